@@ -1,0 +1,1 @@
+"""NumPy + OpenCL toolkit that compresses trained 3D Gaussian splatting scenes."""

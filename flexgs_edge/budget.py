@@ -1,0 +1,140 @@
+"""One memory limit for the whole run, in bytes, and the planner that keeps it.
+
+The limit counts everything: what the process holds when planning starts (Python, libraries, the OpenCL compiler)
+plus every array and device buffer that a stage declares. A stage says what it needs as `fixed` bytes plus `per_row`
+bytes; the planner answers with the rows that fit, or raises with the smallest limit that would do.
+"""
+
+from __future__ import annotations
+
+import re
+import resource
+import sys
+from dataclasses import dataclass
+
+from flexgs_edge.errors import BudgetError, InputError
+
+_UNITS = {
+    "": 1,
+    "B": 1,
+    "KB": 10**3,
+    "MB": 10**6,
+    "GB": 10**9,
+    "KIB": 2**10,
+    "MIB": 2**20,
+    "GIB": 2**30,
+}
+
+
+def parse_size(text: str) -> int:
+    """Bytes from `1.5MB` (10^6), `512MiB` (2^20) or plain bytes.
+
+    >>> parse_size("1.5MB"), parse_size("512MiB"), parse_size("700")
+    (1500000, 536870912, 700)
+    """
+    match = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?|\.[0-9]+)\s*([A-Za-z]*)\s*", text)
+    unit = match.group(2).upper() if match else None
+    if match is None or unit not in _UNITS:
+        raise InputError(f"size {text!r}: expected a number and a unit such as 700, 1.5MB or 512MiB")
+    return int(float(match.group(1)) * _UNITS[unit])
+
+
+def format_size(size: int) -> str:
+    """Bytes for people, in powers of ten: `1.50 MB`.
+
+    >>> format_size(1500000)
+    '1.50 MB'
+    """
+    for unit, scale in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
+        if size >= scale:
+            return f"{size / scale:.2f} {unit}"
+    return f"{size} B"
+
+
+def format_mib(size: int) -> str:
+    """Bytes for memory limits, rounded up to whole MiB: `512MiB` (what `parse_size` reads back)."""
+    return f"{-(-size // 2**20)}MiB"
+
+
+def peak_rss() -> int:
+    """Peak resident memory of this process so far, in bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def current_rss() -> int:
+    """Resident memory of this process now, in bytes (the peak where /proc is missing)."""
+    try:
+        with open("/proc/self/statm") as statm:
+            return int(statm.read().split()[1]) * resource.getpagesize()
+    except OSError:
+        return peak_rss()
+
+
+def available_memory() -> int:
+    """Memory that the machine could give now, in bytes (1 GiB where it cannot tell)."""
+    try:
+        with open("/proc/meminfo") as meminfo:
+            for line in meminfo:
+                if line.startswith("MemAvailable:"):
+                    return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    return 2**30
+
+
+@dataclass
+class MemoryBudget:
+    """A limit in bytes and what is taken from it.
+
+    Parameters
+    ----------
+    limit : int
+        Bytes that the whole process may hold.
+    used : int
+        Bytes held when planning starts, by default what the process holds now.
+    """
+
+    limit: int
+    used: int = 0
+
+    @classmethod
+    def from_limit(cls, limit: int | None) -> MemoryBudget:
+        """A budget of `limit` bytes, or of 3/4 of the memory that is free now."""
+        used = current_rss()
+        return cls(limit if limit is not None else used + available_memory() * 3 // 4, used)
+
+    @property
+    def free(self) -> int:
+        """Bytes not yet taken."""
+        return self.limit - self.used
+
+    def rows(self, stage: str, per_row: int, fixed: int = 0, minimum: int = 1, most: int = 1 << 20) -> int:
+        """Rows of a chunk for `stage`: as many as fit, at most `most`.
+
+        Raises
+        ------
+        BudgetError
+            When not even `minimum` rows fit; the message names the smallest limit that would do.
+        """
+        rows = min(most, (self.free - fixed) // max(per_row, 1))
+        if rows < minimum:
+            self.require(stage, fixed + minimum * per_row)
+        return rows
+
+    def require(self, stage: str, size: int) -> None:
+        """Check that `size` more bytes fit (raises `BudgetError` naming the smallest limit that would)."""
+        if size > self.free:
+            raise BudgetError(
+                f"{stage} needs {format_mib(size)} beside the {format_mib(self.used)} already held, "
+                f"but the memory limit is {format_mib(self.limit)}: use --memory-limit {format_mib(self.used + size)} or more"
+            )
+
+    def take(self, stage: str, size: int) -> None:
+        """Take `size` bytes for as long as the stage lasts (give them back with `give`)."""
+        self.require(stage, size)
+        self.used += size
+
+    def give(self, size: int) -> None:
+        """Return `size` bytes."""
+        self.used -= size

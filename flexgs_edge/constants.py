@@ -1,0 +1,111 @@
+"""Every number that kernels, twins and formats share, once, with its reason and origin.
+
+`KERNEL_CONSTANTS` is printed into the OpenCL programs as exact float literals
+(`flexgs_edge.kernels.source`), and a test reads the values back from the device.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+# --- tiles and blocks -------------------------------------------------------------------------
+TILE: Final = 16
+"""Tile side in pixels (the reference rasteriser's; a tile's splat list then fits a core's L1)."""
+BLOCK: Final = 4
+"""Side of the 4x4 pixel blocks inside a tile that a pair's 16-bit mask switches on and off. A vector of
+16 lanes is one block: small splats leave fewer idle lanes than with rows of 16."""
+LANES: Final = 16
+"""Rows of device arrays are padded to this many elements, so that vectors never read past the end."""
+
+# --- projection (reference rasteriser) --------------------------------------------------------
+DEFAULT_NEAR: Final = 0.2
+"""Near plane in scene units; Gaussians with camera z <= near are culled."""
+DILATION: Final = 0.3
+"""Added to both diagonal terms of the 2D covariance, in px^2: a splat never gets thinner than a pixel."""
+JACOBIAN_MARGIN: Final = 0.15
+"""The Jacobian is taken at a point clamped to the image plus this share of its width (height) on each side:
+1.3 times the half field of view for a centred principal point."""
+SIGMA_RADIUS_INRIA: Final = 3.0
+"""Extent of `--extent inria`: ceil(3 sigma), rounded out to whole tiles."""
+
+# --- blending (reference rasteriser) ----------------------------------------------------------
+ALPHA_MIN: Final = 1.0 / 255.0
+"""A splat whose alpha is below one 8-bit step at a pixel is skipped there."""
+ALPHA_MAX: Final = 0.99
+"""Alpha is capped, so that transmittance never gets to zero in one step."""
+TRANSMITTANCE_MIN: Final = 1e-4
+"""The splat that would bring transmittance below this ends the pixel and is not blended."""
+LOG2_E: Final = math.log2(math.e)
+LOG2_255: Final = math.log2(255.0)
+
+# --- extents ----------------------------------------------------------------------------------
+EXTENT_SLACK: Final = 4e-6
+"""Added to the ellipse's level in log2 units: covers the rounding of log2, exp2 and the exponent sum (each
+below 1e-6), so that no pixel with alpha >= 1/255 is left out."""
+SPAN_SLACK: Final = 2e-3
+"""Pixels added to both ends of a block row's span: 16 ulp at pixel 2000."""
+
+# --- spherical harmonics (real basis, the field's usual signs) --------------------------------
+SH_C0: Final = 0.28209479177387814
+SH_C1: Final = 0.4886025119029199
+SH_C2: Final = (
+    1.0925484305920792,
+    -1.0925484305920792,
+    0.31539156525252005,
+    -1.0925484305920792,
+    0.5462742152960396,
+)
+SH_C3: Final = (
+    -0.5900435899266435,
+    2.890611442640554,
+    -0.4570457994644658,
+    0.3731763325901154,
+    -0.4570457994644658,
+    1.445305721320277,
+    -0.5900435899266435,
+)
+SH_C4: Final = (
+    2.5033429417967046,
+    -1.7701307697799304,
+    0.9461746957575601,
+    -0.6690465435572892,
+    0.10578554691520431,
+    -0.6690465435572892,
+    0.47308734787878004,
+    -1.7701307697799304,
+    0.6258357354491761,
+)
+MAX_SH_DEGREE: Final = 4
+
+# --- exp2 and log2 ----------------------------------------------------------------------------
+EXP2_MAGIC: Final = 12582912.0
+"""1.5 * 2^23: adding and taking it away rounds a float32 to the nearest integer."""
+EXP2_LOW: Final = -126.0
+EXP2_HIGH: Final = 127.0
+"""exp2 arguments are clamped to this range: no denormals, no infinity."""
+EXP2_POLY: Final = (
+    1.000000072,
+    6.931469671e-1,
+    2.402211972e-1,
+    5.550713274e-2,
+    9.675541333e-3,
+    1.327647178e-3,
+)
+"""Degree 5 on [-0.5, 0.5]: relative error 7.5e-8 in reals, 2.1e-7 in float32."""
+
+# --- reductions -------------------------------------------------------------------------------
+FIXED_POINT_BITS: Final = 32
+"""Fraction bits of the 64-bit sums over tiles and views: any order of adding gives the same bits."""
+
+# --- method (FlexGaussian, ACM MM 2025) -------------------------------------------------------
+VOLUME_POWER: Final = 0.1
+"""Exponent of the Gaussian's volume in the gs and meson scores."""
+GROUP_ROWS: Final = 512
+"""Rows per quantization group. The paper's 1000 groups weigh 528 kB whatever N is."""
+DEFAULT_BASE_PSNR: Final = 36.0
+"""PSNR of a model against its photos when there are none (dB): cautious, most scenes are worse and lose less."""
+DEFAULT_HOLDOUT: Final = 8
+"""Every 8th view by name is held out: the field's convention since Mip-NeRF 360."""
+MAX_VIEW_WIDTH: Final = 1600
+"""Views wider than this are scaled down, as the reference training program does."""

@@ -1,0 +1,48 @@
+"""The error tree: every failure that is the user's to mend is one of these.
+
+    FlexGSError
+    |-- InputError    bad scene, cameras, photos or arguments        exit code 2
+    |   `-- FormatError   a file that breaks its own format          exit code 2
+    |-- TargetError   the asked quality or size cannot be reached    exit code 3
+    |-- DeviceError   no usable OpenCL device, a failed build        exit code 4
+    `-- BudgetError   the memory limit or the disk is too small      exit code 5
+
+Anything else that escapes is a bug of ours (exit code 1).
+A message says where (file, field, row or byte), what was expected, what was found, and what to do.
+"""
+
+from __future__ import annotations
+
+
+class FlexGSError(Exception):
+    """Base of all errors that a user can mend."""
+
+    exit_code = 1
+
+
+class InputError(FlexGSError):
+    """A scene, camera file, photo or argument that cannot be used as it is."""
+
+    exit_code = 2
+
+
+class FormatError(InputError):
+    """A file that breaks the rules of its own format (truncated, corrupt, unknown version)."""
+
+
+class TargetError(FlexGSError):
+    """A quality or size target outside what the method can reach; names the closest point."""
+
+    exit_code = 3
+
+
+class DeviceError(FlexGSError):
+    """No usable OpenCL device, an unknown device name, or a kernel that does not build."""
+
+    exit_code = 4
+
+
+class BudgetError(FlexGSError):
+    """The memory limit (or the disk) is too small; names the smallest limit that would do."""
+
+    exit_code = 5

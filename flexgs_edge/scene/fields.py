@@ -1,0 +1,59 @@
+"""The attributes of a Gaussian as data: names, widths, spaces and PLY properties, spelled out here and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Field:
+    """One attribute of a Gaussian.
+
+    Parameters
+    ----------
+    name : str
+        The field's name in arrays and files of this project.
+    space : str
+        What the stored numbers mean.
+    ply : tuple of str
+        INRIA's PLY property names, one a channel (for `sh_rest` a prefix: see `ply_names`).
+    bits : str
+        The field's name in `--bits` and in the container.
+    """
+
+    name: str
+    space: str
+    ply: tuple[str, ...]
+    bits: str
+
+    def width(self, sh_degree: int) -> int:
+        """Channels of this field in a scene of `sh_degree`."""
+        return 3 * sh_rest_count(sh_degree) if self.name == "sh_rest" else len(self.ply)
+
+    def ply_names(self, sh_degree: int) -> tuple[str, ...]:
+        """PLY property names in channel order (`sh_rest` is channel-major: all red, all green, all blue)."""
+        if self.name == "sh_rest":
+            return tuple(f"f_rest_{i}" for i in range(self.width(sh_degree)))
+        return self.ply
+
+
+def sh_rest_count(sh_degree: int) -> int:
+    """SH coefficients above degree 0, a colour channel.
+
+    >>> [sh_rest_count(d) for d in range(5)]
+    [0, 3, 8, 15, 24]
+    """
+    return (sh_degree + 1) ** 2 - 1
+
+
+FIELDS: tuple[Field, ...] = (
+    Field("means", "position, scene units, world minus the source's origin", ("x", "y", "z"), "xyz"),
+    Field("sh_dc", "SH coefficient of degree 0, red green blue", ("f_dc_0", "f_dc_1", "f_dc_2"), "dc"),
+    Field("sh_rest", "SH coefficients above degree 0, channel-major", (), "rest"),
+    Field("opacity_logits", "logit of the opacity", ("opacity",), "opacity"),
+    Field("log_scales", "natural log of the standard deviations, scene units", ("scale_0", "scale_1", "scale_2"), "scale"),
+    Field("quats", "rotation quaternion w x y z, any norm", ("rot_0", "rot_1", "rot_2", "rot_3"), "rot"),
+)
+"""In the order of INRIA's PLY."""
+
+FIELD: dict[str, Field] = {field.name: field for field in FIELDS}
