@@ -15,8 +15,9 @@ TILE: Final = 16
 BLOCK: Final = 4
 """Side of the 4x4 pixel blocks inside a tile that a pair's 16-bit mask switches on and off. A vector of
 16 lanes is one block: small splats leave fewer idle lanes than with rows of 16."""
-LANES: Final = 16
-"""Rows of device arrays are padded to this many elements, so that vectors never read past the end."""
+LANES: Final = 64
+"""Planes on the device are padded to a multiple of this many elements: vectors never read past the end, and a GPU's
+work-groups of 64 fit."""
 
 # --- projection (reference rasteriser) --------------------------------------------------------
 DEFAULT_NEAR: Final = 0.2
@@ -45,6 +46,10 @@ EXTENT_SLACK: Final = 4e-6
 below 1e-6), so that no pixel with alpha >= 1/255 is left out."""
 SPAN_SLACK: Final = 2e-3
 """Pixels added to both ends of a block row's span: 16 ulp at pixel 2000."""
+SPAN_SLACK_RELATIVE: Final = 2e-6
+"""Share of a span's own length added as well: 16 roundings of the span's formula."""
+CULLED: Final = 0xFFFFFFFF
+"""Sort key of a Gaussian that the view does not show (the bits of a NaN: no depth has them)."""
 
 # --- spherical harmonics (real basis, the field's usual signs) --------------------------------
 SH_C0: Final = 0.28209479177387814
@@ -93,6 +98,24 @@ EXP2_POLY: Final = (
     1.327647178e-3,
 )
 """Degree 5 on [-0.5, 0.5]: relative error 7.5e-8 in reals, 2.1e-7 in float32."""
+
+LOG2_PIVOT: Final = 0x3F2AAAAB
+"""Bits of 2/3 as float32: log2 splits its argument into 2^e * m with m in [2/3, 4/3)."""
+LOG2_POLY: Final = (
+    1.4426950216293335,
+    -0.7213465571403503,
+    0.4808958172798157,
+    -0.36078956723213196,
+    0.2887182831764221,
+    -0.2367866337299347,
+    0.20169900357723236,
+    -0.2222205549478531,
+    0.20323719084262848,
+)
+"""log2(1 + f) = f * P(f) on f in [-1/3, 1/3): absolute error 7.1e-8 in float32 (Chebyshev fit, ours)."""
+
+DEQUANTIZE_ROWS: Final = 64
+"""Rows of a work-item of the dequantize kernel: one division to find its group, few enough to spread over all units."""
 
 # --- reductions -------------------------------------------------------------------------------
 FIXED_POINT_BITS: Final = 32

@@ -1,0 +1,1 @@
+"""OpenCL devices: choice, self-test, and the session that owns everything on one of them."""

@@ -1,0 +1,33 @@
+"""Host side of the OpenCL kernels, their NumPy twins, and the choice between the two."""
+
+from __future__ import annotations
+
+from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.kernels.backend import Backend, TwinBackend
+
+__all__ = ["Backend", "open_backend"]
+
+
+def open_backend(device: str | None, budget: MemoryBudget) -> Backend:
+    """The backend that `device` names.
+
+    Parameters
+    ----------
+    device : str or None
+        `numpy` for the twins; otherwise an OpenCL device as in `flexgs_edge.device.select.choose_device`. There is no
+        silent fallback from one to the other.
+    budget : MemoryBudget
+        Every array of the backend is taken from it.
+
+    Raises
+    ------
+    DeviceError
+        When the device does not exist or failed its self-test.
+    """
+    if device == "numpy":
+        return TwinBackend(budget)
+    from flexgs_edge.device.select import choose_device, list_devices
+    from flexgs_edge.kernels.opencl import OpenCLBackend
+
+    info, _ = choose_device(device, list_devices())
+    return OpenCLBackend(info, budget)

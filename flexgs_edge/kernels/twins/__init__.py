@@ -1,0 +1,36 @@
+"""NumPy twins of the OpenCL kernels: same names, same argument order (after the launch size), same bits.
+
+The twins are the specification of the kernels, and what `--device numpy` runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from flexgs_edge.kernels.twins.activate import activate
+from flexgs_edge.kernels.twins.blend import blend
+from flexgs_edge.kernels.twins.dequantize import dequantize
+from flexgs_edge.kernels.twins.project import project
+from flexgs_edge.kernels.twins.sort import (
+    exclusive_scan,
+    sort_count,
+    sort_count_first,
+    sort_scatter,
+    sort_scatter_first,
+)
+from flexgs_edge.kernels.twins.tiles import tile_count, tile_scatter
+
+TWINS: dict[str, Callable[..., None]] = {
+    "activate": activate,
+    "project": project,
+    "sort_count_first": sort_count_first,
+    "sort_scatter_first": sort_scatter_first,
+    "sort_count": sort_count,
+    "sort_scatter": sort_scatter,
+    "exclusive_scan": exclusive_scan,
+    "tile_count": tile_count,
+    "tile_scatter": tile_scatter,
+    "blend": blend,
+    "blend_stats": blend,
+    "dequantize": dequantize,
+}

@@ -1,0 +1,51 @@
+// Stored attributes -> what every view needs: 3D covariance and log2 of the opacity. Once a scene, not once a view.
+// Twin: flexgs_edge.kernels.twins.activate
+
+__kernel void activate(
+    const uint stride,                    // elements of a plane, a multiple of 16
+    __global const float *log_scales,     // [3, stride] natural log, scene units
+    __global const float *quats,          // [4, stride] w x y z, any norm
+    __global const float *logits,         // [stride]
+    __global float *cov,                  // [6, stride] xx xy xz yy yz zz, scene units^2
+    __global float *log2_opacity)         // [stride], -inf where the opacity is below ALPHA_MIN
+{
+  const size_t i = get_global_id(0) * W;
+  FW s0 = fexp2(LOADF(log_scales, i) * (FW)LOG2_E);
+  FW s1 = fexp2(LOADF(log_scales, stride + i) * (FW)LOG2_E);
+  FW s2 = fexp2(LOADF(log_scales, 2 * (size_t)stride + i) * (FW)LOG2_E);
+
+  FW w = LOADF(quats, i), x = LOADF(quats, stride + i);
+  FW y = LOADF(quats, 2 * (size_t)stride + i), z = LOADF(quats, 3 * (size_t)stride + i);
+  // Divide by the largest component first: squares of tiny or huge quaternions would leave float32's range.
+  FW big = fmax(fmax(fabs(w), fabs(x)), fmax(fabs(y), fabs(z)));
+  w = w / big;
+  x = x / big;
+  y = y / big;
+  z = z / big;
+  FW inv = (FW)1.0f / sqrt(fma(z, z, fma(y, y, fma(x, x, w * w))));
+  w = w * inv;
+  x = x * inv;
+  y = y * inv;
+  z = z * inv;
+
+  FW m00 = fma((FW)-2.0f, fma(z, z, y * y), (FW)1.0f) * s0;
+  FW m01 = (FW)2.0f * fma(x, y, -(w * z)) * s1;
+  FW m02 = (FW)2.0f * fma(x, z, w * y) * s2;
+  FW m10 = (FW)2.0f * fma(x, y, w * z) * s0;
+  FW m11 = fma((FW)-2.0f, fma(z, z, x * x), (FW)1.0f) * s1;
+  FW m12 = (FW)2.0f * fma(y, z, -(w * x)) * s2;
+  FW m20 = (FW)2.0f * fma(x, z, -(w * y)) * s0;
+  FW m21 = (FW)2.0f * fma(y, z, w * x) * s1;
+  FW m22 = fma((FW)-2.0f, fma(y, y, x * x), (FW)1.0f) * s2;
+
+  STOREF(dot3(m00, m01, m02, m00, m01, m02), cov, i);
+  STOREF(dot3(m00, m01, m02, m10, m11, m12), cov, (size_t)stride + i);
+  STOREF(dot3(m00, m01, m02, m20, m21, m22), cov, 2 * (size_t)stride + i);
+  STOREF(dot3(m10, m11, m12, m10, m11, m12), cov, 3 * (size_t)stride + i);
+  STOREF(dot3(m10, m11, m12, m20, m21, m22), cov, 4 * (size_t)stride + i);
+  STOREF(dot3(m20, m21, m22, m20, m21, m22), cov, 5 * (size_t)stride + i);
+
+  FW opacity = (FW)1.0f / ((FW)1.0f + fexp2(LOADF(logits, i) * (FW)-LOG2_E));
+  FW level = flog2(fmax(opacity, (FW)ALPHA_MIN));
+  STOREF(pick(MASK(opacity >= (FW)ALPHA_MIN), level, (FW)-INFINITY), log2_opacity, i);
+}

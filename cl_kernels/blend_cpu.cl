@@ -1,0 +1,190 @@
+// Front-to-back blending of one tile by one work-item: explicit vectors over 4x4 blocks, no __local, no barriers.
+// 13 times faster on CPUs than a work-item a pixel. Same bits as blend_gpu.cl and at every W.
+// Twin: flexgs_edge.kernels.twins.blend
+//
+// A pixel that has ended keeps its transmittance with the sign flipped: then T (1 - alpha) < TRANSMITTANCE_MIN holds for every
+// later splat and no extra state is needed.
+
+#define BLOCK_VECTORS (16 / W)   // vectors of a 4x4 block
+#define BLOCKS 16                // blocks of a tile
+#define RETIRE_EVERY 16          // splats between two looks for blocks whose pixels have all ended
+
+#ifndef STATS
+#error "STATS (0: image only, 1: hits and weights as well) must be defined"
+#endif
+
+// Lane l of vector v is pixel (l + v W) of the block, row by row.
+inline FW lane_x(void) { return TO_F(LANE_INDEX & (IW)3); }
+inline FW lane_y(int v) { return TO_F((LANE_INDEX + (IW)(v * W)) >> 2); }
+
+#if W == 1
+inline FW lane_x_at(int v) { return (float)(v & 3); }
+#else
+inline FW lane_x_at(int v) { return lane_x(); }
+#endif
+
+inline int any_alive(FW t) {
+#if W == 16
+  const long8 bits = as_long8(AS_I(t));
+  // Sign bits of both halves of each long; a clear one is a pixel still open.
+  const long8 open = ~bits & (long8)(0x8000000080000000UL);
+  const long4 a = open.lo | open.hi;
+  const long2 b = a.lo | a.hi;
+  return (b.lo | b.hi) != 0;
+#else
+  return ANY(MASK(t > (FW)0.0f));
+#endif
+}
+
+#if STATS
+// 64-bit fixed point by two 32-bit atomics: integer sums, so any order gives the same bits, and no 64-bit atomics are needed.
+inline void add_fixed(__global uint *low, __global uint *high, float value) {
+  const ulong fixed_value = (ulong)(value * 4294967296.0f);
+  const uint add = (uint)fixed_value;
+  const uint old = atomic_add(low, add);
+  const uint carry = (uint)(fixed_value >> 32) + (old + add < old ? 1u : 0u);
+  if (carry) atomic_add(high, carry);
+}
+
+// The fixed pairwise tree over the 16 lanes of a block: l + (l + 8), then + 4, + 2, + 1.
+inline float tree_sum(const FW *v) {
+  float s[16];
+  for (int k = 0; k < BLOCK_VECTORS; ++k) STOREF(v[k], s, k * W);
+  for (int l = 0; l < 8; ++l) s[l] += s[l + 8];
+  for (int l = 0; l < 4; ++l) s[l] += s[l + 4];
+  return (s[0] + s[2]) + (s[1] + s[3]);
+}
+inline uint lane_count(const IW *v) {
+  int s[16];
+  int sum = 0;
+  for (int k = 0; k < BLOCK_VECTORS; ++k) STOREI(v[k], s, k * W);
+  for (int l = 0; l < 16; ++l) sum -= s[l];
+  return (uint)sum;
+}
+#endif
+
+__kernel void blend(
+    const uint tiles_x,
+    const uint blocks,                    // columns of `ends`
+    const int width,                      // pixels
+    const int height,
+    const int resume,                     // 1: go on from `state`, 0: from an empty image
+    const int finish,                     // 1: add the background and write the image, 0: write `state`
+    const float background_r,
+    const float background_g,
+    const float background_b,
+    __global const uint *ends,            // [tiles, blocks] end of each tile's pairs in the last column
+    __global const uint2 *pairs,          // row and block mask
+    __global const float *records,        // [N, 16]
+    __global float *state,                // [tiles, 4, 256] colour and signed transmittance, block by block
+    __global float *image                 // [3, padded height, padded width]
+#if STATS
+    ,
+    __global uint *hits,                  // [N]
+    __global uint *weights                // [2, N] low and high words of sum(alpha T), fixed point
+    ,
+    const uint rows                       // N
+#endif
+) {
+  const uint tile = get_global_id(0);
+  const int tile_px = (int)(tile % tiles_x) * TILE, tile_py = (int)(tile / tiles_x) * TILE;
+  FW red[BLOCKS * BLOCK_VECTORS], green[BLOCKS * BLOCK_VECTORS], blue[BLOCKS * BLOCK_VECTORS];
+  FW trans[BLOCKS * BLOCK_VECTORS];
+  __global float *own = state + (size_t)tile * 1024;
+  for (int k = 0; k < BLOCKS * BLOCK_VECTORS; ++k) {
+    if (resume) {
+      red[k] = LOADF(own, k * W);
+      green[k] = LOADF(own, 256 + k * W);
+      blue[k] = LOADF(own, 512 + k * W);
+      trans[k] = LOADF(own, 768 + k * W);
+    } else {
+      const int b = k / BLOCK_VECTORS, v = k % BLOCK_VECTORS;
+      FW x = lane_x_at(v) + (FW)(float)(tile_px + BLOCK * (b & 3)), y = lane_y(v) + (FW)(float)(tile_py + BLOCK * (b >> 2));
+      red[k] = green[k] = blue[k] = (FW)0.0f;
+      // Pixels outside the image have ended: they count no hits.
+      trans[k] = pick(MASK(x < (FW)(float)width) & MASK(y < (FW)(float)height), (FW)1.0f, (FW)-1.0f);
+    }
+  }
+
+  const uint first = tile ? ends[(size_t)tile * blocks - 1] : 0u, last = ends[(size_t)(tile + 1) * blocks - 1];
+  uint live = 0xFFFFu;
+  for (uint n = first; n < last; ++n) {
+    if (((n - first) & (RETIRE_EVERY - 1)) == 0) {
+      for (int b = 0; b < BLOCKS; ++b) {
+        int alive = 0;
+        for (int v = 0; v < BLOCK_VECTORS; ++v) alive |= any_alive(trans[b * BLOCK_VECTORS + v]);
+        if (!alive) live &= ~(1u << b);
+      }
+      if (!live) break;
+    }
+    const uint2 pair = pairs[n];
+    uint mask = pair.y & live;
+    if (!mask) continue;
+    __global const float *r = records + (size_t)pair.x * 16;
+    const FW mx = (FW)r[0], my = (FW)r[1], ca = (FW)r[2], cb = (FW)r[3], cc = (FW)r[4], level = (FW)r[5];
+    const FW cr = (FW)r[6], cg = (FW)r[7], cbl = (FW)r[8];
+#if STATS
+    IW hit_sum[BLOCK_VECTORS];
+    FW weight_sum[BLOCK_VECTORS];
+    for (int v = 0; v < BLOCK_VECTORS; ++v) {
+      hit_sum[v] = (IW)0;
+      weight_sum[v] = (FW)0.0f;
+    }
+#endif
+    while (mask) {
+      const int b = 31 - (int)clz(mask & (0u - mask));
+      mask &= mask - 1;
+      const float bx = (float)(tile_px + BLOCK * (b & 3)), by = (float)(tile_py + BLOCK * (b >> 2));
+      for (int v = 0; v < BLOCK_VECTORS; ++v) {
+        const int k = b * BLOCK_VECTORS + v;
+        FW dx = (lane_x_at(v) + (FW)bx) - mx, dy = (lane_y(v) + (FW)by) - my;
+        FW q = fma(fma(ca, dx, cb * dy), dx, (cc * dy) * dy);
+        FW alpha = fmin(fexp2(level - fmax(q, (FW)0.0f)), (FW)ALPHA_MAX);
+        FW t = trans[k];
+        FW next = t * ((FW)1.0f - alpha);
+        IW seen = MASK(alpha >= (FW)ALPHA_MIN);
+        IW hit = seen & MASK(next >= (FW)TRANSMITTANCE_MIN);
+        FW weight = pick(hit, alpha * t, (FW)0.0f);
+        red[k] = fma(weight, cr, red[k]);
+        green[k] = fma(weight, cg, green[k]);
+        blue[k] = fma(weight, cbl, blue[k]);
+        trans[k] = pick(hit, next, pick(seen, -fabs(t), t));
+#if STATS
+        hit_sum[v] += hit;
+        weight_sum[v] += weight;
+#endif
+      }
+    }
+#if STATS
+    const uint count = lane_count(hit_sum);
+    if (count) {
+      atomic_add(hits + pair.x, count);
+      add_fixed(weights + pair.x, weights + rows + pair.x, tree_sum(weight_sum));
+    }
+#endif
+  }
+
+  if (!finish) {
+    for (int k = 0; k < BLOCKS * BLOCK_VECTORS; ++k) {
+      STOREF(red[k], own, k * W);
+      STOREF(green[k], own, 256 + k * W);
+      STOREF(blue[k], own, 512 + k * W);
+      STOREF(trans[k], own, 768 + k * W);
+    }
+    return;
+  }
+  const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
+  for (int b = 0; b < BLOCKS; ++b) {
+    float lanes[3][16];
+    for (int v = 0; v < BLOCK_VECTORS; ++v) {
+      const int k = b * BLOCK_VECTORS + v;
+      const FW t = fabs(trans[k]);
+      STOREF(fma(t, (FW)background_r, red[k]), lanes[0], v * W);
+      STOREF(fma(t, (FW)background_g, green[k]), lanes[1], v * W);
+      STOREF(fma(t, (FW)background_b, blue[k]), lanes[2], v * W);
+    }
+    __global float *at = image + (size_t)(tile_py + BLOCK * (b >> 2)) * pitch + tile_px + BLOCK * (b & 3);
+    for (int c = 0; c < 3; ++c)
+      for (int row = 0; row < BLOCK; ++row) vstore4(vload4(row, lanes[c]), 0, at + c * plane + row * pitch);
+  }
+}

@@ -1,0 +1,131 @@
+// Front-to-back blending of one tile by one 16x16 work-group, a pixel a work-item, splats fetched in batches into local memory.
+// Same arguments, same written forms and same bits as blend_cpu.cl. W must be 1. No return before a barrier, no doubles,
+// 256 work-items and less than 16 KiB of local memory, so that small GPUs can run it.
+// Twin: flexgs_edge.kernels.twins.blend
+
+#if W != 1
+#error "the GPU form is scalar: build with -DW=1"
+#endif
+#ifndef STATS
+#error "STATS (0: image only, 1: hits and weights as well) must be defined"
+#endif
+
+#define BATCH 64   // splats in local memory at a time
+
+#if STATS
+inline void add_fixed(__global uint *low, __global uint *high, float value) {
+  const ulong fixed_value = (ulong)(value * 4294967296.0f);
+  const uint add = (uint)fixed_value;
+  const uint old = atomic_add(low, add);
+  const uint carry = (uint)(fixed_value >> 32) + (old + add < old ? 1u : 0u);
+  if (carry) atomic_add(high, carry);
+}
+#endif
+
+__kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
+    const uint tiles_x,
+    const uint blocks,
+    const int width,
+    const int height,
+    const int resume,
+    const int finish,
+    const float background_r,
+    const float background_g,
+    const float background_b,
+    __global const uint *ends,
+    __global const uint2 *pairs,
+    __global const float *records,
+    __global float *state,
+    __global float *image
+#if STATS
+    ,
+    __global uint *hits,
+    __global uint *weights,
+    const uint rows
+#endif
+) {
+  __local float splats[BATCH][9];
+  __local uint2 list[BATCH];
+  __local int open;
+#if STATS
+  __local float sums[256];
+  __local uint counts;
+#endif
+  // Work-items follow the blocks: item p is pixel p % 16 of block p / 16, which is also the layout of `state`.
+  const int p = get_local_id(0), b = p >> 4, lane = p & 15;
+  const uint tile = get_group_id(0);
+  const int px = (int)(tile % tiles_x) * TILE + BLOCK * (b & 3) + (lane & 3);
+  const int py = (int)(tile / tiles_x) * TILE + BLOCK * (b >> 2) + (lane >> 2);
+  __global float *own = state + (size_t)tile * 1024 + p;
+  float red = 0.0f, green = 0.0f, blue = 0.0f, t = px < width && py < height ? 1.0f : -1.0f;
+  if (resume) {
+    red = own[0];
+    green = own[256];
+    blue = own[512];
+    t = own[768];
+  }
+  const uint first = tile ? ends[(size_t)tile * blocks - 1] : 0u, last = ends[(size_t)(tile + 1) * blocks - 1];
+  for (uint start = first; start < last; start += BATCH) {
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (p == 0) open = 0;
+    const uint size = min((uint)BATCH, last - start);
+    if (p < (int)size) {
+      list[p] = pairs[start + p];
+      for (int f = 0; f < 9; ++f) splats[p][f] = records[(size_t)list[p].x * 16 + f];
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (t > 0.0f) open = 1;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    const int go_on = open;   // the same for the whole group: nobody writes `open` before the next barrier
+    if (!go_on) break;
+    for (uint n = 0; n < size; ++n) {
+      float weight = 0.0f;
+      int hit = 0;
+      if (list[n].y >> b & 1u) {
+        const float dx = (float)px - splats[n][0], dy = (float)py - splats[n][1];
+        const float q = fma(fma(splats[n][2], dx, splats[n][3] * dy), dx, (splats[n][4] * dy) * dy);
+        const float alpha = fmin(fexp2(splats[n][5] - fmax(q, 0.0f)), ALPHA_MAX);
+        const float next = t * (1.0f - alpha);
+        const int seen = alpha >= ALPHA_MIN;
+        hit = seen && next >= TRANSMITTANCE_MIN;
+        weight = hit ? alpha * t : 0.0f;
+        red = fma(weight, splats[n][6], red);
+        green = fma(weight, splats[n][7], green);
+        blue = fma(weight, splats[n][8], blue);
+        t = hit ? next : seen ? -fabs(t) : t;
+      }
+#if STATS
+      if (p == 0) counts = 0;
+      sums[p] = weight;
+      barrier(CLK_LOCAL_MEM_FENCE);
+      if (hit) atomic_inc(&counts);
+      // Each lane over the blocks in order, then the pairwise tree over lanes: the CPU form's order.
+      float sum = 0.0f;
+      if (p < 16)
+        for (int k = 0; k < 16; ++k) sum += sums[k * 16 + p];
+      barrier(CLK_LOCAL_MEM_FENCE);
+      if (p < 16) sums[p] = sum;
+      barrier(CLK_LOCAL_MEM_FENCE);
+      if (p == 0 && counts) {
+        for (int l = 0; l < 8; ++l) sums[l] += sums[l + 8];
+        for (int l = 0; l < 4; ++l) sums[l] += sums[l + 4];
+        atomic_add(hits + list[n].x, counts);
+        add_fixed(weights + list[n].x, weights + rows + list[n].x, (sums[0] + sums[2]) + (sums[1] + sums[3]));
+      }
+      barrier(CLK_LOCAL_MEM_FENCE);
+#endif
+    }
+  }
+  if (finish) {
+    const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
+    __global float *at = image + (size_t)py * pitch + px;
+    at[0] = fma(fabs(t), background_r, red);
+    at[plane] = fma(fabs(t), background_g, green);
+    at[2 * plane] = fma(fabs(t), background_b, blue);
+  } else {
+    own[0] = red;
+    own[256] = green;
+    own[512] = blue;
+    own[768] = t;
+  }
+}

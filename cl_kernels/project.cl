@@ -1,0 +1,191 @@
+// One view of a chunk of Gaussians: splat records, depth keys and how many tiles each splat may touch.
+// Twin: flexgs_edge.kernels.twins.project
+
+// Camera, 32 floats: R row-major 0-8, t 9-11, fx fy cx cy 12-15, near 16, Jacobian clamp x lo hi, y lo hi 17-20,
+// position 21-23, width height 24-25.
+#define CAM(k) ((FW)camera[k])
+
+inline FW sh_band(__global const float *sh, size_t stride, size_t i, int k, FW basis, FW acc) {
+  return fma(basis, LOADF(sh, (size_t)k * stride + i), acc);
+}
+
+// One colour channel in direction (x, y, z); sh_rest holds the channel's coefficients above degree 0.
+inline FW sh_colour(__global const float *dc, __global const float *rest, size_t stride, size_t i, int degree,
+                    FW x, FW y, FW z) {
+  FW c = (FW)SH_C0 * LOADF(dc, i);
+  if (degree > 0) {
+    c = sh_band(rest, stride, i, 0, (FW)-SH_C1 * y, c);
+    c = sh_band(rest, stride, i, 1, (FW)SH_C1 * z, c);
+    c = sh_band(rest, stride, i, 2, (FW)-SH_C1 * x, c);
+  }
+  if (degree > 1) {
+    FW xx = x * x, yy = y * y, zz = z * z;
+    c = sh_band(rest, stride, i, 3, (FW)SH_C2_0 * (x * y), c);
+    c = sh_band(rest, stride, i, 4, (FW)SH_C2_1 * (y * z), c);
+    c = sh_band(rest, stride, i, 5, (FW)SH_C2_2 * ((zz + zz) - (xx + yy)), c);
+    c = sh_band(rest, stride, i, 6, (FW)SH_C2_3 * (x * z), c);
+    c = sh_band(rest, stride, i, 7, (FW)SH_C2_4 * (xx - yy), c);
+    if (degree > 2) {
+      c = sh_band(rest, stride, i, 8, (FW)SH_C3_0 * (y * ((FW)3.0f * xx - yy)), c);
+      c = sh_band(rest, stride, i, 9, (FW)SH_C3_1 * ((x * y) * z), c);
+      c = sh_band(rest, stride, i, 10, (FW)SH_C3_2 * (y * ((FW)4.0f * zz - (xx + yy))), c);
+      c = sh_band(rest, stride, i, 11, (FW)SH_C3_3 * (z * ((FW)2.0f * zz - (FW)3.0f * (xx + yy))), c);
+      c = sh_band(rest, stride, i, 12, (FW)SH_C3_4 * (x * ((FW)4.0f * zz - (xx + yy))), c);
+      c = sh_band(rest, stride, i, 13, (FW)SH_C3_5 * (z * (xx - yy)), c);
+      c = sh_band(rest, stride, i, 14, (FW)SH_C3_6 * (x * (xx - (FW)3.0f * yy)), c);
+    }
+    if (degree > 3) {
+      c = sh_band(rest, stride, i, 15, (FW)SH_C4_0 * ((x * y) * (xx - yy)), c);
+      c = sh_band(rest, stride, i, 16, (FW)SH_C4_1 * ((y * z) * ((FW)3.0f * xx - yy)), c);
+      c = sh_band(rest, stride, i, 17, (FW)SH_C4_2 * ((x * y) * ((FW)7.0f * zz - (FW)1.0f)), c);
+      c = sh_band(rest, stride, i, 18, (FW)SH_C4_3 * ((y * z) * ((FW)7.0f * zz - (FW)3.0f)), c);
+      c = sh_band(rest, stride, i, 19, (FW)SH_C4_4 * (zz * ((FW)35.0f * zz - (FW)30.0f) + (FW)3.0f), c);
+      c = sh_band(rest, stride, i, 20, (FW)SH_C4_5 * ((x * z) * ((FW)7.0f * zz - (FW)3.0f)), c);
+      c = sh_band(rest, stride, i, 21, (FW)SH_C4_6 * ((xx - yy) * ((FW)7.0f * zz - (FW)1.0f)), c);
+      c = sh_band(rest, stride, i, 22, (FW)SH_C4_7 * ((x * z) * (xx - (FW)3.0f * yy)), c);
+      c = sh_band(rest, stride, i, 23, (FW)SH_C4_8 * (xx * (xx - (FW)3.0f * yy) - yy * ((FW)3.0f * xx - yy)), c);
+    }
+  }
+  return fmax(c + (FW)0.5f, (FW)0.0f);
+}
+
+__kernel void project(
+    const uint count,                       // rows of this chunk
+    const uint stride,                      // elements of a plane, a multiple of 16
+    const uint base,                        // row of the scene that the chunk starts at
+    const int degree,                       // SH degree of the chunk
+    const int inria_extent,                 // 1: tiles of ceil(3 sigma), 0: the exact ellipse of alpha >= ALPHA_MIN
+    __global const float *camera,           // [32]
+    __global const float *means,            // [3, stride] scene units, relative to the origin
+    __global const float *cov,              // [6, stride]
+    __global const float *log2_opacity,     // [stride]
+    __global const float *sh_dc,            // [3, stride]
+    __global const float *sh_rest,          // [3 * K, stride]
+    __global float *records,                // [N, 16] splats, see below
+    __global uint *keys,                    // [N] depth bits, CULLED where not shown
+    __global uint *bounds)                  // [N] tiles of the splat's bounding box
+{
+  const size_t i = get_global_id(0) * W;
+  if (i >= count) return;
+  const size_t s = stride;
+
+  FW px = LOADF(means, i), py = LOADF(means, s + i), pz = LOADF(means, 2 * s + i);
+  FW z = fma(CAM(8), pz, fma(CAM(6), px, CAM(7) * py)) + CAM(11);
+  FW level = LOADF(log2_opacity, i);
+  IW shown = MASK(z > CAM(16)) & MASK(level > (FW)-1e30f);
+  shown &= MASK((LANE_INDEX + (IW)(int)i) < (IW)(int)count);
+
+  FW x = fma(CAM(2), pz, fma(CAM(0), px, CAM(1) * py)) + CAM(9);
+  FW y = fma(CAM(5), pz, fma(CAM(3), px, CAM(4) * py)) + CAM(10);
+  FW iz = (FW)1.0f / z;
+  FW u = x * iz, v = y * iz;
+  FW mx = fma(CAM(12), u, CAM(14)), my = fma(CAM(13), v, CAM(15));
+  FW uc = fmin(fmax(u, CAM(17)), CAM(18)), vc = fmin(fmax(v, CAM(19)), CAM(20));
+  FW j00 = CAM(12) * iz, j02 = -(j00 * uc);
+  FW j11 = CAM(13) * iz, j12 = -(j11 * vc);
+  FW t00 = fma(j02, CAM(6), j00 * CAM(0)), t01 = fma(j02, CAM(7), j00 * CAM(1)), t02 = fma(j02, CAM(8), j00 * CAM(2));
+  FW t10 = fma(j12, CAM(6), j11 * CAM(3)), t11 = fma(j12, CAM(7), j11 * CAM(4)), t12 = fma(j12, CAM(8), j11 * CAM(5));
+
+  FW cxx = LOADF(cov, i), cxy = LOADF(cov, s + i), cxz = LOADF(cov, 2 * s + i);
+  FW cyy = LOADF(cov, 3 * s + i), cyz = LOADF(cov, 4 * s + i), czz = LOADF(cov, 5 * s + i);
+  FW v0 = dot3(cxx, cxy, cxz, t00, t01, t02);
+  FW v1 = dot3(cxy, cyy, cyz, t00, t01, t02);
+  FW v2 = dot3(cxz, cyz, czz, t00, t01, t02);
+  FW a = dot3(t00, t01, t02, v0, v1, v2) + (FW)DILATION;
+  FW b = dot3(t10, t11, t12, v0, v1, v2);
+  v0 = dot3(cxx, cxy, cxz, t10, t11, t12);
+  v1 = dot3(cxy, cyy, cyz, t10, t11, t12);
+  v2 = dot3(cxz, cyz, czz, t10, t11, t12);
+  FW c = dot3(t10, t11, t12, v0, v1, v2) + (FW)DILATION;
+
+  // ac - b^2 with the rounding error of b^2 added back: plain float32 loses needles here.
+  FW bb = b * b;
+  FW det = fma(a, c, -bb) + fma(-b, b, bb);
+  FW level2 = (level + (FW)(LOG2_255 + EXTENT_SLACK)) * (FW)(2.0f / LOG2_E);  // the ellipse's q, natural units
+  FW t2 = fmax(level2, (FW)0.0f);
+  FW half_width = sqrt(t2 * a), half_height = sqrt(t2 * c);
+  FW width = CAM(24), height = CAM(25);
+  FW reach_x = half_width, reach_y = half_height, radius = (FW)0.0f;
+  if (inria_extent) {
+    FW mid = (FW)0.5f * (a + c);
+    FW spread = sqrt(fmax((FW)0.1f, mid * mid - det));
+    radius = ceil((FW)SIGMA_RADIUS_INRIA * sqrt(mid + spread));
+    reach_x = radius + (FW)TILE;  // rounded out to tiles below
+    reach_y = reach_x;
+  }
+  // Written so that NaN and infinity fail the tests.
+  shown &= MASK(det > (FW)0.0f) & MASK(det < (FW)INFINITY) & MASK(a < (FW)INFINITY) & MASK(c < (FW)INFINITY);
+  shown &= MASK(mx + reach_x >= (FW)-1.0f) & MASK(mx - reach_x <= width);
+  shown &= MASK(my + reach_y >= (FW)-1.0f) & MASK(my - reach_y <= height);
+
+  FW inv = (FW)1.0f / det;
+  FW k = inv * (FW)(0.5f * LOG2_E);  // exponents are powers of two
+  FW out[16];
+  out[0] = mx;
+  out[1] = my;
+  out[2] = c * k;
+  out[3] = -(b + b) * k;
+  out[4] = a * k;
+  out[5] = level;
+  // What the tile stage needs: where the ellipse's right end lies, its half height, axis slope b/c, 1/c, det/c and level.
+  FW ic = (FW)1.0f / c;
+  out[9] = (b / a) * half_width;
+  out[10] = half_height;
+  out[11] = b * ic;
+  out[12] = ic;
+  out[13] = det * ic;
+  out[14] = t2;
+  out[15] = radius;
+
+  FW x0, x1, y0, y1;  // tiles of the bounding box, inclusive
+  if (inria_extent) {
+    x0 = floor((mx - radius) * (FW)(1.0f / TILE));
+    x1 = floor((mx + radius + (FW)(TILE - 1)) * (FW)(1.0f / TILE)) - (FW)1.0f;
+    y0 = floor((my - radius) * (FW)(1.0f / TILE));
+    y1 = floor((my + radius + (FW)(TILE - 1)) * (FW)(1.0f / TILE)) - (FW)1.0f;
+  } else {
+    // Twice the slack of the spans in tiles.cl: this is the bound that the pair buffer is sized by.
+    FW sx = (FW)2.0f * fma(half_width, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
+    FW sy = fma(half_height, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
+    x0 = floor(ceil(mx - half_width - sx) * (FW)(1.0f / TILE));
+    x1 = floor(floor(mx + half_width + sx) * (FW)(1.0f / TILE));
+    y0 = floor(ceil(my - half_height - sy) * (FW)(1.0f / TILE));
+    y1 = floor(floor(my + half_height + sy) * (FW)(1.0f / TILE));
+  }
+  FW last_x = floor((width - (FW)1.0f) * (FW)(1.0f / TILE)), last_y = floor((height - (FW)1.0f) * (FW)(1.0f / TILE));
+  x0 = fmax(x0, (FW)0.0f);
+  y0 = fmax(y0, (FW)0.0f);
+  x1 = fmin(x1, last_x);
+  y1 = fmin(y1, last_y);
+  shown &= MASK(x1 >= x0) & MASK(y1 >= y0);
+  FW tiles = (x1 - x0 + (FW)1.0f) * (y1 - y0 + (FW)1.0f);
+
+  if (ANY(shown)) {
+    FW dx = px - CAM(21), dy = py - CAM(22), dz = pz - CAM(23);
+    FW norm = (FW)1.0f / sqrt(dot3(dx, dy, dz, dx, dy, dz));
+    dx = dx * norm;
+    dy = dy * norm;
+    dz = dz * norm;
+    const size_t rest = (size_t)((degree + 1) * (degree + 1) - 1) * s;
+    out[6] = sh_colour(sh_dc, sh_rest, s, i, degree, dx, dy, dz);
+    out[7] = sh_colour(sh_dc + s, sh_rest + rest, s, i, degree, dx, dy, dz);
+    out[8] = sh_colour(sh_dc + 2 * s, sh_rest + 2 * rest, s, i, degree, dx, dy, dz);
+  } else {
+    out[6] = out[7] = out[8] = (FW)0.0f;
+  }
+
+  float lanes[16][W];
+  float key_lanes[W], bound_lanes[W];
+  int shown_lanes[W];
+  for (int f = 0; f < 16; ++f) STOREF(out[f], lanes[f], 0);
+  STOREF(z, key_lanes, 0);
+  STOREF(tiles, bound_lanes, 0);
+  STOREI(shown, shown_lanes, 0);
+  for (int l = 0; l < W && i + l < count; ++l) {
+    const size_t row = base + i + l;
+    keys[row] = shown_lanes[l] ? as_uint(key_lanes[l]) : (uint)CULLED;
+    bounds[row] = shown_lanes[l] ? (uint)bound_lanes[l] : 0u;
+    if (shown_lanes[l])
+      for (int f = 0; f < 16; ++f) records[row * 16 + f] = lanes[f][l];
+  }
+}

@@ -1,0 +1,122 @@
+// Tile lists in depth order: which splats may show in which tile, and in which of its sixteen 4x4 blocks.
+// A counting sort by tile; a work-item walks one contiguous block of the depth-ordered splats.
+// Twins: flexgs_edge.kernels.twins.tiles
+
+#define BANDS 16   // block rows (4 pixels high) worked on at a time: four rows of tiles
+
+// First and last block column of a splat in W block rows from `band` on; an empty row has first > last.
+// On the ellipse the right end over a row lies at its overall extreme, clamped into the row (it is convex); so does the left.
+inline void block_spans(__global const float *r, int band, float width, IW *first, IW *last) {
+  const FW my = (FW)r[1], hh = (FW)r[10], slope = (FW)r[11];
+  FW top = TO_F((LANE_INDEX + (IW)band) * (IW)BLOCK) - my;
+  FW slack = fma(hh, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
+  FW low = fmax(top, -(hh + slack)), high = fmin(top + (FW)(BLOCK - 1), hh + slack);
+  FW right_dy = fmin(fmax((FW)r[9], low), high), left_dy = fmin(fmax((FW)-r[9], low), high);
+  FW right_root = sqrt(fmax((FW)r[14] - right_dy * right_dy * (FW)r[12], (FW)0.0f) * (FW)r[13]);
+  FW left_root = sqrt(fmax((FW)r[14] - left_dy * left_dy * (FW)r[12], (FW)0.0f) * (FW)r[13]);
+  FW right = fma(slope, right_dy, right_root), left = fma(slope, left_dy, -left_root);
+  FW right_slack = fma(fabs(slope * right_dy) + right_root, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
+  FW left_slack = fma(fabs(slope * left_dy) + left_root, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
+  FW x0 = fmin(fmax(ceil((FW)r[0] + left - left_slack), (FW)0.0f), (FW)width);
+  FW x1 = fmin(fmax(floor((FW)r[0] + right + right_slack), (FW)-1.0f), (FW)(width - 1.0f));
+  IW some = MASK(low <= high) & MASK(x0 <= x1);
+  *first = picki(some, TO_I(x0) >> 2, (IW)1);
+  *last = picki(some, TO_I(x1) >> 2, (IW)0);
+}
+
+// The 16-bit block mask of a tile: bit 4 * row + column. `first` and `last` are the spans of the tile's four block rows.
+inline uint tile_mask(const int *first, const int *last, int tile_x) {
+  uint mask = 0;
+  for (int row = 0; row < 4; ++row) {
+    const int from = max(first[row] - 4 * tile_x, 0), to = min(last[row] - 4 * tile_x, 3);
+    if (first[row] <= last[row] && from <= to) mask |= (((1u << (to + 1)) - 1u) & ~((1u << from) - 1u)) << (4 * row);
+  }
+  return mask;
+}
+
+// Calls EACH(tile, mask) for every tile that the splat may show in.
+#define FOR_EACH_TILE(EACH)                                                                                     \
+  __global const float *r = records + (size_t)ids[n] * 16;                                                      \
+  if (inria_extent) {                                                                                           \
+    const float radius = r[15];                                                                                 \
+    const int x0 = (int)fmax(floor((r[0] - radius) * (1.0f / TILE)), 0.0f);                                     \
+    const int y0 = (int)fmax(floor((r[1] - radius) * (1.0f / TILE)), 0.0f);                                     \
+    const int x1 = (int)fmin(floor((r[0] + radius + (TILE - 1)) * (1.0f / TILE)) - 1.0f, (float)(tiles_x - 1)); \
+    const int y1 = (int)fmin(floor((r[1] + radius + (TILE - 1)) * (1.0f / TILE)) - 1.0f, (float)(tiles_y - 1)); \
+    for (int ty = y0; ty <= y1; ++ty)                                                                           \
+      for (int tx = x0; tx <= x1; ++tx) EACH(ty * tiles_x + tx, 0xFFFFu);                                       \
+  } else {                                                                                                      \
+    const float slack = fma(r[10], SPAN_SLACK_RELATIVE, SPAN_SLACK);                                            \
+    const int y0 = (int)fmax(ceil(r[1] - r[10] - slack), 0.0f);                                                 \
+    const int y1 = (int)fmin(floor(r[1] + r[10] + slack), height - 1.0f);                                       \
+    for (int top = y0 / TILE; top <= y1 / TILE; top += BANDS / 4) {                                             \
+      int first[BANDS], last[BANDS];                                                                            \
+      for (int v = 0; v < BANDS; v += W) {                                                                      \
+        IW f, l;                                                                                                \
+        block_spans(r, top * 4 + v, width, &f, &l);                                                             \
+        STOREI(f, first, v);                                                                                    \
+        STOREI(l, last, v);                                                                                     \
+      }                                                                                                         \
+      for (int t = 0; t < BANDS / 4 && top + t <= y1 / TILE; ++t) {                                             \
+        int from = INT_MAX, to = -1;                                                                            \
+        for (int row = 4 * t; row < 4 * t + 4; ++row)                                                           \
+          if (first[row] <= last[row]) {                                                                        \
+            from = min(from, first[row]);                                                                       \
+            to = max(to, last[row]);                                                                            \
+          }                                                                                                     \
+        if (to < 0) continue;                                                                                   \
+        for (int tx = from >> 2; tx <= to >> 2; ++tx) {                                                         \
+          const uint mask = tile_mask(first + 4 * t, last + 4 * t, tx);                                         \
+          if (mask) EACH((top + t) * tiles_x + tx, mask);                                                       \
+        }                                                                                                       \
+      }                                                                                                         \
+    }                                                                                                           \
+  }
+
+inline void splat_range(uint from, uint count, uint *start, uint *end) {
+  const uint blocks = get_global_size(0), block = get_global_id(0);
+  *start = from + (uint)((ulong)count * block / blocks);
+  *end = from + (uint)((ulong)count * (block + 1) / blocks);
+}
+
+__kernel void tile_count(
+    const uint from,                  // first splat of the batch in depth order
+    const uint count,                 // splats of the batch
+    const float width,                // pixels
+    const float height,
+    const int inria_extent,
+    __global const uint *ids,         // [shown] rows in depth order
+    __global const float *records,    // [N, 16]
+    __global uint *counts)            // [tiles, blocks]
+{
+  const uint blocks = get_global_size(0), block = get_global_id(0);
+  const int tiles_x = ((int)width + TILE - 1) / TILE, tiles_y = ((int)height + TILE - 1) / TILE;
+  uint start, end;
+  splat_range(from, count, &start, &end);
+  for (int tile = 0; tile < tiles_x * tiles_y; ++tile) counts[(size_t)tile * blocks + block] = 0;
+#define COUNT_PAIR(tile, mask) counts[(size_t)(tile) * blocks + block] += 1
+  for (uint n = start; n < end; ++n) {
+    FOR_EACH_TILE(COUNT_PAIR)
+  }
+}
+
+__kernel void tile_scatter(
+    const uint from,
+    const uint count,
+    const float width,
+    const float height,
+    const int inria_extent,
+    __global const uint *ids,         // [shown]
+    __global const float *records,    // [N, 16]
+    __global uint *offsets,           // [tiles, blocks] from the scan; advanced, so that a tile's end stands in its last column
+    __global uint2 *pairs)            // [capacity] row and block mask, tile by tile, in depth order
+{
+  const uint blocks = get_global_size(0), block = get_global_id(0);
+  const int tiles_x = ((int)width + TILE - 1) / TILE, tiles_y = ((int)height + TILE - 1) / TILE;
+  uint start, end;
+  splat_range(from, count, &start, &end);
+#define WRITE_PAIR(tile, mask) pairs[offsets[(size_t)(tile) * blocks + block]++] = (uint2)(ids[n], mask)
+  for (uint n = start; n < end; ++n) {
+    FOR_EACH_TILE(WRITE_PAIR)
+  }
+}

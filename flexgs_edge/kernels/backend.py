@@ -1,0 +1,172 @@
+"""The one interface that the renderer drives: OpenCL kernels or their NumPy twins."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from flexgs_edge.budget import MemoryBudget
+
+
+@dataclass(frozen=True)
+class KernelSpec:
+    """How a kernel is found and launched.
+
+    Parameters
+    ----------
+    file : str
+        Name in `cl_kernels/`; `{form}` is `cpu` or `gpu`.
+    signature : str
+        One letter an argument: u uint32, i int32, f float32, b array.
+    per : str
+        What a work-item is: `rows` (a vector of W rows; the launch size counts rows), `item` (one of the launch
+        size), `tile` (one item a tile on CPUs, a group of 256 on GPUs).
+    """
+
+    file: str
+    signature: str
+    per: str = "item"
+    kernel: str = ""
+    stats: int | None = None
+
+
+_BLEND = "uuiiii" + "fff" + "bbbbb"
+
+KERNELS: dict[str, KernelSpec] = {
+    "activate": KernelSpec("activate.cl", "ubbbbb", "rows"),
+    "project": KernelSpec("project.cl", "uuuiibbbbbbbbb", "rows"),
+    "sort_count_first": KernelSpec("sort.cl", "ubbbb"),
+    "sort_scatter_first": KernelSpec("sort.cl", "ubbbb"),
+    "sort_count": KernelSpec("sort.cl", "uubb"),
+    "sort_scatter": KernelSpec("sort.cl", "uubbbbb"),
+    "exclusive_scan": KernelSpec("sort.cl", "ub"),
+    "tile_count": KernelSpec("tiles.cl", "uuffibbb"),
+    "tile_scatter": KernelSpec("tiles.cl", "uuffibbbb"),
+    "blend": KernelSpec("blend_{form}.cl", _BLEND, "tile", stats=0),
+    "blend_stats": KernelSpec("blend_{form}.cl", _BLEND + "bbu", "tile", kernel="blend", stats=1),
+    "dequantize": KernelSpec("dequantize.cl", "uuuuuuubbbb"),
+}
+"""Every kernel by the name that `Backend.launch` and the twins share."""
+
+
+class Array(Protocol):
+    """An array in the backend's memory."""
+
+    shape: tuple[int, ...]
+    nbytes: int
+
+    def release(self) -> None:
+        """Free it."""
+
+
+class Backend(Protocol):
+    """Memory and kernels of one device (or of NumPy)."""
+
+    name: str
+    is_numpy: bool
+    sort_blocks: int
+    tile_blocks: int
+    startup_seconds: float
+    profile: defaultdict[str, float] | None
+
+    @property
+    def compile_seconds(self) -> float:
+        """Seconds spent building kernels so far."""
+
+    def describe(self) -> dict[str, Any]:
+        """What runs the kernels, for `--json`."""
+
+    def array(self, shape: tuple[int, ...], dtype: Any) -> Any:
+        """An array, not initialised, taken from the budget."""
+
+    def write(self, array: Any, values: np.ndarray, offset: int = 0) -> None:
+        """Copy values into an array."""
+
+    def read(self, array: Any, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
+        """Copy an array out."""
+
+    def fill(self, array: Any, value: int) -> None:
+        """Set every element."""
+
+    def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
+        """Run the kernel `name` over `size` rows, items or tiles."""
+
+    def close(self) -> None:
+        """Free what the backend holds."""
+
+
+class HostArray:
+    """An array of the NumPy backend."""
+
+    def __init__(self, budget: MemoryBudget, shape: tuple[int, ...], dtype: Any) -> None:
+        self.shape = shape
+        self.nbytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        self._budget = budget
+        budget.take("an array", self.nbytes)
+        self.data = np.zeros(shape, dtype)
+
+    def release(self) -> None:
+        """Free the array (once)."""
+        if self.nbytes >= 0:
+            self._budget.give(self.nbytes)
+            self.nbytes = -1
+            del self.data
+
+
+class TwinBackend:
+    """The NumPy twins: the specification, and the way to run where no OpenCL device works."""
+
+    name = "numpy"
+    is_numpy = True
+    sort_blocks = 4
+    tile_blocks = 4
+
+    def __init__(self, budget: MemoryBudget) -> None:
+        start = time.perf_counter()
+        from flexgs_edge.kernels.twins import TWINS
+
+        self._twins: dict[str, Callable[..., None]] = TWINS
+        self.budget = budget
+        self.profile: defaultdict[str, float] | None = None
+        self.startup_seconds = time.perf_counter() - start
+        self.compile_seconds = 0.0
+
+    def describe(self) -> dict[str, Any]:
+        """What runs the kernels."""
+        return {"backend": "numpy", "numpy": np.__version__}
+
+    def array(self, shape: tuple[int, ...], dtype: Any) -> HostArray:
+        """An array taken from the budget."""
+        return HostArray(self.budget, shape, dtype)
+
+    def write(self, array: HostArray, values: np.ndarray, offset: int = 0) -> None:
+        """Copy `values` to the flat element `offset` of `array`."""
+        values = np.ascontiguousarray(values, array.data.dtype)
+        array.data.reshape(-1)[offset : offset + values.size] = values.reshape(-1)
+
+    def read(self, array: HostArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
+        """Copy `array` out, from the flat element `offset` on."""
+        if out is None:
+            return array.data.copy()
+        out.reshape(-1)[:] = array.data.reshape(-1)[offset : offset + out.size]
+        return out
+
+    def fill(self, array: HostArray, value: int) -> None:
+        """Set every element."""
+        array.data.fill(value)
+
+    def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
+        """Run the twin `name`."""
+        start = time.perf_counter()
+        with np.errstate(all="ignore"):  # kernels do not trap either: culling tests are written to fail on NaN
+            self._twins[name](size, *(a.data if isinstance(a, HostArray) else a for a in args))
+        if self.profile is not None:
+            self.profile[name] += time.perf_counter() - start
+
+    def close(self) -> None:
+        """Nothing is held beyond the arrays."""

@@ -1,0 +1,106 @@
+"""The OpenCL backend: builds the kernels for one device and launches them by name."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.device.select import DeviceInfo
+from flexgs_edge.device.session import DeviceArray, Session
+from flexgs_edge.errors import DeviceError
+from flexgs_edge.kernels.backend import KERNELS
+from flexgs_edge.kernels.source import load_source
+
+GPU_GROUP = 64
+"""Work-group of the kernels with a row a work-item on GPUs (divides the padding of planes)."""
+
+
+class OpenCLBackend:
+    """Kernels and memory of one OpenCL device.
+
+    Parameters
+    ----------
+    info : DeviceInfo
+        The device.
+    budget : MemoryBudget
+        Buffers are taken from it.
+    width : int, optional
+        Lanes of a vector, 16, 8, 4 or 1. Default: the device's native width on CPUs, 1 on GPUs.
+    form : {"cpu", "gpu"}, optional
+        Shape of the blend kernel: a work-item a tile, or a work-group a tile. Default: by the device's type.
+    """
+
+    is_numpy = False
+
+    def __init__(self, info: DeviceInfo, budget: MemoryBudget, width: int | None = None, form: str | None = None) -> None:
+        start = time.perf_counter()
+        self.session = Session(info, budget)
+        self.form = form or ("gpu" if info.type == "gpu" else "cpu")
+        native = max(w for w in (16, 8, 4, 1) if w <= max(info.native_width, 1))
+        self.width = width or (1 if self.form == "gpu" else native)
+        if self.width not in (16, 8, 4, 1) or (self.form == "gpu" and self.width != 1):
+            raise DeviceError(f"vector width {self.width} of the {self.form} form: expected 16, 8, 4 or 1 (gpu: 1)")
+        self.name = f"{info.name} ({info.platform})"
+        # Blocks of the serial passes: enough to keep every unit busy to the end, few enough for short scans.
+        self.sort_blocks = self.tile_blocks = max(8 * info.compute_units, 16) if self.form == "cpu" else 64
+        self._kernels: dict[str, cl.Kernel] = {}
+        self.startup_seconds = time.perf_counter() - start
+
+    @property
+    def compile_seconds(self) -> float:
+        """Seconds spent building programs so far."""
+        return self.session.compile_seconds
+
+    @property
+    def profile(self) -> defaultdict[str, float] | None:
+        """Wall seconds by kernel when set (every launch then waits for the queue)."""
+        return self.session.profile
+
+    @profile.setter
+    def profile(self, value: defaultdict[str, float] | None) -> None:
+        self.session.profile = value
+
+    def describe(self) -> dict[str, Any]:
+        """What runs the kernels."""
+        return {"backend": "opencl", "width": self.width, "form": self.form, **self.session.info.to_json()}
+
+    def array(self, shape: tuple[int, ...], dtype: Any) -> DeviceArray:
+        """An array on the device, not initialised."""
+        return self.session.array(shape, dtype)
+
+    def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0) -> None:
+        """Copy `values` to the flat element `offset` of `array`."""
+        self.session.write(array, values, offset)
+
+    def read(self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
+        """Copy `array` to the host."""
+        return self.session.read(array, out, offset)
+
+    def fill(self, array: DeviceArray, value: int) -> None:
+        """Set every element of `array`."""
+        self.session.fill(array, value)
+
+    def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
+        """Enqueue the kernel `name` over `size` rows, items or tiles."""
+        spec = KERNELS[name]
+        if name not in self._kernels:
+            options = [f"-DW={self.width}"] + ([f"-DSTATS={spec.stats}"] if spec.stats is not None else [])
+            source = load_source(spec.file.format(form=self.form))
+            self._kernels[name] = self.session.kernel(source, spec.kernel or name, tuple(options), spec.signature)
+        local: tuple[int, ...] = (1,) * len(size)
+        if spec.per == "rows":
+            size = (size[0] // self.width,)
+            local = (GPU_GROUP if self.form == "gpu" else 1,)
+        elif spec.per == "tile" and self.form == "gpu":
+            size, local = (size[0] * 256,), (256,)
+        if size[0]:
+            self.session.launch(name, self._kernels[name], size, local, args)
+
+    def close(self) -> None:
+        """Wait for the queue; buffers are released by their owners."""
+        self.session.finish()

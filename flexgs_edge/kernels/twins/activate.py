@@ -1,0 +1,36 @@
+"""Twin of `cl_kernels/activate.cl`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexgs_edge.constants import ALPHA_MIN, LOG2_E
+from flexgs_edge.kernels.twins.arithmetic import dot3, f32, fexp2, flog2, fma
+
+
+def activate(
+    size: tuple[int, ...],
+    stride: int,
+    log_scales: np.ndarray,
+    quats: np.ndarray,
+    logits: np.ndarray,
+    cov: np.ndarray,
+    log2_opacity: np.ndarray,
+) -> None:
+    """Stored attributes to 3D covariance ([6, stride]) and log2 of the opacity ([stride], -inf below ALPHA_MIN)."""
+    s0, s1, s2 = (fexp2(row * f32(LOG2_E)) for row in log_scales)
+    big = np.fmax(np.fmax(np.abs(quats[0]), np.abs(quats[1])), np.fmax(np.abs(quats[2]), np.abs(quats[3])))
+    w, x, y, z = (row / big for row in quats)
+    inv = f32(1) / np.sqrt(fma(z, z, fma(y, y, fma(x, x, w * w))))
+    w, x, y, z = w * inv, x * inv, y * inv, z * inv
+
+    one, two = f32(1), f32(2)
+    m0 = (fma(-two, fma(z, z, y * y), one) * s0, two * fma(x, y, -(w * z)) * s1, two * fma(x, z, w * y) * s2)
+    m1 = (two * fma(x, y, w * z) * s0, fma(-two, fma(z, z, x * x), one) * s1, two * fma(y, z, -(w * x)) * s2)
+    m2 = (two * fma(x, z, -(w * y)) * s0, two * fma(y, z, w * x) * s1, fma(-two, fma(y, y, x * x), one) * s2)
+    for row, (a, b) in enumerate(((m0, m0), (m0, m1), (m0, m2), (m1, m1), (m1, m2), (m2, m2))):
+        cov[row] = dot3(*a, *b)
+
+    opacity = one / (one + fexp2(logits.reshape(-1) * f32(-LOG2_E)))
+    level = flog2(np.fmax(opacity, f32(ALPHA_MIN)))
+    log2_opacity[:] = np.where(opacity >= f32(ALPHA_MIN), level, f32(-np.inf))

@@ -1,0 +1,174 @@
+"""Twin of `cl_kernels/project.cl`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexgs_edge.constants import (
+    CULLED,
+    DILATION,
+    EXTENT_SLACK,
+    LOG2_255,
+    LOG2_E,
+    SH_C0,
+    SH_C1,
+    SH_C2,
+    SH_C3,
+    SH_C4,
+    SIGMA_RADIUS_INRIA,
+    SPAN_SLACK,
+    SPAN_SLACK_RELATIVE,
+    TILE,
+)
+from flexgs_edge.kernels.twins.arithmetic import dot3, f32, fma
+
+_LOG2_E = f32(LOG2_E)
+
+
+def sh_basis(degree: int, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[np.ndarray]:
+    """Basis functions above degree 0 in unit directions (x, y, z), in the written forms of project.cl."""
+    basis: list[np.ndarray] = []
+    if degree > 0:
+        c1 = f32(SH_C1)
+        basis += [-c1 * y, c1 * z, -c1 * x]
+    if degree > 1:
+        xx, yy, zz = x * x, y * y, z * z
+        c2 = [f32(c) for c in SH_C2]
+        basis += [c2[0] * (x * y), c2[1] * (y * z), c2[2] * ((zz + zz) - (xx + yy)), c2[3] * (x * z), c2[4] * (xx - yy)]
+    if degree > 2:
+        c3 = [f32(c) for c in SH_C3]
+        three, four = f32(3), f32(4)
+        basis += [
+            c3[0] * (y * (three * xx - yy)),
+            c3[1] * ((x * y) * z),
+            c3[2] * (y * (four * zz - (xx + yy))),
+            c3[3] * (z * (f32(2) * zz - three * (xx + yy))),
+            c3[4] * (x * (four * zz - (xx + yy))),
+            c3[5] * (z * (xx - yy)),
+            c3[6] * (x * (xx - three * yy)),
+        ]
+    if degree > 3:
+        c4 = [f32(c) for c in SH_C4]
+        one, three, seven = f32(1), f32(3), f32(7)
+        basis += [
+            c4[0] * ((x * y) * (xx - yy)),
+            c4[1] * ((y * z) * (three * xx - yy)),
+            c4[2] * ((x * y) * (seven * zz - one)),
+            c4[3] * ((y * z) * (seven * zz - three)),
+            c4[4] * (zz * (f32(35) * zz - f32(30)) + three),
+            c4[5] * ((x * z) * (seven * zz - three)),
+            c4[6] * ((xx - yy) * (seven * zz - one)),
+            c4[7] * ((x * z) * (xx - three * yy)),
+            c4[8] * (xx * (xx - three * yy) - yy * (three * xx - yy)),
+        ]
+    return basis
+
+
+def _bounds(
+    inria_extent: int, mx: np.ndarray, my: np.ndarray, half: tuple[np.ndarray, np.ndarray], radius: np.ndarray, cam: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Tiles of the bounding box, and whether there are any."""
+    per_tile, spans = f32(1.0 / TILE), []
+    for centre, half_extent, slack_factor, pixels in ((mx, half[0], f32(2), cam[24]), (my, half[1], f32(1), cam[25])):
+        if inria_extent:
+            first = np.floor((centre - radius) * per_tile)
+            last = np.floor((centre + radius + f32(TILE - 1)) * per_tile) - f32(1)
+        else:
+            slack = slack_factor * fma(half_extent, f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))
+            first = np.floor(np.ceil(centre - half_extent - slack) * per_tile)
+            last = np.floor(np.floor(centre + half_extent + slack) * per_tile)
+        first = np.fmax(first, f32(0))
+        last = np.fmin(last, np.floor((pixels - f32(1)) * per_tile))
+        spans.append((first, last))
+    (x0, x1), (y0, y1) = spans
+    return (x1 - x0 + f32(1)) * (y1 - y0 + f32(1)), (x1 >= x0) & (y1 >= y0)
+
+
+def project(
+    size: tuple[int, ...],
+    count: int,
+    stride: int,
+    base: int,
+    degree: int,
+    inria_extent: int,
+    camera: np.ndarray,
+    means: np.ndarray,
+    cov: np.ndarray,
+    log2_opacity: np.ndarray,
+    sh_dc: np.ndarray,
+    sh_rest: np.ndarray,
+    records: np.ndarray,
+    keys: np.ndarray,
+    bounds: np.ndarray,
+) -> None:
+    """Splat records ([N, 16]), depth keys and bounds ([N]) of rows [base, base + count)."""
+    cam = camera
+    px, py, pz = means[:, :count]
+    z = fma(cam[8], pz, fma(cam[6], px, cam[7] * py)) + cam[11]
+    level = log2_opacity[:count]
+    shown = (z > cam[16]) & (level > f32(-1e30))
+
+    x = fma(cam[2], pz, fma(cam[0], px, cam[1] * py)) + cam[9]
+    y = fma(cam[5], pz, fma(cam[3], px, cam[4] * py)) + cam[10]
+    iz = f32(1) / z
+    u, v = x * iz, y * iz
+    mx, my = fma(cam[12], u, cam[14]), fma(cam[13], v, cam[15])
+    uc, vc = np.fmin(np.fmax(u, cam[17]), cam[18]), np.fmin(np.fmax(v, cam[19]), cam[20])
+    j00, j11 = cam[12] * iz, cam[13] * iz
+    j02, j12 = -(j00 * uc), -(j11 * vc)
+    t0 = tuple(fma(j02, cam[6 + k], j00 * cam[k]) for k in range(3))
+    t1 = tuple(fma(j12, cam[6 + k], j11 * cam[3 + k]) for k in range(3))
+
+    cxx, cxy, cxz, cyy, cyz, czz = cov[:, :count]
+    v0 = (dot3(cxx, cxy, cxz, *t0), dot3(cxy, cyy, cyz, *t0), dot3(cxz, cyz, czz, *t0))
+    a, b = dot3(*t0, *v0) + f32(DILATION), dot3(*t1, *v0)
+    v1 = (dot3(cxx, cxy, cxz, *t1), dot3(cxy, cyy, cyz, *t1), dot3(cxz, cyz, czz, *t1))
+    c = dot3(*t1, *v1) + f32(DILATION)
+
+    bb = b * b
+    det = fma(a, c, -bb) + fma(-b, b, bb)
+    t2 = np.fmax((level + (f32(LOG2_255) + f32(EXTENT_SLACK))) * (f32(2) / _LOG2_E), f32(0))
+    half = (np.sqrt(t2 * a), np.sqrt(t2 * c))
+    reach, radius = half, np.zeros_like(a)
+    if inria_extent:
+        mid = f32(0.5) * (a + c)
+        spread = np.sqrt(np.fmax(f32(0.1), mid * mid - det))
+        radius = np.ceil(f32(SIGMA_RADIUS_INRIA) * np.sqrt(mid + spread))
+        reach = (radius + f32(TILE), radius + f32(TILE))
+    shown &= (det > 0) & (det < np.inf) & (a < np.inf) & (c < np.inf)
+    shown &= (mx + reach[0] >= f32(-1)) & (mx - reach[0] <= cam[24])
+    shown &= (my + reach[1] >= f32(-1)) & (my - reach[1] <= cam[25])
+
+    k = (f32(1) / det) * (f32(0.5) * _LOG2_E)
+    ic = f32(1) / c
+    tiles, some = _bounds(inria_extent, mx, my, half, radius, cam)
+    shown &= some
+
+    rows = np.flatnonzero(shown)
+    colours = _colours(rows, degree, cam, (px, py, pz), sh_dc, sh_rest)
+    out = [mx, my, c * k, -(b + b) * k, a * k, level, *colours]
+    out += [(b / a) * half[0], half[1], b * ic, ic, det * ic, t2, radius]
+    for field, values in enumerate(out):
+        records[base + rows, field] = values if 6 <= field <= 8 else values[rows]
+    keys[base : base + count] = np.where(shown, z.view(np.uint32), np.uint32(CULLED))
+    bounds[base : base + count] = np.where(shown, tiles, 0).astype(np.uint32)
+
+
+def _colours(
+    rows: np.ndarray,
+    degree: int,
+    cam: np.ndarray,
+    position: tuple[np.ndarray, np.ndarray, np.ndarray],
+    sh_dc: np.ndarray,
+    sh_rest: np.ndarray,
+) -> list[np.ndarray]:
+    dx, dy, dz = (p[rows] - cam[21 + k] for k, p in enumerate(position))
+    norm = f32(1) / np.sqrt(dot3(dx, dy, dz, dx, dy, dz))
+    basis = sh_basis(degree, dx * norm, dy * norm, dz * norm)
+    colours = []
+    for channel in range(3):
+        colour = f32(SH_C0) * sh_dc[channel, rows]
+        for k, function in enumerate(basis):
+            colour = fma(function, sh_rest[channel * len(basis) + k, rows], colour)
+        colours.append(np.fmax(colour + f32(0.5), f32(0)))
+    return colours

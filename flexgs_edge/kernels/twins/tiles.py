@@ -1,0 +1,110 @@
+"""Twins of `cl_kernels/tiles.cl`: tile lists in depth order with block masks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexgs_edge.constants import BLOCK, SPAN_SLACK, SPAN_SLACK_RELATIVE, TILE
+from flexgs_edge.kernels.twins.arithmetic import f32, fma
+from flexgs_edge.kernels.twins.sort import block_of
+
+_BANDS = np.arange(TILE // BLOCK, dtype=np.int32)
+
+
+def block_spans(records: np.ndarray, bands: np.ndarray, width: np.float32) -> tuple[np.ndarray, np.ndarray]:
+    """First and last block column ([m, 4] i32) of splats ([m, 16]) over four block rows each ([m, 4]); first > last: none."""
+    mx, my, turn, hh, slope, ic, root_scale, level = (records[:, k : k + 1] for k in (0, 1, 9, 10, 11, 12, 13, 14))
+    top = (bands * BLOCK).astype(f32) - my
+    slack = fma(hh, f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))
+    low, high = np.fmax(top, -(hh + slack)), np.fmin(top + f32(BLOCK - 1), hh + slack)
+    right_dy, left_dy = np.fmin(np.fmax(turn, low), high), np.fmin(np.fmax(-turn, low), high)
+    right_root = np.sqrt(np.fmax(level - right_dy * right_dy * ic, f32(0)) * root_scale)
+    left_root = np.sqrt(np.fmax(level - left_dy * left_dy * ic, f32(0)) * root_scale)
+    right, left = fma(slope, right_dy, right_root), fma(slope, left_dy, -left_root)
+    right_slack = fma(np.abs(slope * right_dy) + right_root, f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))
+    left_slack = fma(np.abs(slope * left_dy) + left_root, f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))
+    x0 = np.fmin(np.fmax(np.ceil(mx + left - left_slack), f32(0)), width)
+    x1 = np.fmin(np.fmax(np.floor(mx + right + right_slack), f32(-1)), width - f32(1))
+    some = (low <= high) & (x0 <= x1)
+    return np.where(some, x0.astype(np.int32) >> 2, 1), np.where(some, x1.astype(np.int32) >> 2, 0)
+
+
+def _expand(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(owner, value) for every value in [first, last] of each owner."""
+    counts = np.maximum(last - first + 1, 0)
+    owner = np.repeat(np.arange(len(counts)), counts)
+    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return owner, first[owner] + within
+
+
+def list_pairs(
+    ids: np.ndarray, records: np.ndarray, width: np.float32, height: np.float32, inria_extent: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(index into ids, tile, mask) of every pair, splat by splat in the order of `ids`."""
+    splats = records[ids]
+    tiles_x, tiles_y = -(-int(width) // TILE), -(-int(height) // TILE)
+    if inria_extent:
+        spans = []
+        for centre, most in ((splats[:, 0], tiles_x), (splats[:, 1], tiles_y)):
+            radius = splats[:, 15]
+            first = np.fmax(np.floor((centre - radius) * f32(1 / TILE)), f32(0))
+            last = np.fmin(np.floor((centre + radius + f32(TILE - 1)) * f32(1 / TILE)) - f32(1), f32(most - 1))
+            spans.append((first.astype(np.int64), last.astype(np.int64)))
+        splat, ty = _expand(*spans[1])
+        row, tx = _expand(spans[0][0][splat], spans[0][1][splat])
+        return splat[row], ty[row] * tiles_x + tx, np.full(len(tx), 0xFFFF, np.uint32)
+    slack = fma(splats[:, 10], f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))
+    y0 = np.fmax(np.ceil(splats[:, 1] - splats[:, 10] - slack), f32(0)).astype(np.int64)
+    y1 = np.fmin(np.floor(splats[:, 1] + splats[:, 10] + slack), height - f32(1)).astype(np.int64)
+    splat, ty = _expand(y0 // TILE, y1 // TILE)
+    first, last = block_spans(splats[splat], (ty[:, None] * (TILE // BLOCK) + _BANDS).astype(np.int32), width)
+    some = first <= last
+    row, tx = _expand(
+        np.where(some, first, np.iinfo(np.int32).max).min(axis=1, initial=np.iinfo(np.int32).max) >> 2,
+        np.where(some, last, -1).max(axis=1, initial=-1) >> 2,
+    )
+    start = np.maximum(first[row] - 4 * tx[:, None], 0)
+    end = np.minimum(last[row] - 4 * tx[:, None], 3)
+    bits = ((1 << (np.clip(end, 0, 3) + 1)) - 1) & ~((1 << np.clip(start, 0, 4)) - 1)
+    mask = np.where(some[row] & (start <= end), bits << (4 * _BANDS), 0).sum(axis=1).astype(np.uint32)
+    keep = mask != 0
+    return splat[row][keep], (ty[row] * tiles_x + tx)[keep], mask[keep]
+
+
+def tile_count(
+    size: tuple[int, ...],
+    start: int,
+    count: int,
+    width: float,
+    height: float,
+    inria_extent: int,
+    ids: np.ndarray,
+    records: np.ndarray,
+    counts: np.ndarray,
+) -> None:
+    """Pairs by tile and block of splats ([tiles, blocks]) of the depth-ordered splats [start, start + count)."""
+    splat, tile, _ = list_pairs(ids[start : start + count], records, f32(width), f32(height), inria_extent)
+    cells = tile * size[0] + block_of(count, size[0])[splat]
+    counts[:-1] = np.bincount(cells, minlength=len(counts) - 1)
+
+
+def tile_scatter(
+    size: tuple[int, ...],
+    start: int,
+    count: int,
+    width: float,
+    height: float,
+    inria_extent: int,
+    ids: np.ndarray,
+    records: np.ndarray,
+    offsets: np.ndarray,
+    pairs: np.ndarray,
+) -> None:
+    """Writes (row, mask) tile by tile in depth order; `offsets` end up at each cell's end."""
+    batch = ids[start : start + count]
+    splat, tile, mask = list_pairs(batch, records, f32(width), f32(height), inria_extent)
+    cells = tile * size[0] + block_of(count, size[0])[splat]
+    order = np.argsort(cells, kind="stable")
+    pairs[: len(order), 0] = batch[splat[order]]
+    pairs[: len(order), 1] = mask[order]
+    offsets[:-1] += np.bincount(cells, minlength=len(offsets) - 1).astype(np.uint32)

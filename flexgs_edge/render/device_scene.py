@@ -1,0 +1,208 @@
+"""A scene in the backend's memory, by chunks: kept there when it fits, streamed view by view when it does not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.constants import DEQUANTIZE_ROWS, LANES
+from flexgs_edge.kernels import Backend
+from flexgs_edge.quantize import QuantizedArray, QuantizedScene
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import SceneSource
+
+CHUNK_ROWS = 1 << 18
+"""Most rows of a chunk: 60 MB of planes at SH degree 3, large enough that launches cost nothing."""
+MIN_CHUNK_ROWS = 1 << 10
+VIEW_BYTES = 64 + 4 + 4 + 4 * 4
+"""Bytes a row that a view needs beside the scene: record, key, bound, and the sort's two pairs of buffers."""
+
+
+def plane_bytes(sh_degree: int) -> int:
+    """Bytes a row of an activated chunk: means, covariance, log2 of the opacity, colour."""
+    return 4 * (3 + 6 + 1 + 3 + FIELD["sh_rest"].width(sh_degree))
+
+
+def upload_bytes(sh_degree: int) -> int:
+    """Bytes a row that loading needs on top for a moment: stored scale, rotation, opacity, and all planes on the host."""
+    return 4 * (3 + 4 + 1) + 4 * (3 + 3 + 4 + 1 + 3 + FIELD["sh_rest"].width(sh_degree))
+
+
+@dataclass
+class Chunk:
+    """Planes of rows [base, base + count) of a scene, ready for `project`."""
+
+    base: int
+    count: int
+    stride: int
+    degree: int
+    means: Any
+    cov: Any
+    log2_opacity: Any
+    sh_dc: Any
+    sh_rest: Any
+
+    def release(self) -> None:
+        """Free the planes."""
+        for array in (self.means, self.cov, self.log2_opacity, self.sh_dc, self.sh_rest):
+            array.release()
+
+
+def padded(count: int) -> int:
+    """Elements of a plane that holds `count` rows."""
+    return -(-count // LANES) * LANES
+
+
+def activate_chunk(backend: Backend, base: int, count: int, degree: int, planes: dict[str, Any]) -> Chunk:
+    """Activate stored planes (arrays of the backend with `padded(count)` columns) and free what is not needed after."""
+    stride = padded(count)
+    cov = backend.array((6, stride), np.float32)
+    log2_opacity = backend.array((stride,), np.float32)
+    backend.launch(
+        "activate", (stride,), stride, planes["log_scales"], planes["quats"], planes["opacity_logits"], cov, log2_opacity
+    )
+    for name in ("log_scales", "quats", "opacity_logits"):
+        planes[name].release()
+    return Chunk(base, count, stride, degree, planes["means"], cov, log2_opacity, planes["sh_dc"], planes["sh_rest"])
+
+
+class SourcePlanes:
+    """Fills chunks from a `SceneSource`."""
+
+    def __init__(self, backend: Backend, source: SceneSource) -> None:
+        self.backend = backend
+        self.source = source
+        self.count, self.sh_count, self.sh_degree = source.count, source.sh_count, source.sh_degree
+        self.origin = source.origin
+        self.upload_bytes = upload_bytes(source.sh_degree)
+
+    def load(self, start: int, stop: int, degree: int) -> dict[str, Any]:
+        """Arrays of the backend, [width, padded(stop - start)], by field name."""
+        stride = padded(stop - start)
+        names = [name for name in FIELD if degree or name != "sh_rest"]
+        host = self.source.read(slice(start, stop), names)
+        planes = {}
+        for name, field in FIELD.items():
+            planes[name] = self.backend.array((field.width(degree), stride), np.float32)
+            for channel in range(field.width(degree)):
+                self.backend.write(planes[name], host[name][channel], channel * stride)
+        return planes
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class QuantizedPlanes:
+    """Fills chunks from a quantized scene: codes and ranges are copied to the backend once and dequantized there."""
+
+    def __init__(self, backend: Backend, quantized: QuantizedScene) -> None:
+        self.backend = backend
+        self.count, self.sh_count, self.sh_degree = quantized.count, quantized.sh_count, quantized.sh_degree
+        self.origin = quantized.origin
+        self.upload_bytes = 4 * (3 + 4 + 1)
+        self._arrays: dict[str, tuple[QuantizedArray, Any, Any, Any]] = {}
+        for name, array in quantized.arrays.items():
+            # Three spare bytes: the kernel reads a code through a window of three.
+            codes = backend.array((array.planes.size + 3,), np.uint8)
+            backend.write(codes, array.planes.reshape(-1))
+            low = backend.array(array.low.shape, np.float32)
+            step = backend.array(array.step.shape, np.float32)
+            backend.write(low, array.low)
+            backend.write(step, array.step)
+            self._arrays[name] = (array, codes, low, step)
+
+    def load(self, start: int, stop: int, degree: int) -> dict[str, Any]:
+        """Arrays of the backend, [width, padded(stop - start)], by field name."""
+        rows, stride = stop - start, padded(stop - start)
+        planes = {}
+        for name, field in FIELD.items():
+            width = field.width(degree)
+            planes[name] = self.backend.array((width, stride), np.float32)
+            if width == 0:
+                continue
+            array, codes, low, step = self._arrays[name]
+            size = (-(-rows // DEQUANTIZE_ROWS), width)
+            self.backend.launch(
+                "dequantize", size, array.count, array.groups, array.bits, array.planes.shape[1], start, rows, stride,
+                codes, low, step, planes[name],
+            )  # fmt: skip
+        return planes
+
+    def close(self) -> None:
+        """Free codes and ranges."""
+        for _, *arrays in self._arrays.values():
+            for array in arrays:
+                array.release()
+        self._arrays = {}
+
+
+class DeviceScene:
+    """A scene on a backend. Iterate over `chunks()` for every view; close when done.
+
+    Parameters
+    ----------
+    backend : Backend
+    planes : SourcePlanes or QuantizedPlanes
+        Asked for each chunk once when the scene fits into the budget, once a view when it does not.
+    budget : MemoryBudget
+    """
+
+    def __init__(self, backend: Backend, planes: SourcePlanes | QuantizedPlanes, budget: MemoryBudget) -> None:
+        self.backend = backend
+        self.count = planes.count
+        self.origin = planes.origin
+        self.statistics: list[Any] = []
+        self._planes = planes
+        self._resident: list[Chunk] = []
+        activated, on_top = plane_bytes(planes.sh_degree), planes.upload_bytes
+        sh_less = plane_bytes(0)
+        view = VIEW_BYTES * self.count
+        whole = planes.sh_count * activated + (self.count - planes.sh_count) * sh_less + view
+        most = min(CHUNK_ROWS, max(self.count, 1))
+        least = min(MIN_CHUNK_ROWS, most)
+        self.resident = budget.free >= whole + most * on_top
+        if self.resident:
+            self._rows = most
+            self._resident = [self._load(*span) for span in self._spans()]
+        else:
+            self._rows = budget.rows("a chunk of the scene", activated + on_top, view, minimum=least, most=most)
+
+    def _spans(self) -> Iterator[tuple[int, int, int]]:
+        """(start, stop, degree): rows with SH first, then the block without."""
+        planes = self._planes
+        parts = ((0, planes.sh_count, planes.sh_degree), (planes.sh_count, planes.count, 0))
+        for first, last, degree in parts:
+            for start in range(first, last, self._rows):
+                yield start, min(start + self._rows, last), degree
+
+    def _load(self, start: int, stop: int, degree: int) -> Chunk:
+        return activate_chunk(self.backend, start, stop - start, degree, self._planes.load(start, stop, degree))
+
+    def chunks(self) -> Iterator[Chunk]:
+        """The scene's chunks in row order; a streamed chunk lives until the next one is asked for."""
+        if self.resident:
+            yield from self._resident
+            return
+        for span in self._spans():
+            chunk = self._load(*span)
+            try:
+                yield chunk
+            finally:
+                chunk.release()
+
+    def close(self) -> None:
+        """Free everything."""
+        for held in (*self._resident, *self.statistics):
+            held.release()
+        self._resident, self.statistics = [], []
+        self._planes.close()
+
+    def __enter__(self) -> DeviceScene:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()

@@ -1,0 +1,253 @@
+"""A view of a scene: projection, depth order, tile lists, blending, in depth-ordered batches of a bounded size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.cameras import Camera
+from flexgs_edge.constants import DEFAULT_NEAR, FIXED_POINT_BITS, JACOBIAN_MARGIN, TILE
+from flexgs_edge.errors import InputError
+from flexgs_edge.kernels import Backend
+from flexgs_edge.quantize import QuantizedScene
+from flexgs_edge.render.device_scene import DeviceScene, QuantizedPlanes, SourcePlanes
+from flexgs_edge.scene.source import SceneSource
+
+SORT_DIGIT_BITS = 11
+SORT_DIGITS = 1 << SORT_DIGIT_BITS
+PAIR_BYTES = 8
+DEFAULT_PAIRS = 1 << 22
+"""Pairs of a batch when memory allows: 32 MiB, one batch for most views."""
+EXTENTS = ("exact", "inria")
+
+
+@dataclass
+class Statistics:
+    """Sums over the views added so far, one entry a row of the scene.
+
+    Attributes
+    ----------
+    hits : np.ndarray
+        [N] i64, pixels at which the Gaussian was blended.
+    weights : np.ndarray
+        [N] u64, sum of alpha T over pixels in fixed point of `FIXED_POINT_BITS` fraction bits: adding is exact, so any
+        order of views, chunks and workers gives the same bits.
+    """
+
+    hits: np.ndarray
+    weights: np.ndarray
+
+    @classmethod
+    def zeros(cls, count: int) -> Statistics:
+        """Statistics of no view."""
+        return cls(np.zeros(count, np.int64), np.zeros(count, np.uint64))
+
+    @property
+    def weight_sums(self) -> np.ndarray:
+        """[N] f64, sum of alpha T."""
+        return self.weights * 2.0**-FIXED_POINT_BITS
+
+
+def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray:
+    """The 32 floats that `project` reads, for a scene re-centred at `origin` ([3] f64, world).
+
+    Everything is computed in float64 and rounded once.
+    """
+    moved = camera.moved(origin)
+    x_low = -(moved.cx + 0.5) / moved.fx - JACOBIAN_MARGIN * moved.width / moved.fx
+    x_high = (moved.width - 0.5 - moved.cx) / moved.fx + JACOBIAN_MARGIN * moved.width / moved.fx
+    y_low = -(moved.cy + 0.5) / moved.fy - JACOBIAN_MARGIN * moved.height / moved.fy
+    y_high = (moved.height - 0.5 - moved.cy) / moved.fy + JACOBIAN_MARGIN * moved.height / moved.fy
+    record = np.zeros(32)
+    record[0:9] = moved.rotation.reshape(-1)
+    record[9:12] = moved.translation
+    record[12:16] = moved.fx, moved.fy, moved.cx, moved.cy
+    record[16:21] = near, x_low, x_high, y_low, y_high
+    record[21:24] = moved.center
+    record[24:26] = moved.width, moved.height
+    return record.astype(np.float32)
+
+
+class _ViewBuffers:
+    """Buffers that live as long as the views have one size and one number of rows."""
+
+    def __init__(self, backend: Backend, count: int, width: int, height: int, budget: MemoryBudget) -> None:
+        self.key = (count, width, height)
+        self.tiles_x, self.tiles_y = -(-width // TILE), -(-height // TILE)
+        self.tiles = self.tiles_x * self.tiles_y
+        self.arrays: list[Any] = []
+        self.padded_height, self.padded_width = self.tiles_y * TILE, self.tiles_x * TILE
+
+        def array(shape: tuple[int, ...], dtype: Any) -> Any:
+            made = backend.array(shape, dtype)
+            self.arrays.append(made)
+            return made
+
+        try:
+            self.camera = array((32,), np.float32)
+            self.records = array((count, 16), np.float32)
+            self.keys = array((count,), np.uint32)
+            self.bounds = array((count,), np.uint32)
+            self.sorted = [(array((count,), np.uint32), array((count,), np.uint32)) for _ in range(2)]
+            self.digits = array((SORT_DIGITS * backend.sort_blocks + 1,), np.uint32)
+            self.block_pairs = array((backend.sort_blocks,), np.uint64)
+            self.ends = array((self.tiles * backend.tile_blocks + 1,), np.uint32)
+            self.state = array((self.tiles, 4, TILE * TILE), np.float32)
+            self.image = array((3, self.padded_height, self.padded_width), np.float32)
+            # One splat may touch every tile, so no batch can be smaller than that.
+            self.capacity = budget.rows("the tile lists", PAIR_BYTES, 0, minimum=self.tiles, most=max(DEFAULT_PAIRS, self.tiles))
+            self.pairs = array((self.capacity, 2), np.uint32)
+        except BaseException:
+            self.release()
+            raise
+
+    def release(self) -> None:
+        for array in self.arrays:
+            array.release()
+        self.arrays = []
+
+
+class Renderer:
+    """Renders views and sums statistics on a backend.
+
+    Parameters
+    ----------
+    backend : Backend
+        From `flexgs_edge.kernels.open_backend`.
+    budget : MemoryBudget
+    near : float
+        Near plane, scene units.
+    background : sequence of float
+        Red, green, blue in [0, 1].
+    extent : {"exact", "inria"}
+        Pixels that a splat may reach: the ellipse of alpha >= 1/255, or the reference rasteriser's tiles of ceil(3 sigma).
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        budget: MemoryBudget,
+        near: float = DEFAULT_NEAR,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        extent: str = "exact",
+    ) -> None:
+        if extent not in EXTENTS:
+            raise InputError(f"extent {extent!r}: expected one of {', '.join(EXTENTS)}")
+        self.backend = backend
+        self.budget = budget
+        self.near = near
+        self.background = tuple(float(np.float32(c)) for c in background)
+        self.inria_extent = int(extent == "inria")
+        self.pairs_listed = 0
+        self.splats_shown = 0
+        self._buffers: _ViewBuffers | None = None
+
+    def load(self, source: SceneSource) -> DeviceScene:
+        """Bring a scene to the backend (all of it, or chunk by chunk for each view when it does not fit)."""
+        self.release()
+        return DeviceScene(self.backend, SourcePlanes(self.backend, source), self.budget)
+
+    def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
+        """Bring a quantized scene to the backend, dequantized there."""
+        self.release()
+        return DeviceScene(self.backend, QuantizedPlanes(self.backend, quantized), self.budget)
+
+    def render(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
+        """The image of `scene` from `camera` (world coordinates).
+
+        Returns
+        -------
+        np.ndarray
+            [H, W, 3] f32, linear in the model's own colour space, not clamped.
+        """
+        self._draw(scene, camera, "blend", ())
+        buffers = self._buffers
+        assert buffers is not None
+        planes = self.backend.read(buffers.image)
+        return planes[:, : camera.height, : camera.width].transpose(1, 2, 0)
+
+    def add_statistics(self, scene: DeviceScene, camera: Camera, statistics: Statistics) -> None:
+        """Add one view to `statistics` (hits and weights of every row)."""
+        if not scene.statistics:
+            scene.statistics = [self.backend.array((scene.count,), np.uint32), self.backend.array((2, scene.count), np.uint32)]
+        hits, weights = scene.statistics
+        self.backend.fill(hits, 0)
+        self.backend.fill(weights, 0)
+        self._draw(scene, camera, "blend_stats", (hits, weights, scene.count))
+        statistics.hits += self.backend.read(hits)
+        words = self.backend.read(weights).astype(np.uint64)
+        statistics.weights += words[0] + (words[1] << np.uint64(32))
+
+    def _draw(self, scene: DeviceScene, camera: Camera, blend: str, extra: tuple[Any, ...]) -> None:
+        backend = self.backend
+        buffers = self._view_buffers(scene, camera)
+        backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
+        for chunk in scene.chunks():
+            backend.launch(
+                "project", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, self.inria_extent,
+                buffers.camera, chunk.means, chunk.cov, chunk.log2_opacity, chunk.sh_dc, chunk.sh_rest,
+                buffers.records, buffers.keys, buffers.bounds,
+            )  # fmt: skip
+        shown, pairs = self._sort(scene.count, buffers)
+        self.splats_shown = shown
+        batches = [(0, shown)] if pairs <= buffers.capacity else self._batches(buffers, shown)
+        self.pairs_listed = 0
+        for index, (start, stop) in enumerate(batches):
+            self._list_tiles(buffers, camera, start, stop - start)
+            backend.launch(
+                blend, (buffers.tiles,), buffers.tiles_x, backend.tile_blocks, camera.width, camera.height,
+                int(index > 0), int(index == len(batches) - 1), *self.background,
+                buffers.ends, buffers.pairs, buffers.records, buffers.state, buffers.image, *extra,
+            )  # fmt: skip
+
+    def _view_buffers(self, scene: DeviceScene, camera: Camera) -> _ViewBuffers:
+        key = (scene.count, camera.width, camera.height)
+        if self._buffers is None or self._buffers.key != key:
+            self.release()
+            self._buffers = _ViewBuffers(self.backend, *key, self.budget)
+        return self._buffers
+
+    def _sort(self, count: int, buffers: _ViewBuffers) -> tuple[int, int]:
+        """Depth order of the shown splats into `buffers.sorted[0]`; how many there are, and a bound on their pairs."""
+        backend, blocks = self.backend, self.backend.sort_blocks
+        (keys_a, ids_a), (keys_b, ids_b) = buffers.sorted
+        cells = SORT_DIGITS * blocks
+        backend.launch("sort_count_first", (blocks,), count, buffers.keys, buffers.bounds, buffers.digits, buffers.block_pairs)
+        backend.launch("exclusive_scan", (1,), cells, buffers.digits)
+        backend.launch("sort_scatter_first", (blocks,), count, buffers.keys, buffers.digits, keys_a, ids_a)
+        shown = int(backend.read(buffers.digits, np.empty(1, np.uint32), cells)[0])
+        pairs = int(backend.read(buffers.block_pairs).sum())
+        for shift in (SORT_DIGIT_BITS, 2 * SORT_DIGIT_BITS):
+            backend.launch("sort_count", (blocks,), shown, shift, keys_a, buffers.digits)
+            backend.launch("exclusive_scan", (1,), cells, buffers.digits)
+            backend.launch("sort_scatter", (blocks,), shown, shift, keys_a, ids_a, buffers.digits, keys_b, ids_b)
+            (keys_a, ids_a), (keys_b, ids_b) = (keys_b, ids_b), (keys_a, ids_a)
+        return shown, pairs
+
+    def _batches(self, buffers: _ViewBuffers, shown: int) -> list[tuple[int, int]]:
+        """Splits of the depth order whose pairs fit the buffer."""
+        order = self.backend.read(buffers.sorted[0][1], np.empty(shown, np.uint32))
+        ends = np.cumsum(self.backend.read(buffers.bounds)[order], dtype=np.int64)
+        batches, start, done = [], 0, 0
+        while start < shown:
+            stop = int(np.searchsorted(ends, done + buffers.capacity, side="right"))
+            batches.append((start, stop))
+            start, done = stop, int(ends[stop - 1])
+        return batches
+
+    def _list_tiles(self, buffers: _ViewBuffers, camera: Camera, start: int, count: int) -> None:
+        backend, blocks = self.backend, self.backend.tile_blocks
+        shared = (start, count, camera.width, camera.height, self.inria_extent, buffers.sorted[0][1], buffers.records)
+        backend.launch("tile_count", (blocks,), *shared, buffers.ends)
+        backend.launch("exclusive_scan", (1,), buffers.tiles * blocks, buffers.ends)
+        backend.launch("tile_scatter", (blocks,), *shared, buffers.ends, buffers.pairs)
+
+    def release(self) -> None:
+        """Free the view's buffers (they come back with the next view)."""
+        if self._buffers is not None:
+            self._buffers.release()
+            self._buffers = None
