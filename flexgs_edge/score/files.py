@@ -1,0 +1,54 @@
+"""Scores kept in NumPy files, so that another target takes one search and no scoring."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.scene.atomic import atomic_write
+
+
+def load_scores(path: str | Path, count: int) -> np.ndarray:
+    """Scores from a `.npy` file, or from a `.npz` file with one array.
+
+    Returns
+    -------
+    np.ndarray
+        [count] f64.
+
+    Raises
+    ------
+    InputError
+        Naming what was found when it is not one array of `count` numbers without NaN (+inf is refused too; -inf, "never
+        seen", is allowed).
+    """
+    path = Path(path)
+    try:
+        loaded = np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such score file (.npy or .npz)") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: not a NumPy file of scores: {error}") from error
+    if isinstance(loaded, np.lib.npyio.NpzFile):
+        with loaded as archive:
+            if len(archive.files) != 1:
+                raise InputError(f"{path}: expected one array, found {len(archive.files)}: {', '.join(archive.files)}")
+            loaded = archive[archive.files[0]]
+    if loaded.shape != (count,) or loaded.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: expected {count} numbers, one a Gaussian of the scene; found shape {loaded.shape}, dtype {loaded.dtype}"
+        )
+    scores = loaded.astype(np.float64)
+    bad = np.flatnonzero(np.isnan(scores) | (scores == np.inf))
+    if len(bad):
+        raise InputError(f"{path}: {len(bad)} scores are NaN or +inf, the first at row {bad[0]}: expected numbers to rank by")
+    return scores
+
+
+def save_scores(path: str | Path, scores: np.ndarray, force: bool = False) -> None:
+    """Write scores ([N] f64) as `.npy`, through a temporary file."""
+    with atomic_write(Path(path), force) as file:
+        np.save(file, scores)
