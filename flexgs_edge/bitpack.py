@@ -1,0 +1,131 @@
+"""Codes of 1 to 16 bits in byte strings, least significant bit first: the code of row i starts at bit i * bits.
+
+Eight codes of b bits fill exactly b bytes, so every width has whole bytes at every eighth row: eight codes are put
+together in two 64-bit words and their first b bytes are kept. Any row range can be read without the rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+MAX_BITS = 16
+"""Widest code: two bytes."""
+
+
+def plane_bytes(rows: int, bits: int) -> int:
+    """Bytes of `rows` codes of `bits` bits.
+
+    >>> plane_bytes(3, 4), plane_bytes(0, 7), plane_bytes(9, 1)
+    (2, 0, 2)
+    """
+    return (rows * bits + 7) // 8
+
+
+def pack(codes: np.ndarray, bits: int) -> np.ndarray:
+    """Codes as bytes; unused bits of the last byte are zero.
+
+    Parameters
+    ----------
+    codes : np.ndarray
+        [n] u16, each below 2^bits (higher bits are not masked).
+    bits : int
+        1 to 16.
+
+    Returns
+    -------
+    np.ndarray
+        [ceil(n * bits / 8)] u8.
+    """
+    n = len(codes)
+    if bits == 16:
+        return codes.astype("<u2", copy=False).view(np.uint8)
+    if bits == 8:
+        return codes.astype(np.uint8)
+    if n % 8:
+        codes = np.concatenate([codes, np.zeros(-n % 8, codes.dtype)])
+    if bits == 4:
+        pairs = codes.astype(np.uint8)
+        packed = pairs[0::2] | (pairs[1::2] << np.uint8(4))
+    elif bits == 1:
+        packed = np.packbits(codes.astype(np.uint8), bitorder="little")
+    else:
+        eights = codes.astype("<u8").reshape(-1, 8)
+        first, second = _join(eights[:, :4], bits), _join(eights[:, 4:], bits)
+        words = np.empty((len(eights), 2), "<u8")
+        words[:, 0] = first | (second << np.uint64(4 * bits))
+        words[:, 1] = second >> np.uint64(64 - 4 * bits)
+        packed = words.view(np.uint8)[:, :bits].reshape(-1)
+    return packed[: plane_bytes(n, bits)]
+
+
+def unpack(plane: np.ndarray, bits: int, start: int, stop: int) -> np.ndarray:
+    """Codes of rows [start, stop) of a packed plane.
+
+    Parameters
+    ----------
+    plane : np.ndarray
+        [bytes] u8, contiguous, as `pack` made it.
+    bits : int
+        1 to 16.
+    start, stop : int
+        Rows, 0 <= start <= stop <= rows of the plane.
+
+    Returns
+    -------
+    np.ndarray
+        [stop - start] u16.
+    """
+    if stop <= start:
+        return np.zeros(0, np.uint16)
+    if bits == 16:
+        return plane[2 * start : 2 * stop].view("<u2").astype(np.uint16, copy=False)
+    if bits == 8:
+        return plane[start:stop].astype(np.uint16)
+    head = start // 8 * 8
+    used = plane[head * bits // 8 : plane_bytes(stop, bits)]
+    if bits == 4:
+        codes = np.empty(2 * len(used), np.uint16)
+        np.bitwise_and(used, 15, out=codes[0::2])
+        np.right_shift(used, 4, out=codes[1::2])
+    elif bits == 1:
+        codes = np.unpackbits(used, bitorder="little").astype(np.uint16)
+    else:
+        codes = _unpack_eights(used, bits).reshape(-1)
+    return codes[start - head : stop - head]
+
+
+def pack_into(plane: np.ndarray, bits: int, start: int, codes: np.ndarray) -> None:
+    """Write codes at row `start` of a plane that holds rows [0, start) already (later rows are lost)."""
+    head = start // 8 * 8
+    if head != start:
+        codes = np.concatenate([unpack(plane, bits, head, start), codes])
+    packed = pack(codes, bits)
+    first = head * bits // 8
+    plane[first : first + len(packed)] = packed
+
+
+def _join(fours: np.ndarray, bits: int) -> np.ndarray:
+    """Four codes a row ([m, 4] u64) in one word of 4 * bits bits."""
+    word = fours[:, 0].copy()
+    for i in range(1, 4):
+        word |= fours[:, i] << np.uint64(i * bits)
+    return word
+
+
+def _unpack_eights(used: np.ndarray, bits: int) -> np.ndarray:
+    """[m, 8] u16 codes of the bytes `used` (a missing tail of the last eight reads as zero)."""
+    eights = -(-len(used) // bits)
+    padded = np.zeros((eights, 16), np.uint8)
+    whole = len(used) // bits
+    padded[:whole, :bits] = used[: whole * bits].reshape(whole, bits)
+    if whole < eights:
+        padded[whole, : len(used) - whole * bits] = used[whole * bits :]
+    words = padded.view("<u8")
+    first = words[:, 0]
+    second = (first >> np.uint64(4 * bits)) | (words[:, 1] << np.uint64(64 - 4 * bits))
+    mask = np.uint64(2**bits - 1)
+    codes = np.empty((eights, 8), np.uint16)
+    for i in range(4):
+        codes[:, i] = (first >> np.uint64(i * bits)) & mask
+        codes[:, 4 + i] = (second >> np.uint64(i * bits)) & mask
+    return codes

@@ -1,0 +1,119 @@
+"""A pinhole camera, and what is done to whole lists of them: split, limit, scale."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexgs_edge.constants import DEFAULT_HOLDOUT
+from flexgs_edge.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera: `p = rotation @ x + translation`, pixel `(fx p_x / p_z + cx, fy p_y / p_z + cy)`.
+
+    Camera space is COLMAP's (x right, y down, z forward); the centre of the first pixel is (0, 0).
+
+    Parameters
+    ----------
+    name : str
+        What photos are matched by and views sorted by.
+    width, height : int
+        Pixels.
+    rotation : np.ndarray
+        [3, 3] f64, world to camera.
+    translation : np.ndarray
+        [3] f64, scene units.
+    fx, fy : float
+        Focal lengths, pixels.
+    cx, cy : float
+        Principal point, pixels, integer pixel centres: (W - 1) / 2 is the middle.
+    """
+
+    name: str
+    width: int
+    height: int
+    rotation: np.ndarray
+    translation: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        for field, shape in (("rotation", (3, 3)), ("translation", (3,))):
+            array = np.array(getattr(self, field), np.float64)
+            if array.shape != shape:
+                raise InputError(f"camera {self.name!r}: {field}: expected shape {shape}, found {array.shape}")
+            array.flags.writeable = False
+            object.__setattr__(self, field, array)
+
+    @property
+    def center(self) -> np.ndarray:
+        """[3] f64: where the camera stands in the world."""
+        return -self.rotation.T @ self.translation
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same view at another size in pixels."""
+        if width < 1 or height < 1:
+            raise InputError(f"camera {self.name!r}: size {width}x{height}: expected at least 1x1")
+        across, down = width / self.width, height / self.height
+        # The image's edge, not the centre of its first pixel, is what stays put: hence the half pixels.
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * across,
+            fy=self.fy * down,
+            cx=(self.cx + 0.5) * across - 0.5,
+            cy=(self.cy + 0.5) * down - 0.5,
+        )
+
+    def moved(self, origin: np.ndarray) -> Camera:
+        """The same view of a scene whose positions are relative to `origin` ([3] f64, world)."""
+        return replace(self, translation=self.translation + self.rotation @ np.asarray(origin, np.float64))
+
+
+def split_views(count: int, holdout: int = DEFAULT_HOLDOUT) -> tuple[list[int], list[int]]:
+    """Views to train on and views held out, as indices into the list sorted by name.
+
+    Parameters
+    ----------
+    count : int
+        Number of views.
+    holdout : int, optional
+        Every `holdout`-th view (index % holdout == 0) is held out; 0 holds out none.
+
+    >>> split_views(5, 2)
+    ([1, 3], [0, 2, 4])
+    """
+    if holdout < 0 or holdout == 1:
+        raise InputError(f"--holdout {holdout}: expected 0 (hold out none) or 2 and more (every such view)")
+    if holdout == 0:
+        return list(range(count)), []
+    return [i for i in range(count) if i % holdout], list(range(0, count, holdout))
+
+
+def limit_width(cameras: Sequence[Camera], max_width: int) -> tuple[list[Camera], str | None]:
+    """Scale views wider than `max_width` pixels down to it, keeping their shape.
+
+    Returns
+    -------
+    cameras : list of Camera
+        In the same order; heights are rounded down, as the reference training program does.
+    note : str or None
+        How many were scaled, for the summary.
+    """
+    if max_width < 1:
+        raise InputError(f"--resolution {max_width}: expected a width of at least 1 pixel")
+    limited = [
+        camera.scaled(max_width, max(1, camera.height * max_width // camera.width))
+        if camera.width > max_width
+        else camera
+        for camera in cameras
+    ]
+    changed = sum(camera.width > max_width for camera in cameras)
+    return limited, f"{changed} views scaled down to {max_width} pixels wide" if changed else None

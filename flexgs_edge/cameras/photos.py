@@ -1,0 +1,200 @@
+"""The photos of a scene, matched to its cameras by name and by size."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera, limit_width
+from flexgs_edge.errors import InputError
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+SUFFIXES = (".jpg", ".jpeg", ".png")
+_SHOWN = 5
+# What Pillow raises for damaged files, beside OSError (its base for truncated and unknown ones).
+_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, OverflowError)
+
+Size = tuple[int, int]
+"""Width and height in pixels."""
+
+
+class Photos:
+    """One photo a camera; sizes are known, pixels are read when asked for.
+
+    Made by `Photos.open`.
+
+    Attributes
+    ----------
+    cameras : list of Camera
+        In the order given, scaled to the photos (and to the width limit).
+    paths : list of Path
+        The photo of each camera.
+    notes : tuple of str
+        What was scaled, for the summary.
+    """
+
+    def __init__(
+        self, paths: list[Path], cameras: list[Camera], background: np.ndarray, notes: tuple[str, ...] = ()
+    ) -> None:
+        self.paths, self.cameras, self.background, self.notes = paths, cameras, background, notes
+
+    @classmethod
+    def open(
+        cls,
+        images_dir: str | os.PathLike[str],
+        cameras: Sequence[Camera],
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        max_width: int | None = None,
+    ) -> Photos:
+        """Find the photo of every camera and check its size.
+
+        Parameters
+        ----------
+        images_dir : path
+            Folder of .jpg, .jpeg or .png files.
+        cameras : sequence of Camera
+            Names are file names with or without extension.
+        background : sequence of float, optional
+            Red, green, blue in [0, 1] behind photos with an alpha channel.
+        max_width : int, optional
+            Photos wider than this, and their cameras, are scaled down to it.
+
+        Raises
+        ------
+        InputError
+            When the folder or a photo is missing or damaged, or sizes do not match the cameras.
+        """
+        folder = Path(images_dir)
+        paths = _match(folder, cameras)
+        sizes = [_size(path) for path in paths]
+        scaled, note = _scale_to(sizes, paths, cameras)
+        notes = () if note is None else (note,)
+        if max_width is not None:
+            scaled, note = limit_width(scaled, max_width)
+            notes += () if note is None else (note,)
+        return cls(paths, scaled, np.asarray(background, np.float32).reshape(3), notes)
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def load(self, index: int) -> np.ndarray:
+        """Photo of camera `index`: [H, W, 3] f32 in [0, 1], at the camera's size.
+
+        Raises
+        ------
+        InputError
+            When the photo is damaged or of a pixel kind that has no colours in [0, 1].
+        """
+        from PIL import Image
+
+        path, camera = self.paths[index], self.cameras[index]
+        try:
+            with Image.open(path) as image:
+                image.load()
+                pixels = _pixels(image, self.background, path)
+        except (*_DAMAGED, Image.DecompressionBombError) as error:
+            raise InputError(f"{path}: the photo cannot be decoded ({error}); is the file complete?") from error
+        if pixels.shape[:2] == (camera.height, camera.width):
+            return pixels
+        # Area average in float, so that the result is not rounded to 8 bits a second time.
+        planes = [
+            Image.fromarray(np.ascontiguousarray(pixels[:, :, c])).resize(
+                (camera.width, camera.height), Image.Resampling.BOX
+            )
+            for c in range(3)
+        ]
+        return np.stack([np.asarray(plane, np.float32) for plane in planes], axis=2).clip(0.0, 1.0)
+
+
+def _match(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
+    """The photo of each camera: by file name, by name without extension, by the camera's name without extension."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of photos")
+    deep = any("/" in camera.name for camera in cameras)
+    by_name: dict[str, Path] = {}
+    by_stem: dict[str, list[Path]] = {}
+    for path in sorted(folder.rglob("*") if deep else folder.iterdir()):
+        if path.suffix.lower() in SUFFIXES and path.is_file():
+            name = path.relative_to(folder).as_posix()
+            by_name[name] = path
+            by_stem.setdefault(name[: -len(path.suffix)], []).append(path)
+    found: list[Path] = []
+    missing: list[str] = []
+    for camera in cameras:
+        name = camera.name
+        stem = name[: -len(Path(name).suffix)] if Path(name).suffix.lower() in SUFFIXES else name
+        choice = [by_name[name]] if name in by_name else by_stem.get(name) or by_stem.get(stem) or []
+        if len(choice) > 1:
+            raise InputError(
+                f"{folder}: camera {name!r} has more than one photo ({', '.join(path.name for path in choice)}); keep one"
+            )
+        found.extend(choice)
+        if not choice:
+            missing.append(name)
+    if missing:
+        more = f" and {len(missing) - _SHOWN} more" if len(missing) > _SHOWN else ""
+        raise InputError(
+            f"{folder}: no photo for {len(missing)} of {len(cameras)} cameras: {', '.join(missing[:_SHOWN])}{more}; "
+            f"expected files named after the cameras, ending in {', '.join(SUFFIXES)}"
+        )
+    return found
+
+
+def _size(path: Path) -> Size:
+    """Size from the file's header; nothing is decoded."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (*_DAMAGED, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: not a photo that can be read ({error})") from error
+
+
+def _scale_to(sizes: list[Size], paths: list[Path], cameras: Sequence[Camera]) -> tuple[list[Camera], str | None]:
+    """The cameras at the sizes of their photos, if one factor explains all of them."""
+    factors: tuple[float, float] = (1.0, float("inf"))
+    seen: dict[Size, Size] = {}
+    for (width, height), path, camera in zip(sizes, paths, cameras):
+        place = f"{path}: photo of {width}x{height} for camera {camera.name!r} of {camera.width}x{camera.height}"
+        if width > camera.width or height > camera.height:
+            raise InputError(f"{place}: photos may be smaller than the cameras say, never larger; check the two folders")
+        low = max(factors[0], camera.width / (width + 1), camera.height / (height + 1))
+        high = min(factors[1], _most(camera.width, width), _most(camera.height, height))
+        same = seen.setdefault((camera.width, camera.height), (width, height)) == (width, height)
+        if low > high or not same:
+            first = f"{paths[0]} ({sizes[0][0]}x{sizes[0][1]} for {cameras[0].width}x{cameras[0].height})"
+            raise InputError(f"{place}: expected the same factor in width, height and all photos, as in {first}")
+        factors = (low, high)
+    scaled = [camera.scaled(*size) for camera, size in zip(cameras, sizes)]
+    if all(size == (camera.width, camera.height) for camera, size in zip(cameras, sizes)):
+        return list(cameras), None
+    factor = cameras[0].width / sizes[0][0]
+    return scaled, f"cameras scaled down {factor:.4g}x to their photos ({sizes[0][0]}x{sizes[0][1]})"
+
+
+def _most(camera: int, photo: int) -> float:
+    """Largest factor that leaves `photo` pixels of `camera` when rounded either way."""
+    return camera / (photo - 1) if photo > 1 else float("inf")
+
+
+def _pixels(image: Image.Image, background: np.ndarray, path: Path) -> np.ndarray:
+    """[H, W, 3] f32 in [0, 1] of a decoded image of any of Pillow's usual modes."""
+    mode = image.mode
+    if mode == "F":
+        raise InputError(f"{path}: pixels are floats; expected 8-bit or 16-bit colours")
+    if mode == "I" or mode.startswith("I;16"):  # 16-bit grey: Pillow's own conversion to RGB would clip at 255
+        grey = np.asarray(image).astype(np.float32) / 65535.0
+        return np.repeat(grey[:, :, None], 3, axis=2).clip(0.0, 1.0)
+    if mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
+        colours = np.asarray(image.convert("RGBA"), np.float32) / 255.0
+        alpha = colours[:, :, 3:]
+        return colours[:, :, :3] * alpha + background * (1.0 - alpha)
+    return np.asarray(image.convert("RGB"), np.float32) / np.float32(255.0)

@@ -1,0 +1,275 @@
+"""PLY scenes in INRIA's layout: read by row ranges, written by chunks.
+
+Files are read with plain positioned reads into a small block, not mapped: mapped pages count as resident memory of
+the process, and a file that shrinks while mapped kills it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+import numpy as np
+
+from flexgs_edge.errors import FormatError, InputError
+from flexgs_edge.scene.atomic import atomic_write
+from flexgs_edge.scene.fields import FIELD, FIELDS
+from flexgs_edge.scene.ply_layout import PlyHeader, gaussian_layout, read_header
+from flexgs_edge.scene.source import Planes, Rows, SceneSource
+
+_BLOCK_ROWS = 4096
+"""Rows read at a time: 1 MB at SH degree 3, so that the gather runs in the cache."""
+_SPAN = 4
+"""A list of rows is read as one span of the file while the span has at most this many rows a row asked for."""
+_ORIGIN_ROWS = 65536
+_ORIGIN_QUANTILES = (0.05, 0.95)
+
+
+class PlySource(SceneSource):
+    """A PLY in INRIA's layout: any property order, byte order and float width; SH degree 0 to 4.
+
+    Binary files whose rows have one size are read by row ranges; others (ascii, lists) are loaded whole by plyfile.
+    The origin is chosen by `choose_origin` from a sample of the positions; it is taken off in float64 before
+    positions are rounded to float32.
+
+    Parameters
+    ----------
+    path : path
+        The file; it must not change while the source is in use (checked at every read).
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it breaks the format or is no Gaussian scene; names header line, property or bytes.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self.name = os.fspath(path)
+        try:
+            with open(self.path, "rb") as file:
+                header = read_header(self.path, file)
+                stamp = _stamp(file)
+            self.sh_degree, self.notes = gaussian_layout(header)
+            header.check_size(stamp[1])
+            self._rows: _RowReader = _FileRows(header, stamp) if header.plain else _ArrayRows(_load_whole(header))
+        except OSError as error:
+            raise InputError(f"{path}: cannot read the scene ({error.strerror})") from error
+        self.count = header.vertex.count
+        self.sh_count = self.count if self.sh_degree else 0
+        self.origin = np.zeros(3)  # while the sample is read: world positions
+        self.origin = choose_origin(self._sample())
+
+    def _sample(self) -> np.ndarray:
+        """[n, 3] f64: world positions of every k-th row, at most 65536."""
+        step = max(1, -(-self.count // _ORIGIN_ROWS))
+        rows = np.arange(0, self.count, step)
+        sample = np.empty((rows.size, 3))
+        for part, block in self._rows.blocks(rows):
+            for axis, name in enumerate(FIELD["means"].ply):
+                sample[part, axis] = block[name]
+        return sample
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`; needs about 1 MB beside the arrays (4 MB for lists of rows)."""
+        rows, planes = self.begin_read(rows, fields, out)
+        with np.errstate(over="ignore", invalid="ignore"):  # doubles beyond float32 become inf: check_scene reports them
+            for part, block in self._rows.blocks(rows):
+                for field, plane in planes.items():
+                    for channel, name in enumerate(FIELD[field].ply_names(self.sh_degree)):
+                        values = block[name]
+                        if field == "means":
+                            values = values.astype(np.float64) - self.origin[channel]
+                        plane[channel, part] = values
+        return planes
+
+
+def choose_origin(positions: np.ndarray) -> np.ndarray:
+    """Where to measure positions from, so that float32 keeps their digits.
+
+    Per axis the 5 % and 95 % quantiles of the finite positions give a centre and an extent; the grid is the largest
+    extent, rounded up to a power of two (1 if there is none), and the origin is the grid point nearest to the centre.
+    A scene whose middle is within half a grid step of zero keeps the origin 0, and with it its exact numbers.
+
+    Parameters
+    ----------
+    positions : np.ndarray
+        [n, 3] f64, world.
+
+    Returns
+    -------
+    np.ndarray
+        [3] f64, world.
+
+    >>> choose_origin(np.array([[500000.0, 0.0, 1.0], [500003.0, 1.0, 1.5]]))
+    array([500000.,      0.,      0.])
+    """
+    finite = positions[np.isfinite(positions).all(axis=1)]
+    if not len(finite):
+        return np.zeros(3)
+    with np.errstate(all="ignore"):
+        low, high = np.quantile(finite, _ORIGIN_QUANTILES, axis=0)
+        extent = float((high - low).max())
+        grid = 2.0 ** np.ceil(np.log2(extent)) if extent > 0 else 1.0
+        # + 0.0 turns -0.0 into 0.0, which would otherwise show in files and messages.
+        origin = np.round((low + high) / 2 / grid) * grid + 0.0
+    return origin if np.all(np.isfinite(origin)) else np.zeros(3)
+
+
+class _RowReader(Protocol):
+    def blocks(self, rows: Rows) -> Iterator[tuple[slice, np.ndarray]]:
+        """Blocks of structured rows, each with its place in the result; a block is valid until the next."""
+
+
+class _ArrayRows:
+    """Rows of a structured array in memory."""
+
+    def __init__(self, array: np.ndarray) -> None:
+        self.array = array
+
+    def blocks(self, rows: Rows) -> Iterator[tuple[slice, np.ndarray]]:
+        if isinstance(rows, slice):
+            yield slice(0, rows.stop - rows.start), self.array[rows]
+            return
+        for start in range(0, len(rows), _BLOCK_ROWS):
+            part = slice(start, min(start + _BLOCK_ROWS, len(rows)))
+            yield part, self.array[rows[part]]
+
+
+class _FileRows:
+    """Rows of a file, read block by block."""
+
+    def __init__(self, header: PlyHeader, stamp: tuple[int, int, int]) -> None:
+        self.path, self.stamp = header.path, stamp
+        self.offset, self.dtype = header.vertex_offset, header.vertex_dtype
+
+    def blocks(self, rows: Rows) -> Iterator[tuple[slice, np.ndarray]]:
+        size = rows.stop - rows.start if isinstance(rows, slice) else len(rows)
+        if not size:
+            return
+        try:
+            with open(self.path, "rb", buffering=0) as file:
+                if _stamp(file) != self.stamp:
+                    raise InputError(f"{self.path}: the file was changed after it was opened; start again")
+                block = np.empty(min(size, _BLOCK_ROWS) * (1 if isinstance(rows, slice) else _SPAN), self.dtype)
+                for start in range(0, size, _BLOCK_ROWS):
+                    part = slice(start, min(start + _BLOCK_ROWS, size))
+                    if isinstance(rows, slice):
+                        first = rows.start + start
+                        yield part, self._range(file, first, block[: part.stop - part.start])
+                    else:
+                        yield part, self._list(file, rows[part], block)
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot read the scene ({error.strerror})") from error
+
+    def _list(self, file: BinaryIO, rows: np.ndarray, block: np.ndarray) -> np.ndarray:
+        low, high = int(rows.min()), int(rows.max())
+        if high - low < len(block):
+            return self._range(file, low, block[: high - low + 1])[rows - low]
+        # Far apart: each run of consecutive rows straight to its place.
+        starts = np.flatnonzero(np.diff(rows, prepend=rows[0] - 2) != 1)
+        for start, stop in zip(starts, np.append(starts[1:], len(rows))):
+            self._range(file, int(rows[start]), block[start:stop])
+        return block[: len(rows)]
+
+    def _range(self, file: BinaryIO, first: int, block: np.ndarray) -> np.ndarray:
+        """Fill `block` with the rows from `first` on."""
+        view = memoryview(block.view(np.uint8))
+        file.seek(self.offset + first * self.dtype.itemsize)
+        done = 0
+        while done < len(view):
+            got = file.readinto(view[done:])  # type: ignore[attr-defined]
+            if not got:
+                raise FormatError(f"{self.path}: truncated while being read, at row {first}")
+            done += got
+        return block
+
+
+def _stamp(file: BinaryIO) -> tuple[int, int, int]:
+    """What changes when a file is replaced or written to: inode, size, time."""
+    status = os.fstat(file.fileno())
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _load_whole(header: PlyHeader) -> np.ndarray:
+    """The rows of `vertex` of a file that only plyfile can take apart (held in memory as long as the source)."""
+    from plyfile import PlyData, PlyParseError  # GPL-3: imported only for the files that need it
+
+    try:
+        with open(header.path, "rb") as file:
+            rows = PlyData.read(file, mmap=False)["vertex"].data
+            rest = file.read().strip() if header.order else b""
+    except (PlyParseError, ValueError, UnicodeDecodeError, OverflowError, MemoryError) as error:
+        raise FormatError(f"{header.path}: {error}") from error
+    if rest:
+        raise FormatError(f"{header.path}: {len(rest)} bytes too many after the last element")
+    return rows
+
+
+def write_ply(
+    path: str | os.PathLike[str], source: SceneSource, *, force: bool = False, chunk_rows: int = 65536
+) -> tuple[str, ...]:
+    """Write a scene in INRIA's layout: x y z, nx ny nz (zeros), f_dc, f_rest, opacity, scale, rot; little endian.
+
+    Properties are `float`. Positions are world positions; with an origin other than zero they are `double`, since
+    float32 would lose the digits that the origin kept.
+
+    Parameters
+    ----------
+    path : path
+        Written beside its place first, renamed when complete.
+    source : SceneSource
+        May be the very file that is overwritten.
+    force : bool, optional
+        Replace a file that exists.
+    chunk_rows : int, optional
+        Rows held at a time.
+
+    Returns
+    -------
+    tuple of str
+        Notes for the summary.
+
+    Raises
+    ------
+    InputError
+        When the file exists and `force` is not set, or the folder is missing.
+    BudgetError
+        When the disk is full.
+    """
+    wide = bool(np.any(source.origin != 0))
+    dtype = inria_dtype(source.sh_degree, wide)
+    kinds = {"<f4": "float", "<f8": "double"}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {source.count}"]
+    lines += [f"property {kinds[dtype[name].str]} {name}" for name in dtype.names or ()]
+    fields = [field.name for field in FIELDS]
+    with atomic_write(path, force) as file:
+        file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
+        for rows in source.chunks(chunk_rows):
+            planes = source.read(rows, fields)
+            block = np.zeros(rows.stop - rows.start, dtype)
+            for field in FIELDS:
+                for channel, name in enumerate(field.ply_names(source.sh_degree)):
+                    block[name] = planes[field.name][channel]
+            if wide:
+                for axis, name in enumerate(FIELD["means"].ply):
+                    block[name] += source.origin[axis]
+            file.write(memoryview(block.view(np.uint8)))
+    where = ", ".join(f"{value:g}" for value in source.origin)
+    return (f"positions written as double: the scene is far from zero (origin {where})",) if wide else ()
+
+
+def inria_dtype(sh_degree: int, wide: bool = False) -> np.dtype:
+    """One row of INRIA's PLY (248 bytes at degree 3); `wide`: positions as float64.
+
+    >>> inria_dtype(3).itemsize
+    248
+    """
+    position, normals = FIELD["means"].ply, ("nx", "ny", "nz")
+    others = [name for field in FIELDS if field.name != "means" for name in field.ply_names(sh_degree)]
+    places = [(name, "<f8" if wide else "<f4") for name in position]
+    return np.dtype(places + [(name, "<f4") for name in (*normals, *others)])

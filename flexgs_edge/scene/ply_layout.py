@@ -1,0 +1,250 @@
+"""PLY headers: what a file says it holds, checked against its size before a byte of it is allocated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from flexgs_edge.constants import MAX_SH_DEGREE
+from flexgs_edge.errors import FormatError
+from flexgs_edge.scene.fields import FIELDS, sh_rest_count
+from flexgs_edge.scene.source import REST_WIDTHS
+
+_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+_FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_HEADER_LIMIT = 1 << 20
+"""Bytes: headers of scenes have 2 kB; a file without `end_header` is not read to its end."""
+_SILENT = ("nx", "ny", "nz")
+"""INRIA's own properties that carry nothing."""
+
+
+@dataclass
+class Property:
+    """One property of an element; `length` is the type of a list's count, None for scalars."""
+
+    name: str
+    type: str
+    length: str | None = None
+
+    @property
+    def smallest(self) -> int:
+        """Fewest bytes that one value takes in a binary file."""
+        return np.dtype(self.length or self.type).itemsize
+
+
+@dataclass
+class Element:
+    """One element of the header, e.g. `vertex`."""
+
+    name: str
+    count: int
+    properties: list[Property] = field(default_factory=list)
+
+    @property
+    def scalar(self) -> bool:
+        """Has no lists: all rows have the same size."""
+        return all(p.length is None for p in self.properties)
+
+    @property
+    def row_size(self) -> int:
+        """Bytes a row in a binary file (the least, with lists)."""
+        return sum(p.smallest for p in self.properties)
+
+
+@dataclass
+class PlyHeader:
+    """A parsed header.
+
+    Attributes
+    ----------
+    order : str
+        "<", ">" or "" (ascii).
+    elements : list of Element
+        In the file's order.
+    data_offset : int
+        Byte where the data starts.
+    """
+
+    path: Path
+    order: str
+    elements: list[Element]
+    data_offset: int
+
+    @property
+    def vertex(self) -> Element:
+        """The element that holds the Gaussians."""
+        for element in self.elements:
+            if element.name == "vertex":
+                return element
+        names = ", ".join(element.name for element in self.elements) or "none"
+        raise FormatError(f"{self.path}: no element 'vertex'; found {names}")
+
+    @property
+    def plain(self) -> bool:
+        """Binary with rows of one size: can be read by row ranges."""
+        return bool(self.order) and all(element.scalar for element in self.elements)
+
+    @property
+    def vertex_offset(self) -> int:
+        """Byte where the rows of `vertex` start (plain files)."""
+        before = self.elements[: self.elements.index(self.vertex)]
+        return self.data_offset + sum(element.count * element.row_size for element in before)
+
+    @property
+    def vertex_dtype(self) -> np.dtype:
+        """One row of `vertex` as the file stores it (plain files)."""
+        return np.dtype([(p.name, self.order + p.type) for p in self.vertex.properties])
+
+    def check_size(self, size: int) -> None:
+        """Compare what the header claims with the file's `size` in bytes (exactly for plain files).
+
+        Raises
+        ------
+        FormatError
+            When data are missing, or there are bytes too many.
+        """
+        for element in self.elements:
+            if element.count and not element.properties:
+                raise FormatError(f"{self.path}: element {element.name!r} has {element.count} rows without properties")
+        # In ascii a value is one character and its separator at the least; the last may lack the latter.
+        least = sum(e.count * (e.row_size if self.order else 2 * len(e.properties)) for e in self.elements)
+        found = size - self.data_offset
+        claims = ", ".join(f"{e.count} x {e.name}" for e in self.elements)
+        if found + (not self.order) < least:
+            raise FormatError(
+                f"{self.path}: truncated: the header promises {claims}, {'' if self.plain else 'at least '}{least} bytes "
+                f"from byte {self.data_offset}; found {found}"
+            )
+        if self.plain and found > least:
+            raise FormatError(
+                f"{self.path}: {found - least} bytes too many: the header promises {claims}, {least} bytes "
+                f"from byte {self.data_offset}; found {found}"
+            )
+
+
+def read_header(path: Path, file: BinaryIO) -> PlyHeader:
+    """Parse the header of the PLY `file` (positioned at its start).
+
+    Raises
+    ------
+    FormatError
+        Names the line and what was expected there.
+    """
+    number, order, elements = 0, None, list[Element]()
+    while True:
+        number += 1
+        raw = file.readline(_HEADER_LIMIT + 1 - min(file.tell(), _HEADER_LIMIT))
+        words = raw.decode("ascii", "replace").split()
+        place = f"{path}: header line {number}"
+        if number == 1:
+            if raw.rstrip(b"\r\n") != b"ply":
+                raise FormatError(f"{path}: not a PLY file: expected 'ply' in the first line, found {raw[:16]!r}")
+        elif not raw.endswith(b"\n"):
+            raise FormatError(f"{path}: the header has no 'end_header' line (looked at {file.tell()} bytes)")
+        elif words[:1] == ["end_header"]:
+            break
+        elif words[:1] == ["format"]:
+            order = _format(place, words, order)
+        elif words[:1] == ["element"]:
+            elements.append(_element(place, words, elements))
+        elif words[:1] == ["property"]:
+            if not elements:
+                raise FormatError(f"{place}: a property before any element")
+            elements[-1].properties.append(_property(place, words, elements[-1]))
+        elif words and words[0] not in ("comment", "obj_info"):
+            raise FormatError(f"{place}: expected format, element, property, comment or end_header, found {words[0]!r}")
+    if order is None:
+        raise FormatError(f"{path}: the header has no 'format' line; expected one of {', '.join(_FORMATS)}")
+    return PlyHeader(path, order, elements, file.tell())
+
+
+def _format(place: str, words: list[str], order: str | None) -> str:
+    if order is not None:
+        raise FormatError(f"{place}: a second 'format' line")
+    if len(words) != 3 or words[1] not in _FORMATS or words[2] != "1.0":
+        raise FormatError(f"{place}: expected 'format' and one of {', '.join(_FORMATS)}, 1.0; found {' '.join(words)!r}")
+    return _FORMATS[words[1]]
+
+
+def _element(place: str, words: list[str], elements: list[Element]) -> Element:
+    if len(words) != 3 or not (words[2].isascii() and words[2].isdigit()) or len(words[2]) > 18:
+        raise FormatError(f"{place}: expected 'element NAME COUNT', found {' '.join(words)[:80]!r}")
+    if any(element.name == words[1] for element in elements):
+        raise FormatError(f"{place}: a second element {words[1]!r}")
+    return Element(words[1], int(words[2]))
+
+
+def _property(place: str, words: list[str], element: Element) -> Property:
+    types = words[2:4] if words[1:2] == ["list"] else words[1:2]
+    if len(words) != len(types) + (3 if words[1:2] == ["list"] else 2):
+        raise FormatError(f"{place}: expected 'property TYPE NAME', found {' '.join(words)[:80]!r}")
+    for name in types:
+        if name not in _TYPES:
+            raise FormatError(f"{place}: unknown type {name!r}; expected one of {', '.join(_TYPES)}")
+    if any(p.name == words[-1] for p in element.properties):
+        raise FormatError(f"{place}: a second property {words[-1]!r} in element {element.name!r}")
+    if len(types) == 2:
+        if _TYPES[types[0]].startswith("f"):
+            raise FormatError(f"{place}: a list's length has type {types[0]!r}; expected an integer type")
+        return Property(words[-1], _TYPES[types[1]], _TYPES[types[0]])
+    return Property(words[-1], _TYPES[types[0]])
+
+
+def gaussian_layout(header: PlyHeader) -> tuple[int, tuple[str, ...]]:
+    """SH degree of the scene, and notes on what is left out.
+
+    Raises
+    ------
+    FormatError
+        When properties are missing, of the wrong type, or there is a wrong number of `f_rest_*`.
+    """
+    vertex = header.vertex
+    by_name = {p.name: p for p in vertex.properties}
+    degree = _sh_degree(header.path, by_name)
+    needed = [name for f in FIELDS for name in f.ply_names(degree)]
+    missing = [name for name in needed if name not in by_name]
+    if missing:
+        hint = "; compressed PLY files must be expanded first" if "packed_position" in by_name else ""
+        raise FormatError(f"{header.path}: element 'vertex' lacks the properties {_list(missing)}{hint}")
+    wrong = [name for name in needed if by_name[name].length or not by_name[name].type.startswith("f")]
+    if wrong:
+        kind = "a list" if by_name[wrong[0]].length else f"type {by_name[wrong[0]].type}"
+        raise FormatError(f"{header.path}: property {wrong[0]!r} is {kind}; expected float or double")
+    known = {*needed, *_SILENT}
+    extra = [name for name in by_name if name not in known]
+    notes = [f"extra properties left out: {_list(extra)}"] if extra else []
+    notes += [f"element {e.name!r} left out ({e.count} rows)" for e in header.elements if e is not vertex]
+    return degree, tuple(notes)
+
+
+def _sh_degree(path: Path, by_name: dict[str, Property]) -> int:
+    found = sum(name.startswith("f_rest_") for name in by_name)
+    if found not in REST_WIDTHS:
+        expected = ", ".join(f"{3 * sh_rest_count(d)} (degree {d})" for d in range(MAX_SH_DEGREE + 1))
+        raise FormatError(f"{path}: {found} properties f_rest_*; expected {expected}")
+    return REST_WIDTHS[found]
+
+
+def _list(names: list[str], shown: int = 8) -> str:
+    more = f" and {len(names) - shown} more" if len(names) > shown else ""
+    return ", ".join(names[:shown]) + more

@@ -1,0 +1,271 @@
+"""A scene as a lazy source: metadata at open, values by row range or row list into arrays that the caller owns."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Union
+
+import numpy as np
+
+from flexgs_edge.constants import MAX_SH_DEGREE
+from flexgs_edge.errors import InputError
+from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
+
+Planes = dict[str, np.ndarray]
+"""Arrays by field name, each [width, n] f32."""
+
+Rows = Union[slice, np.ndarray]
+"""`slice(start, stop)` or a sorted int64 array."""
+
+REST_WIDTHS: dict[int, int] = {3 * sh_rest_count(degree): degree for degree in range(MAX_SH_DEGREE + 1)}
+"""SH degree by the number of `sh_rest` channels: 0, 9, 24, 45, 72."""
+
+
+class SceneSource(ABC):
+    """N Gaussians that can be read in parts.
+
+    Attributes
+    ----------
+    name : str
+        For messages: a path or "memory".
+    count : int
+        N.
+    sh_degree : int
+        0 to 4.
+    sh_count : int
+        Rows [0, sh_count) may have SH above degree 0, the rest have none (zeros). 0 at degree 0.
+    origin : np.ndarray
+        [3] f64, world: what was taken from the positions.
+    notes : tuple of str
+        What the reader left out or changed, for the summary.
+    """
+
+    name: str
+    count: int
+    sh_degree: int
+    sh_count: int
+    origin: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    @abstractmethod
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """Read some fields of some rows.
+
+        Parameters
+        ----------
+        rows : slice or np.ndarray
+            `slice(start, stop)` without a step, or [n] int64, sorted ascending.
+        fields : sequence of str
+            Names from `flexgs_edge.scene.fields.FIELD`.
+        out : dict, optional
+            Arrays [width, n] f32 to fill; a field without one gets a new array.
+
+        Returns
+        -------
+        dict
+            {field: [width, n] f32}; the very arrays of `out` where given.
+
+        Raises
+        ------
+        IndexError
+            When a row is outside [0, N).
+        ValueError
+            When a field is unknown or an array of `out` does not fit.
+        """
+
+    def width(self, field: str) -> int:
+        """Channels of `field` in this scene."""
+        return FIELD[field].width(self.sh_degree)
+
+    def select(self, rows: np.ndarray) -> SceneSource:
+        """The rows `rows` ([n] int64, any order, kept as given) as a source; nothing is read."""
+        return SelectSource(self, rows)
+
+    def chunks(self, rows: int) -> Iterator[slice]:
+        """Row ranges of at most `rows` that cover the scene in order."""
+        if rows < 1:
+            raise ValueError(f"chunks of {rows} rows: expected at least 1")
+        for start in range(0, self.count, rows):
+            yield slice(start, min(start + rows, self.count))
+
+    def begin_read(self, rows: Rows, fields: Sequence[str], out: Planes | None) -> tuple[Rows, Planes]:
+        """Check the arguments of `read` and allocate what `out` lacks (for readers of new formats).
+
+        Returns
+        -------
+        rows : slice or np.ndarray
+            With plain bounds (0 <= start <= stop <= N), or int64.
+        planes : dict
+            One array [width, n] f32 a field, in the order of `fields`.
+        """
+        rows, size = normalize_rows(rows, self.count)
+        planes: Planes = {}
+        for field in fields:
+            if field not in FIELD:
+                raise ValueError(f"field {field!r}: expected one of {', '.join(FIELD)}")
+            shape = (self.width(field), size)
+            array = None if out is None else out.get(field)
+            if array is None:
+                array = np.empty(shape, np.float32)
+            elif array.shape != shape or array.dtype != np.float32:
+                raise ValueError(f"out[{field!r}]: expected {shape} float32, found {array.shape} {array.dtype}")
+            planes[field] = array
+        return rows, planes
+
+
+def normalize_rows(rows: Rows, count: int) -> tuple[Rows, int]:
+    """Plain form of `rows` and how many they are; raises `IndexError` outside [0, count).
+
+    >>> normalize_rows(slice(2, None), 5)
+    (slice(2, 5, None), 3)
+    """
+    if isinstance(rows, slice):
+        start, stop = rows.start or 0, count if rows.stop is None else rows.stop
+        if rows.step not in (None, 1) or not 0 <= start <= stop <= count:
+            raise IndexError(f"rows {rows}: expected slice(start, stop) inside [0, {count}]")
+        return slice(int(start), int(stop)), int(stop) - int(start)
+    rows = np.asarray(rows)
+    if rows.ndim != 1 or (rows.size and rows.dtype.kind not in "iu"):
+        raise IndexError(f"rows: expected [n] integers, found {list(rows.shape)} {rows.dtype}")
+    if rows.size and (rows.min() < 0 or rows.max() >= count):
+        raise IndexError(f"rows: {rows.min()} to {rows.max()} are not all inside [0, {count})")
+    return rows.astype(np.int64, copy=False), rows.size
+
+
+def as_range(rows: np.ndarray) -> slice | None:
+    """`rows` as a slice if they are consecutive and ascending, else None."""
+    if rows.size == 0:
+        return slice(0, 0)
+    if rows[-1] - rows[0] + 1 == rows.size and np.all(rows[1:] > rows[:-1]):
+        return slice(int(rows[0]), int(rows[-1]) + 1)
+    return None
+
+
+class MemorySource(SceneSource):
+    """A scene whose arrays are in memory.
+
+    Parameters
+    ----------
+    arrays : mapping
+        {field: [width, N] f32}; every field of the table. `sh_rest` ([0, N]) may be missing at degree 0.
+        C-contiguous float32 arrays are used as they are, never copied or changed.
+    sh_degree : int, optional
+        Default: from the width of `sh_rest`.
+    origin : array_like, optional
+        [3] f64, world. Default zeros.
+    name : str, optional
+        For messages.
+    sh_count : int, optional
+        Rows from here on have no SH above degree 0 (must be zeros). Default: N, or 0 at degree 0.
+
+    Raises
+    ------
+    InputError
+        When a field is missing, unknown or of the wrong shape.
+    """
+
+    def __init__(
+        self,
+        arrays: Mapping[str, np.ndarray],
+        sh_degree: int | None = None,
+        origin: np.ndarray | Sequence[float] | None = None,
+        name: str = "memory",
+        sh_count: int | None = None,
+    ) -> None:
+        self.name = name
+        unknown = sorted(set(arrays) - set(FIELD))
+        if unknown:
+            raise InputError(f"{name}: unknown fields {', '.join(unknown)}; expected {', '.join(FIELD)}")
+        missing = [field.name for field in FIELDS if field.name not in arrays and field.name != "sh_rest"]
+        if missing:
+            raise InputError(f"{name}: missing fields {', '.join(missing)}")
+        self.count = int(np.shape(arrays["means"])[-1])
+        planes = dict(arrays)
+        planes.setdefault("sh_rest", np.zeros((0, self.count), np.float32))
+        self.sh_degree = self._degree(planes["sh_rest"], sh_degree)
+        self._planes = {field.name: self._plane(field.name, planes[field.name]) for field in FIELDS}
+        self.sh_count = self._sh_count(sh_count)
+        self.origin = np.zeros(3) if origin is None else np.array(origin, np.float64)
+        if self.origin.shape != (3,) or not np.all(np.isfinite(self.origin)):
+            raise InputError(f"{name}: origin: expected 3 finite numbers, found {self.origin}")
+
+    def _degree(self, sh_rest: np.ndarray, sh_degree: int | None) -> int:
+        width = np.shape(sh_rest)[0]
+        if sh_degree is None:
+            if width not in REST_WIDTHS:
+                raise InputError(
+                    f"{self.name}: sh_rest has {width} channels; expected one of {', '.join(map(str, REST_WIDTHS))}"
+                )
+            return REST_WIDTHS[width]
+        if not 0 <= sh_degree <= MAX_SH_DEGREE:
+            raise InputError(f"{self.name}: SH degree {sh_degree}: expected 0 to {MAX_SH_DEGREE}")
+        return sh_degree
+
+    def _plane(self, field: str, values: np.ndarray) -> np.ndarray:
+        plane = np.ascontiguousarray(values, np.float32)
+        expected = (self.width(field), self.count)
+        if plane.shape != expected:
+            raise InputError(f"{self.name}: {field}: expected an array {expected}, found {plane.shape}")
+        return plane
+
+    def _sh_count(self, sh_count: int | None) -> int:
+        if self.sh_degree == 0:
+            return 0
+        if sh_count is None:
+            return self.count
+        if not 0 <= sh_count <= self.count:
+            raise InputError(f"{self.name}: sh_count {sh_count}: expected 0 to {self.count}")
+        if self._planes["sh_rest"][:, sh_count:].any():
+            raise InputError(f"{self.name}: sh_rest: rows from sh_count {sh_count} on must be zeros")
+        return sh_count
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`."""
+        rows, planes = self.begin_read(rows, fields, out)
+        for field, plane in planes.items():
+            plane[...] = self._planes[field][:, rows]
+        return planes
+
+
+class SelectSource(SceneSource):
+    """Some rows of another source, in the order given (a selection of a selection reads the first source).
+
+    Parameters
+    ----------
+    parent : SceneSource
+        Where the values come from.
+    rows : np.ndarray
+        [n] integers in [0, parent.count), any order, repeats allowed.
+    notes : tuple of str, optional
+        Added to the parent's.
+    """
+
+    def __init__(self, parent: SceneSource, rows: np.ndarray, notes: tuple[str, ...] = ()) -> None:
+        plain = normalize_rows(np.asarray(rows), parent.count)[0]
+        assert isinstance(plain, np.ndarray)
+        notes = parent.notes + notes
+        sh_rows = np.flatnonzero(plain < parent.sh_count)
+        if isinstance(parent, SelectSource):
+            plain, parent = parent.rows[plain], parent.parent
+        self.parent = parent
+        # Half the bytes where they do: the list lives as long as the source.
+        self.rows = plain.astype(np.int32 if parent.count < 2**31 else np.int64)
+        self.name, self.count, self.sh_degree = parent.name, plain.size, parent.sh_degree
+        self.sh_count = int(sh_rows[-1]) + 1 if sh_rows.size else 0
+        self.origin, self.notes = parent.origin, notes
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`; rows out of order cost a second copy of what is read."""
+        rows, planes = self.begin_read(rows, fields, out)
+        chosen = self.rows[rows].astype(np.int64)
+        consecutive = as_range(chosen)
+        if consecutive is not None:
+            self.parent.read(consecutive, fields, planes)
+        elif np.all(chosen[1:] >= chosen[:-1]):
+            self.parent.read(chosen, fields, planes)
+        else:
+            order = np.argsort(chosen, kind="stable")
+            for field, plane in planes.items():  # one field at a time: the copy is the widest field, not all of them
+                plane[:, order] = self.parent.read(chosen[order], [field])[field]
+        return planes
