@@ -116,4 +116,5 @@ def limit_width(cameras: Sequence[Camera], max_width: int) -> tuple[list[Camera]
         for camera in cameras
     ]
     changed = sum(camera.width > max_width for camera in cameras)
-    return limited, f"{changed} views scaled down to {max_width} pixels wide" if changed else None
+    views = "1 view" if changed == 1 else f"{changed} views"
+    return limited, f"{views} scaled down to {max_width} pixels wide" if changed else None

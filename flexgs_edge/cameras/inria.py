@@ -122,15 +122,16 @@ class _Entry:
 
     def _array(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
         expected = " x ".join(map(str, shape)) + " finite numbers"
-        values = np.array(_nested(self._get(key)), dtype=object)
-        if values.shape != shape:
-            raise self._fail(key, expected, f"shape {list(values.shape)}")
+        value = self._get(key)
+        if _shape(value) != shape:
+            raise self._fail(key, expected, repr(value)[:80])
+        leaves = np.array(value, dtype=object)
+        if not all(isinstance(leaf, (int, float)) and not isinstance(leaf, bool) for leaf in leaves.flat):
+            raise self._fail(key, expected, repr(value)[:80])
         try:
-            if any(isinstance(value, (bool, str)) for value in values.flat):
-                raise TypeError
-            array = values.astype(np.float64)
-        except (TypeError, ValueError, OverflowError):
-            raise self._fail(key, expected, repr(self.entry[key])[:80]) from None
+            array = leaves.astype(np.float64)
+        except OverflowError:
+            raise self._fail(key, expected, "a number beyond float64") from None
         if not np.all(np.isfinite(array)):
             raise self._fail(key, expected, f"{array.tolist()}")
         return array
@@ -139,15 +140,18 @@ class _Entry:
         rotation = self._array("rotation", (3, 3))
         error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if not error <= ROTATION_TOLERANCE:
-            raise self._fail("rotation", f"an orthonormal matrix (within {ROTATION_TOLERANCE})", f"one off by {error:.3g}")
+            raise self._fail(
+                "rotation", f"an orthonormal matrix (within {ROTATION_TOLERANCE})", f"one off by {error:.3g}"
+            )
         if np.linalg.det(rotation) < 0:
             raise self._fail("rotation", "a rotation (determinant 1)", "a reflection (determinant -1)")
         return rotation
 
 
-def _nested(value: Any) -> Any:
-    """A list of lists of equal length as it is; anything ragged as one opaque value (NumPy would raise)."""
-    if isinstance(value, list) and any(isinstance(item, list) for item in value):
-        if len({len(item) if isinstance(item, list) else -1 for item in value}) != 1:
-            return [None]
-    return value
+def _shape(value: Any) -> tuple[int, ...] | None:
+    """Shape of nested lists, None if they are ragged (which NumPy would raise on)."""
+    if not isinstance(value, list):
+        return ()
+    shapes = {_shape(item) for item in value}
+    inner = shapes.pop() if len(shapes) == 1 else None
+    return None if inner is None else (len(value), *inner)

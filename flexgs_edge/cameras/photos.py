@@ -75,7 +75,7 @@ class Photos:
         paths = _match(folder, cameras)
         sizes = [_size(path) for path in paths]
         scaled, note = _scale_to(sizes, paths, cameras)
-        notes = () if note is None else (note,)
+        notes: tuple[str, ...] = () if note is None else (note,)
         if max_width is not None:
             scaled, note = limit_width(scaled, max_width)
             notes += () if note is None else (note,)
@@ -132,9 +132,8 @@ def _match(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
         stem = name[: -len(Path(name).suffix)] if Path(name).suffix.lower() in SUFFIXES else name
         choice = [by_name[name]] if name in by_name else by_stem.get(name) or by_stem.get(stem) or []
         if len(choice) > 1:
-            raise InputError(
-                f"{folder}: camera {name!r} has more than one photo ({', '.join(path.name for path in choice)}); keep one"
-            )
+            names = ", ".join(path.name for path in choice)
+            raise InputError(f"{folder}: camera {name!r} has more than one photo ({names}); keep one")
         found.extend(choice)
         if not choice:
             missing.append(name)
@@ -165,7 +164,9 @@ def _scale_to(sizes: list[Size], paths: list[Path], cameras: Sequence[Camera]) -
     for (width, height), path, camera in zip(sizes, paths, cameras):
         place = f"{path}: photo of {width}x{height} for camera {camera.name!r} of {camera.width}x{camera.height}"
         if width > camera.width or height > camera.height:
-            raise InputError(f"{place}: photos may be smaller than the cameras say, never larger; check the two folders")
+            raise InputError(
+                f"{place}: photos may be smaller than the cameras say, never larger; check the two folders"
+            )
         low = max(factors[0], camera.width / (width + 1), camera.height / (height + 1))
         high = min(factors[1], _most(camera.width, width), _most(camera.height, height))
         same = seen.setdefault((camera.width, camera.height), (width, height)) == (width, height)

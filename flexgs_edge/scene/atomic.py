@@ -24,12 +24,16 @@ def check_writable(path: str | os.PathLike[str], force: bool = False) -> Path:
         When the folder is missing, `path` is no regular file, or it exists and `force` is not set.
     """
     target = Path(os.path.realpath(path))
-    if not target.parent.is_dir():
+    try:
+        folder, exists, plain = target.parent.is_dir(), target.exists(), target.is_file()
+    except OSError as error:  # a name too long, a folder that may not be entered
+        raise InputError(f"{path}: cannot write there ({error.strerror})") from error
+    if not folder:
         raise InputError(f"{path}: the folder {target.parent} does not exist; make it first")
     # A rename would replace a device node such as /dev/null by a file: refuse whatever is not a plain file.
-    if target.exists() and not target.is_file():
+    if exists and not plain:
         raise InputError(f"{path}: expected a file name to write to, found a folder or a special file")
-    if target.exists() and not force:
+    if exists and not force:
         raise InputError(f"{path}: the file exists; choose another name or use -f to overwrite it")
     return target
 

@@ -95,7 +95,7 @@ def _check_chunk(source: SceneSource, rows: slice, faults: _Faults) -> tuple[np.
         if field.name == "log_scales":
             finite |= np.isneginf(values)
             scales = values
-        broken = ~finite.all(axis=0)
+        broken = np.asarray(~finite.all(axis=0))
         faults.add(rows.start, broken, f"NaN or infinity in {field.name}")
         bad |= broken
         if field.name == "quats":

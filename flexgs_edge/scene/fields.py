@@ -51,7 +51,9 @@ FIELDS: tuple[Field, ...] = (
     Field("sh_dc", "SH coefficient of degree 0, red green blue", ("f_dc_0", "f_dc_1", "f_dc_2"), "dc"),
     Field("sh_rest", "SH coefficients above degree 0, channel-major", (), "rest"),
     Field("opacity_logits", "logit of the opacity", ("opacity",), "opacity"),
-    Field("log_scales", "natural log of the standard deviations, scene units", ("scale_0", "scale_1", "scale_2"), "scale"),
+    Field(
+        "log_scales", "natural log of the standard deviations, scene units", ("scale_0", "scale_1", "scale_2"), "scale"
+    ),
     Field("quats", "rotation quaternion w x y z, any norm", ("rot_0", "rot_1", "rot_2", "rot_3"), "rot"),
 )
 """In the order of INRIA's PLY."""

@@ -79,9 +79,10 @@ def find_companions(path: str | os.PathLike[str]) -> Companions:
     """
     place = Path(path)
     folder = place if place.is_dir() else place.parent
-    if not place.is_dir() and _ITERATION.fullmatch(folder.name) and folder.absolute().parent.name == "point_cloud":
-        if not (folder / "cameras.json").is_file():
-            folder = folder.parent.parent
+    holder = folder.absolute()  # a bare file name has no parents of its own to look at
+    inside = _ITERATION.fullmatch(holder.name) and holder.parent.name == "point_cloud"
+    if inside and not (folder / "cameras.json").is_file():
+        folder = holder.parent.parent
     settings = _read_cfg_args(folder / "cfg_args")
     white = settings.get("white_background")
     cameras = folder / "cameras.json"
@@ -115,8 +116,5 @@ def _read_cfg_args(path: Path) -> dict[str, Any]:
         raise FormatError(f"{path}: expected the text Namespace(key=value, ...), found {text[:40]!r}") from error
     if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.func.id != "Namespace":
         raise FormatError(f"{path}: expected the text Namespace(key=value, ...), found {text[:40]!r}")
-    return {keyword.arg: keyword.value.value for keyword in call.keywords if _literal(keyword)}
-
-
-def _literal(keyword: ast.keyword) -> bool:
-    return keyword.arg is not None and isinstance(keyword.value, ast.Constant)
+    pairs = ((keyword.arg, keyword.value) for keyword in call.keywords)
+    return {key: value.value for key, value in pairs if key is not None and isinstance(value, ast.Constant)}

@@ -6,6 +6,7 @@ the process, and a file that shrinks while mapped kills it.
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -25,13 +26,16 @@ _SPAN = 4
 """A list of rows is read as one span of the file while the span has at most this many rows a row asked for."""
 _ORIGIN_ROWS = 65536
 _ORIGIN_QUANTILES = (0.05, 0.95)
+_ORIGIN_FAR = 16.0
+"""Extents from zero to where float32 has lost 4 of its 24 bits. Nearer scenes keep origin 0: their numbers stay exact,
+and they can be written as INRIA's float properties (many viewers cannot read double)."""
 
 
 class PlySource(SceneSource):
     """A PLY in INRIA's layout: any property order, byte order and float width; SH degree 0 to 4.
 
-    Binary files whose rows have one size are read by row ranges; others (ascii, lists) are loaded whole by plyfile.
-    The origin is chosen by `choose_origin` from a sample of the positions; it is taken off in float64 before
+    Binary files are read by row ranges; ascii files, and those with lists in or before the vertices, are loaded whole
+    by plyfile. The origin is chosen by `choose_origin` from a sample of the positions; it is taken off in float64 before
     positions are rounded to float32.
 
     Parameters
@@ -77,7 +81,8 @@ class PlySource(SceneSource):
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`; needs about 1 MB beside the arrays (4 MB for lists of rows)."""
         rows, planes = self.begin_read(rows, fields, out)
-        with np.errstate(over="ignore", invalid="ignore"):  # doubles beyond float32 become inf: check_scene reports them
+        # Doubles beyond float32 become infinite here; check_scene reports them.
+        with np.errstate(over="ignore", invalid="ignore"):
             for part, block in self._rows.blocks(rows):
                 for field, plane in planes.items():
                     for channel, name in enumerate(FIELD[field].ply_names(self.sh_degree)):
@@ -92,8 +97,8 @@ def choose_origin(positions: np.ndarray) -> np.ndarray:
     """Where to measure positions from, so that float32 keeps their digits.
 
     Per axis the 5 % and 95 % quantiles of the finite positions give a centre and an extent; the grid is the largest
-    extent, rounded up to a power of two (1 if there is none), and the origin is the grid point nearest to the centre.
-    A scene whose middle is within half a grid step of zero keeps the origin 0, and with it its exact numbers.
+    extent, rounded up to a power of two (1 if there is none). The origin is the grid point nearest to the centre,
+    or 0 for scenes whose centre is within 16 grid steps of zero on every axis: these lose too little to be moved.
 
     Parameters
     ----------
@@ -115,9 +120,10 @@ def choose_origin(positions: np.ndarray) -> np.ndarray:
         low, high = np.quantile(finite, _ORIGIN_QUANTILES, axis=0)
         extent = float((high - low).max())
         grid = 2.0 ** np.ceil(np.log2(extent)) if extent > 0 else 1.0
-        # + 0.0 turns -0.0 into 0.0, which would otherwise show in files and messages.
-        origin = np.round((low + high) / 2 / grid) * grid + 0.0
-    return origin if np.all(np.isfinite(origin)) else np.zeros(3)
+        origin = np.round((low + high) / 2 / grid) * grid
+        far = np.all(np.isfinite(origin)) and np.any(np.abs(origin) > _ORIGIN_FAR * grid)
+    # + 0.0 turns -0.0 into 0.0, which would otherwise show in files and messages.
+    return origin + 0.0 if far else np.zeros(3)
 
 
 class _RowReader(Protocol):
@@ -178,7 +184,7 @@ class _FileRows:
 
     def _range(self, file: BinaryIO, first: int, block: np.ndarray) -> np.ndarray:
         """Fill `block` with the rows from `first` on."""
-        view = memoryview(block.view(np.uint8))
+        view = block.view(np.uint8).data
         file.seek(self.offset + first * self.dtype.itemsize)
         done = 0
         while done < len(view):
@@ -195,18 +201,43 @@ def _stamp(file: BinaryIO) -> tuple[int, int, int]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
+class _HeaderThenData:
+    """What plyfile reads: our own header (it refuses comments in UTF-8), then the data, as text for ascii files.
+
+    Plain bytes would not do for ascii: plyfile wraps them and reads ahead, and what follows cannot be checked.
+    """
+
+    def __init__(self, header: PlyHeader, file: BinaryIO) -> None:
+        self.text, self.file = not header.order, file
+        self.head = io.BytesIO(header.text.encode("ascii"))
+        self.left = os.fstat(file.fileno()).st_size - header.data_offset
+
+    def read(self, size: int) -> str | bytes:
+        if size < 0:
+            raise ValueError(f"a list of negative length ({size})")
+        # A list's length is a claim too: no more is asked for than there is.
+        data = self.head.read(size) or self.file.read(min(size, self.left))
+        return data.decode("ascii") if self.text else data
+
+    def readline(self) -> str:
+        return self.file.readline().decode("ascii", "replace")
+
+
 def _load_whole(header: PlyHeader) -> np.ndarray:
     """The rows of `vertex` of a file that only plyfile can take apart (held in memory as long as the source)."""
-    from plyfile import PlyData, PlyParseError  # GPL-3: imported only for the files that need it
+    # GPL-3: imported only for the files that need it.
+    from plyfile import PlyData, PlyParseError
 
     try:
         with open(header.path, "rb") as file:
-            rows = PlyData.read(file, mmap=False)["vertex"].data
-            rest = file.read().strip() if header.order else b""
+            file.seek(header.data_offset)
+            stream = _HeaderThenData(header, file)
+            rows = PlyData.read(stream, mmap=False)["vertex"].data
+            rest = len(file.read() if header.order else file.read().strip())
     except (PlyParseError, ValueError, UnicodeDecodeError, OverflowError, MemoryError) as error:
         raise FormatError(f"{header.path}: {error}") from error
     if rest:
-        raise FormatError(f"{header.path}: {len(rest)} bytes too many after the last element")
+        raise FormatError(f"{header.path}: {rest} bytes too many after the last element")
     return rows
 
 
@@ -258,7 +289,7 @@ def write_ply(
             if wide:
                 for axis, name in enumerate(FIELD["means"].ply):
                     block[name] += source.origin[axis]
-            file.write(memoryview(block.view(np.uint8)))
+            file.write(block.view(np.uint8).data)
     where = ", ".join(f"{value:g}" for value in source.origin)
     return (f"positions written as double: the scene is far from zero (origin {where})",) if wide else ()
 

@@ -31,6 +31,7 @@ _TYPES = {
     "double": "f8",
     "float64": "f8",
 }
+_NAMES = {kind: name for name, kind in reversed(_TYPES.items())}
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 1 << 20
 """Bytes: headers of scenes have 2 kB; a file without `end_header` is not read to its end."""
@@ -100,15 +101,31 @@ class PlyHeader:
         raise FormatError(f"{self.path}: no element 'vertex'; found {names}")
 
     @property
+    def before(self) -> list[Element]:
+        """The elements stored before `vertex`."""
+        return self.elements[: self.elements.index(self.vertex)]
+
+    @property
     def plain(self) -> bool:
-        """Binary with rows of one size: can be read by row ranges."""
-        return bool(self.order) and all(element.scalar for element in self.elements)
+        """Binary, and no lists in `vertex` or before it: can be read by row ranges."""
+        return bool(self.order) and all(element.scalar for element in (*self.before, self.vertex))
 
     @property
     def vertex_offset(self) -> int:
         """Byte where the rows of `vertex` start (plain files)."""
-        before = self.elements[: self.elements.index(self.vertex)]
-        return self.data_offset + sum(element.count * element.row_size for element in before)
+        return self.data_offset + sum(element.count * element.row_size for element in self.before)
+
+    @property
+    def text(self) -> str:
+        """The header again, without comments."""
+        names = {order: name for name, order in _FORMATS.items()}
+        lines = ["ply", f"format {names[self.order]} 1.0"]
+        for element in self.elements:
+            lines.append(f"element {element.name} {element.count}")
+            for p in element.properties:
+                kind = _NAMES[p.type] if p.length is None else f"list {_NAMES[p.length]} {_NAMES[p.type]}"
+                lines.append(f"property {kind} {p.name}")
+        return "\n".join([*lines, "end_header", ""])
 
     @property
     def vertex_dtype(self) -> np.dtype:
@@ -116,7 +133,7 @@ class PlyHeader:
         return np.dtype([(p.name, self.order + p.type) for p in self.vertex.properties])
 
     def check_size(self, size: int) -> None:
-        """Compare what the header claims with the file's `size` in bytes (exactly for plain files).
+        """Compare what the header claims with the file's `size` in bytes (exactly for binary files without lists).
 
         Raises
         ------
@@ -127,15 +144,17 @@ class PlyHeader:
             if element.count and not element.properties:
                 raise FormatError(f"{self.path}: element {element.name!r} has {element.count} rows without properties")
         # In ascii a value is one character and its separator at the least; the last may lack the latter.
+        exact = bool(self.order) and all(element.scalar for element in self.elements)
         least = sum(e.count * (e.row_size if self.order else 2 * len(e.properties)) for e in self.elements)
         found = size - self.data_offset
         claims = ", ".join(f"{e.count} x {e.name}" for e in self.elements)
         if found + (not self.order) < least:
+            promised = f"{'' if exact else 'at least '}{least} bytes"
             raise FormatError(
-                f"{self.path}: truncated: the header promises {claims}, {'' if self.plain else 'at least '}{least} bytes "
-                f"from byte {self.data_offset}; found {found}"
+                f"{self.path}: truncated: the header promises {claims}, {promised} from byte {self.data_offset}; "
+                f"found {found}"
             )
-        if self.plain and found > least:
+        if exact and found > least:
             raise FormatError(
                 f"{self.path}: {found - least} bytes too many: the header promises {claims}, {least} bytes "
                 f"from byte {self.data_offset}; found {found}"
@@ -182,7 +201,9 @@ def _format(place: str, words: list[str], order: str | None) -> str:
     if order is not None:
         raise FormatError(f"{place}: a second 'format' line")
     if len(words) != 3 or words[1] not in _FORMATS or words[2] != "1.0":
-        raise FormatError(f"{place}: expected 'format' and one of {', '.join(_FORMATS)}, 1.0; found {' '.join(words)!r}")
+        raise FormatError(
+            f"{place}: expected 'format' and one of {', '.join(_FORMATS)}, 1.0; found {' '.join(words)!r}"
+        )
     return _FORMATS[words[1]]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Union
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
 Planes = dict[str, np.ndarray]
 """Arrays by field name, each [width, n] f32."""
 
-Rows = Union[slice, np.ndarray]
+Rows = slice | np.ndarray
 """`slice(start, stop)` or a sorted int64 array."""
 
 REST_WIDTHS: dict[int, int] = {3 * sh_rest_count(degree): degree for degree in range(MAX_SH_DEGREE + 1)}
@@ -242,15 +241,15 @@ class SelectSource(SceneSource):
     """
 
     def __init__(self, parent: SceneSource, rows: np.ndarray, notes: tuple[str, ...] = ()) -> None:
-        plain = normalize_rows(np.asarray(rows), parent.count)[0]
+        plain, _ = normalize_rows(np.asarray(rows), parent.count)
         assert isinstance(plain, np.ndarray)
         notes = parent.notes + notes
-        sh_rows = np.flatnonzero(plain < parent.sh_count)
         if isinstance(parent, SelectSource):
             plain, parent = parent.rows[plain], parent.parent
-        self.parent = parent
+        sh_rows = np.flatnonzero(plain < parent.sh_count)
+        self.parent: SceneSource = parent
         # Half the bytes where they do: the list lives as long as the source.
-        self.rows = plain.astype(np.int32 if parent.count < 2**31 else np.int64)
+        self.rows: np.ndarray = plain.astype(np.int32 if parent.count < 2**31 else np.int64)
         self.name, self.count, self.sh_degree = parent.name, plain.size, parent.sh_degree
         self.sh_count = int(sh_rows[-1]) + 1 if sh_rows.size else 0
         self.origin, self.notes = parent.origin, notes
