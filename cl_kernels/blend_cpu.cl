@@ -10,7 +10,7 @@
 #define RETIRE_EVERY 16          // splats between two looks for blocks whose pixels have all ended
 
 #ifndef STATS
-#error "STATS (0: image only, 1: hits and weights as well) must be defined"
+#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual) must be defined"
 #endif
 
 // Lane l of vector v is pixel (l + v W) of the block, row by row.
@@ -38,28 +38,42 @@ inline int any_alive(FW t) {
 
 #if STATS
 // 64-bit fixed point by two 32-bit atomics: integer sums, so any order gives the same bits, and no 64-bit atomics are needed.
-inline void add_fixed(__global uint *low, __global uint *high, float value) {
-  const ulong fixed_value = (ulong)(value * 4294967296.0f);
+inline void add_fixed(__global uint *low, __global uint *high, float value, float scale) {
+  const ulong fixed_value = (ulong)(long)(clamp(value * scale, -FIXED_LARGEST, FIXED_LARGEST));
   const uint add = (uint)fixed_value;
   const uint old = atomic_add(low, add);
   const uint carry = (uint)(fixed_value >> 32) + (old + add < old ? 1u : 0u);
   if (carry) atomic_add(high, carry);
 }
+#define ADD_SUM(k, v, scale)                                                                               \
+  add_fixed(sums + (size_t)(2 * (k)) * rows + pair.x, sums + (size_t)(2 * (k) + 1) * rows + pair.x, \
+            tree_sum(v), scale)
 
 // The fixed pairwise tree over the 16 lanes of a block: l + (l + 8), then + 4, + 2, + 1.
+#if W == 16
+#define FOLD(v) const CAT(LANE_T, 8) h = v[0].lo + v[0].hi; const CAT(LANE_T, 4) f = h.lo + h.hi
+#elif W == 8
+#define FOLD(v) const CAT(LANE_T, 8) h = v[0] + v[1]; const CAT(LANE_T, 4) f = h.lo + h.hi
+#elif W == 4
+#define FOLD(v) const CAT(LANE_T, 4) f = (v[0] + v[2]) + (v[1] + v[3])
+#else
+#define FOLD(v)                                                              \
+  CAT(LANE_T, 4) f;                                                          \
+  f.s0 = (v[0] + v[8]) + (v[4] + v[12]), f.s1 = (v[1] + v[9]) + (v[5] + v[13]); \
+  f.s2 = (v[2] + v[10]) + (v[6] + v[14]), f.s3 = (v[3] + v[11]) + (v[7] + v[15])
+#endif
 inline float tree_sum(const FW *v) {
-  float s[16];
-  for (int k = 0; k < BLOCK_VECTORS; ++k) STOREF(v[k], s, k * W);
-  for (int l = 0; l < 8; ++l) s[l] += s[l + 8];
-  for (int l = 0; l < 4; ++l) s[l] += s[l + 4];
-  return (s[0] + s[2]) + (s[1] + s[3]);
+#define LANE_T float
+  FOLD(v);
+#undef LANE_T
+  return (f.s0 + f.s2) + (f.s1 + f.s3);
 }
+// Lanes hold -1 for each hit.
 inline uint lane_count(const IW *v) {
-  int s[16];
-  int sum = 0;
-  for (int k = 0; k < BLOCK_VECTORS; ++k) STOREI(v[k], s, k * W);
-  for (int l = 0; l < 16; ++l) sum -= s[l];
-  return (uint)sum;
+#define LANE_T int
+  FOLD(v);
+#undef LANE_T
+  return (uint)-((f.s0 + f.s2) + (f.s1 + f.s3));
 }
 #endif
 
@@ -81,9 +95,9 @@ __kernel void blend(
 #if STATS
     ,
     __global uint *hits,                  // [N]
-    __global uint *weights                // [2, N] low and high words of sum(alpha T), fixed point
-    ,
-    const uint rows                       // N
+    __global uint *sums,                  // [S, 2, N] low and high words of fixed-point sums, see SUMS in renderer.py
+    const uint rows,                      // N
+    __global const float *target          // [3, padded height, padded width] 2: the finished image, 3: the residual
 #endif
 ) {
   const uint tile = get_global_id(0);
@@ -106,6 +120,22 @@ __kernel void blend(
     }
   }
 
+#if STATS > 1
+  FW target_r[BLOCKS * BLOCK_VECTORS], target_g[BLOCKS * BLOCK_VECTORS], target_b[BLOCKS * BLOCK_VECTORS];
+  for (int b = 0; b < BLOCKS; ++b) {
+    const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
+    __global const float *at = target + (size_t)(tile_py + BLOCK * (b >> 2)) * pitch + tile_px + BLOCK * (b & 3);
+    float lanes[3][16];
+    for (int c = 0; c < 3; ++c)
+      for (int row = 0; row < BLOCK; ++row) vstore4(vload4(0, at + c * plane + row * pitch), row, lanes[c]);
+    for (int v = 0; v < BLOCK_VECTORS; ++v) {
+      target_r[b * BLOCK_VECTORS + v] = LOADF(lanes[0], v * W);
+      target_g[b * BLOCK_VECTORS + v] = LOADF(lanes[1], v * W);
+      target_b[b * BLOCK_VECTORS + v] = LOADF(lanes[2], v * W);
+    }
+  }
+#endif
+
   const uint first = tile ? ends[(size_t)tile * blocks - 1] : 0u, last = ends[(size_t)(tile + 1) * blocks - 1];
   uint live = 0xFFFFu;
   for (uint n = first; n < last; ++n) {
@@ -125,10 +155,10 @@ __kernel void blend(
     const FW cr = (FW)r[6], cg = (FW)r[7], cbl = (FW)r[8];
 #if STATS
     IW hit_sum[BLOCK_VECTORS];
-    FW weight_sum[BLOCK_VECTORS];
+    FW sum_a[BLOCK_VECTORS], sum_b[BLOCK_VECTORS], sum_c[BLOCK_VECTORS], sum_d[BLOCK_VECTORS];
     for (int v = 0; v < BLOCK_VECTORS; ++v) {
       hit_sum[v] = (IW)0;
-      weight_sum[v] = (FW)0.0f;
+      sum_a[v] = sum_b[v] = sum_c[v] = sum_d[v] = (FW)0.0f;
     }
 #endif
     while (mask) {
@@ -151,15 +181,40 @@ __kernel void blend(
         trans[k] = pick(hit, next, pick(seen, -fabs(t), t));
 #if STATS
         hit_sum[v] += hit;
-        weight_sum[v] += weight;
+#endif
+#if STATS == 1
+        sum_a[v] += weight;
+#elif STATS == 2
+        // What the pixel would change by without this splat: its own light goes, what lies behind it gets brighter.
+        const FW ratio = pick(hit, alpha / ((FW)1.0f - alpha), (FW)0.0f);
+        const FW er = fma(weight, cr, -(ratio * (target_r[k] - red[k])));
+        const FW eg = fma(weight, cg, -(ratio * (target_g[k] - green[k])));
+        const FW eb = fma(weight, cbl, -(ratio * (target_b[k] - blue[k])));
+        sum_a[v] += fma(eb, eb, fma(eg, eg, er * er));
+        sum_b[v] = fma(weight, weight, sum_b[v]);
+#elif STATS == 3
+        sum_a[v] += weight;
+        sum_b[v] = fma(weight, target_r[k], sum_b[v]);
+        sum_c[v] = fma(weight, target_g[k], sum_c[v]);
+        sum_d[v] = fma(weight, target_b[k], sum_d[v]);
 #endif
       }
     }
 #if STATS
     const uint count = lane_count(hit_sum);
     if (count) {
+#if STATS == 1
       atomic_add(hits + pair.x, count);
-      add_fixed(weights + pair.x, weights + rows + pair.x, tree_sum(weight_sum));
+      ADD_SUM(0, sum_a, FIXED_WEIGHT);
+#elif STATS == 2
+      ADD_SUM(0, sum_a, FIXED_ERROR);
+      ADD_SUM(1, sum_b, FIXED_ERROR);
+#elif STATS == 3
+      ADD_SUM(0, sum_a, FIXED_WEIGHT);
+      ADD_SUM(1, sum_b, FIXED_WEIGHT);
+      ADD_SUM(2, sum_c, FIXED_WEIGHT);
+      ADD_SUM(3, sum_d, FIXED_WEIGHT);
+#endif
     }
 #endif
   }

@@ -41,7 +41,8 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
     ,
     __global uint *hits,
     __global uint *weights,
-    const uint rows
+    const uint rows,
+    __global const float *target
 #endif
 ) {
   __local float splats[BATCH][9];

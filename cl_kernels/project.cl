@@ -1,51 +1,17 @@
 // One view of a chunk of Gaussians: splat records, depth keys and how many tiles each splat may touch.
 // Twin: flexgs_edge.kernels.twins.project
 
-// Camera, 32 floats: R row-major 0-8, t 9-11, fx fy cx cy 12-15, near 16, Jacobian clamp x lo hi, y lo hi 17-20,
+// Camera, 32 floats (see sh.clh too): R row-major 0-8, t 9-11, fx fy cx cy 12-15, near 16, Jacobian clamp x lo hi, y lo hi 17-20,
 // position 21-23, width height 24-25.
 #define CAM(k) ((FW)camera[k])
-
-inline FW sh_band(__global const float *sh, size_t stride, size_t i, int k, FW basis, FW acc) {
-  return fma(basis, LOADF(sh, (size_t)k * stride + i), acc);
-}
 
 // One colour channel in direction (x, y, z); sh_rest holds the channel's coefficients above degree 0.
 inline FW sh_colour(__global const float *dc, __global const float *rest, size_t stride, size_t i, int degree,
                     FW x, FW y, FW z) {
   FW c = (FW)SH_C0 * LOADF(dc, i);
-  if (degree > 0) {
-    c = sh_band(rest, stride, i, 0, (FW)-SH_C1 * y, c);
-    c = sh_band(rest, stride, i, 1, (FW)SH_C1 * z, c);
-    c = sh_band(rest, stride, i, 2, (FW)-SH_C1 * x, c);
-  }
-  if (degree > 1) {
-    FW xx = x * x, yy = y * y, zz = z * z;
-    c = sh_band(rest, stride, i, 3, (FW)SH_C2_0 * (x * y), c);
-    c = sh_band(rest, stride, i, 4, (FW)SH_C2_1 * (y * z), c);
-    c = sh_band(rest, stride, i, 5, (FW)SH_C2_2 * ((zz + zz) - (xx + yy)), c);
-    c = sh_band(rest, stride, i, 6, (FW)SH_C2_3 * (x * z), c);
-    c = sh_band(rest, stride, i, 7, (FW)SH_C2_4 * (xx - yy), c);
-    if (degree > 2) {
-      c = sh_band(rest, stride, i, 8, (FW)SH_C3_0 * (y * ((FW)3.0f * xx - yy)), c);
-      c = sh_band(rest, stride, i, 9, (FW)SH_C3_1 * ((x * y) * z), c);
-      c = sh_band(rest, stride, i, 10, (FW)SH_C3_2 * (y * ((FW)4.0f * zz - (xx + yy))), c);
-      c = sh_band(rest, stride, i, 11, (FW)SH_C3_3 * (z * ((FW)2.0f * zz - (FW)3.0f * (xx + yy))), c);
-      c = sh_band(rest, stride, i, 12, (FW)SH_C3_4 * (x * ((FW)4.0f * zz - (xx + yy))), c);
-      c = sh_band(rest, stride, i, 13, (FW)SH_C3_5 * (z * (xx - yy)), c);
-      c = sh_band(rest, stride, i, 14, (FW)SH_C3_6 * (x * (xx - (FW)3.0f * yy)), c);
-    }
-    if (degree > 3) {
-      c = sh_band(rest, stride, i, 15, (FW)SH_C4_0 * ((x * y) * (xx - yy)), c);
-      c = sh_band(rest, stride, i, 16, (FW)SH_C4_1 * ((y * z) * ((FW)3.0f * xx - yy)), c);
-      c = sh_band(rest, stride, i, 17, (FW)SH_C4_2 * ((x * y) * ((FW)7.0f * zz - (FW)1.0f)), c);
-      c = sh_band(rest, stride, i, 18, (FW)SH_C4_3 * ((y * z) * ((FW)7.0f * zz - (FW)3.0f)), c);
-      c = sh_band(rest, stride, i, 19, (FW)SH_C4_4 * (zz * ((FW)35.0f * zz - (FW)30.0f) + (FW)3.0f), c);
-      c = sh_band(rest, stride, i, 20, (FW)SH_C4_5 * ((x * z) * ((FW)7.0f * zz - (FW)3.0f)), c);
-      c = sh_band(rest, stride, i, 21, (FW)SH_C4_6 * ((xx - yy) * ((FW)7.0f * zz - (FW)1.0f)), c);
-      c = sh_band(rest, stride, i, 22, (FW)SH_C4_7 * ((x * z) * (xx - (FW)3.0f * yy)), c);
-      c = sh_band(rest, stride, i, 23, (FW)SH_C4_8 * (xx * (xx - (FW)3.0f * yy) - yy * ((FW)3.0f * xx - yy)), c);
-    }
-  }
+#define ADD_BAND(k, basis) c = fma(basis, LOADF(rest, (size_t)(k) * stride + i), c)
+  FOR_EACH_BASIS(degree, x, y, z, ADD_BAND)
+#undef ADD_BAND
   return fmax(c + (FW)0.5f, (FW)0.0f);
 }
 
@@ -161,11 +127,8 @@ __kernel void project(
   FW tiles = (x1 - x0 + (FW)1.0f) * (y1 - y0 + (FW)1.0f);
 
   if (ANY(shown)) {
-    FW dx = px - CAM(21), dy = py - CAM(22), dz = pz - CAM(23);
-    FW norm = (FW)1.0f / sqrt(dot3(dx, dy, dz, dx, dy, dz));
-    dx = dx * norm;
-    dy = dy * norm;
-    dz = dz * norm;
+    FW dx, dy, dz;
+    view_direction(camera, px, py, pz, &dx, &dy, &dz);
     const size_t rest = (size_t)((degree + 1) * (degree + 1) - 1) * s;
     out[6] = sh_colour(sh_dc, sh_rest, s, i, degree, dx, dy, dz);
     out[7] = sh_colour(sh_dc + s, sh_rest + rest, s, i, degree, dx, dy, dz);

@@ -118,8 +118,12 @@ DEQUANTIZE_ROWS: Final = 64
 """Rows of a work-item of the dequantize kernel: one division to find its group, few enough to spread over all units."""
 
 # --- reductions -------------------------------------------------------------------------------
-FIXED_POINT_BITS: Final = 32
-"""Fraction bits of the 64-bit sums over tiles and views: any order of adding gives the same bits."""
+FIXED_WEIGHT: Final = 2.0**32
+FIXED_ERROR: Final = 2.0**40
+"""Units of the 64-bit fixed-point sums over tiles and views, of weights and of squared errors: any order of adding gives the
+same bits. A pixel's weight is at most 1; errors get finer units since those of small splats decide what goes first."""
+FIXED_LARGEST: Final = 2.0**62
+"""Values are clamped to this before they become integers."""
 
 # --- method (FlexGaussian, ACM MM 2025) -------------------------------------------------------
 VOLUME_POWER: Final = 0.1

@@ -48,7 +48,12 @@ KERNELS: dict[str, KernelSpec] = {
     "tile_count": KernelSpec("tiles.cl", "uuffibbb"),
     "tile_scatter": KernelSpec("tiles.cl", "uuffibbbb"),
     "blend": KernelSpec("blend_{form}.cl", _BLEND, "tile", stats=0),
-    "blend_stats": KernelSpec("blend_{form}.cl", _BLEND + "bbu", "tile", kernel="blend", stats=1),
+    "blend_stats": KernelSpec("blend_{form}.cl", _BLEND + "bbub", "tile", kernel="blend", stats=1),
+    "blend_removal": KernelSpec("blend_{form}.cl", _BLEND + "bbub", "tile", kernel="blend", stats=2),
+    "blend_residual": KernelSpec("blend_{form}.cl", _BLEND + "bbub", "tile", kernel="blend", stats=3),
+    "residual": KernelSpec("score.cl", "ubbb", "rows"),
+    "sh_costs": KernelSpec("score.cl", "uuuuubbbbb", "rows"),
+    "sh_residual": KernelSpec("score.cl", "uuuuubbbb", "rows"),
     "dequantize": KernelSpec("dequantize.cl", "uuuuuuubbbb"),
 }
 """Every kernel by the name that `Backend.launch` and the twins share."""

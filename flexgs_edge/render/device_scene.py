@@ -154,6 +154,7 @@ class DeviceScene:
     def __init__(self, backend: Backend, planes: SourcePlanes | QuantizedPlanes, budget: MemoryBudget) -> None:
         self.backend = backend
         self.count = planes.count
+        self.sh_degree = planes.sh_degree if planes.sh_count else 0
         self.origin = planes.origin
         self.statistics: list[Any] = []
         self._planes = planes
@@ -193,6 +194,17 @@ class DeviceScene:
                 yield chunk
             finally:
                 chunk.release()
+
+    def refresh(self, *fields: str) -> None:
+        """Read `sh_dc` or `sh_rest` again from a source whose values have changed (streamed chunks do so anyway)."""
+        if not isinstance(self._planes, SourcePlanes):
+            raise TypeError("only a scene with a source can be refreshed")
+        for chunk in self._resident:
+            names = [name for name in fields if FIELD[name].width(chunk.degree)]
+            host = self._planes.source.read(slice(chunk.base, chunk.base + chunk.count), names)
+            for name in names:
+                for channel in range(FIELD[name].width(chunk.degree)):
+                    self.backend.write(getattr(chunk, name), host[name][channel], channel * chunk.stride)
 
     def close(self) -> None:
         """Free everything."""

@@ -10,11 +10,11 @@ import numpy as np
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
-from flexgs_edge.constants import DEFAULT_NEAR, FIXED_POINT_BITS, JACOBIAN_MARGIN, TILE
+from flexgs_edge.constants import DEFAULT_NEAR, FIXED_WEIGHT, JACOBIAN_MARGIN, TILE
 from flexgs_edge.errors import InputError
 from flexgs_edge.kernels import Backend
 from flexgs_edge.quantize import QuantizedScene
-from flexgs_edge.render.device_scene import DeviceScene, QuantizedPlanes, SourcePlanes
+from flexgs_edge.render.device_scene import DeviceScene, QuantizedPlanes, SourcePlanes, padded
 from flexgs_edge.scene.source import SceneSource
 
 SORT_DIGIT_BITS = 11
@@ -34,7 +34,7 @@ class Statistics:
     hits : np.ndarray
         [N] i64, pixels at which the Gaussian was blended.
     weights : np.ndarray
-        [N] u64, sum of alpha T over pixels in fixed point of `FIXED_POINT_BITS` fraction bits: adding is exact, so any
+        [N] u64, sum of alpha T over pixels in fixed point, units of 1 / `FIXED_WEIGHT`: adding is exact, so any
         order of views, chunks and workers gives the same bits.
     """
 
@@ -49,7 +49,7 @@ class Statistics:
     @property
     def weight_sums(self) -> np.ndarray:
         """[N] f64, sum of alpha T."""
-        return self.weights * 2.0**-FIXED_POINT_BITS
+        return self.weights / FIXED_WEIGHT
 
 
 def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray:
@@ -80,6 +80,8 @@ class _ViewBuffers:
         self.tiles_x, self.tiles_y = -(-width // TILE), -(-height // TILE)
         self.tiles = self.tiles_x * self.tiles_y
         self.arrays: list[Any] = []
+        self._backend = backend
+        self._targets: tuple[Any, Any] | None = None
         self.padded_height, self.padded_width = self.tiles_y * TILE, self.tiles_x * TILE
 
         def array(shape: tuple[int, ...], dtype: Any) -> Any:
@@ -105,10 +107,28 @@ class _ViewBuffers:
             self.release()
             raise
 
+    def target_arrays(self) -> tuple[Any, Any]:
+        """A target image in half precision and the residual against it, made when first asked for."""
+        if self._targets is None:
+            pixels = 3 * self.padded_height * self.padded_width
+            self._targets = (self._backend.array((pixels,), np.float16), self._backend.array((pixels,), np.float32))
+            self.arrays += self._targets
+        return self._targets
+
     def release(self) -> None:
         for array in self.arrays:
             array.release()
         self.arrays = []
+        self._targets = None
+
+
+@dataclass
+class _View:
+    """A view whose splats are projected and ordered."""
+
+    buffers: _ViewBuffers
+    camera: Camera
+    batches: list[tuple[int, int]]
 
 
 class Renderer:
@@ -142,9 +162,14 @@ class Renderer:
         self.near = near
         self.background = tuple(float(np.float32(c)) for c in background)
         self.inria_extent = int(extent == "inria")
-        self.pairs_listed = 0
         self.splats_shown = 0
         self._buffers: _ViewBuffers | None = None
+
+    @property
+    def camera_array(self) -> Any:
+        """The record of the view drawn last, in the backend's memory."""
+        assert self._buffers is not None
+        return self._buffers.camera
 
     def load(self, source: SceneSource) -> DeviceScene:
         """Bring a scene to the backend (all of it, or chunk by chunk for each view when it does not fit)."""
@@ -164,25 +189,79 @@ class Renderer:
         np.ndarray
             [H, W, 3] f32, linear in the model's own colour space, not clamped.
         """
-        self._draw(scene, camera, "blend", ())
-        buffers = self._buffers
-        assert buffers is not None
-        planes = self.backend.read(buffers.image)
-        return planes[:, : camera.height, : camera.width].transpose(1, 2, 0)
+        return self.render_planes(scene, camera)[:, : camera.height, : camera.width].transpose(1, 2, 0)
+
+    def render_planes(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
+        """`render` as the kernels leave it: [3, H, W] f32, both sides rounded up to whole tiles."""
+        view = self._prepare(scene, camera)
+        self._blend(view, "blend")
+        return self.backend.read(view.buffers.image)
 
     def add_statistics(self, scene: DeviceScene, camera: Camera, statistics: Statistics) -> None:
         """Add one view to `statistics` (hits and weights of every row)."""
-        if not scene.statistics:
-            scene.statistics = [self.backend.array((scene.count,), np.uint32), self.backend.array((2, scene.count), np.uint32)]
-        hits, weights = scene.statistics
-        self.backend.fill(hits, 0)
-        self.backend.fill(weights, 0)
-        self._draw(scene, camera, "blend_stats", (hits, weights, scene.count))
+        view = self._prepare(scene, camera)
+        hits, sums = self._sum_arrays(scene, 1)
+        self._blend(view, "blend_stats", (hits, sums, padded(scene.count), view.buffers.image))
         statistics.hits += self.backend.read(hits)
-        words = self.backend.read(weights).astype(np.uint64)
-        statistics.weights += words[0] + (words[1] << np.uint64(32))
+        statistics.weights += self.read_sums(sums, 1, scene.count)[0].view(np.uint64)
 
-    def _draw(self, scene: DeviceScene, camera: Camera, blend: str, extra: tuple[Any, ...]) -> None:
+    def removal_sums(self, scene: DeviceScene, camera: Camera) -> Any:
+        """Squared error of removing each row alone, and the sum of its squared weights, in one view.
+
+        Returns
+        -------
+        array of the backend
+            [2, 2, padded N] u32, low and high words in units of 1 / `FIXED_ERROR`; valid until the next sums.
+        """
+        view = self._prepare(scene, camera)
+        self._blend(view, "blend")
+        hits, sums = self._sum_arrays(scene, 2)
+        self._blend(view, "blend_removal", (hits, sums, padded(scene.count), view.buffers.image), again=True)
+        return sums
+
+    def residual_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
+        """Weights of each row in one view, and what it sees of `target` minus the view.
+
+        Parameters
+        ----------
+        target : np.ndarray
+            [3, H, W] f16, as `render_planes` lays it out.
+
+        Returns
+        -------
+        array of the backend
+            [4, 2, padded N] u32, low and high words of sum(alpha T) and sum(alpha T r) for red, green, blue, in units of
+            1 / `FIXED_WEIGHT`; valid until the next sums.
+        """
+        view = self._prepare(scene, camera)
+        self._blend(view, "blend")
+        hits, sums = self._sum_arrays(scene, 4)
+        half, residual = view.buffers.target_arrays()
+        self.backend.write(half, target.reshape(-1))
+        self.backend.launch("residual", (residual.shape[0],), residual.shape[0], half, view.buffers.image, residual)
+        self._blend(view, "blend_residual", (hits, sums, padded(scene.count), residual), again=True)
+        return sums
+
+    def read_sums(self, sums: Any, channels: int, count: int) -> np.ndarray:
+        """[channels, N] i64 from the words of `removal_sums` or `residual_sums`."""
+        words = self.backend.read(sums)[:channels, :, :count].astype(np.uint64)
+        return (words[:, 0] | (words[:, 1] << np.uint64(32))).view(np.int64)
+
+    def _sum_arrays(self, scene: DeviceScene, channels: int) -> tuple[Any, Any]:
+        held = scene.statistics
+        if held and held[1].shape[0] < channels:
+            for array in held:
+                array.release()
+            held = scene.statistics = []
+        if not held:
+            shapes = (((scene.count,), np.uint32), ((channels, 2, padded(scene.count)), np.uint32))
+            held = scene.statistics = [self.backend.array(shape, dtype) for shape, dtype in shapes]
+        for array in held:
+            self.backend.fill(array, 0)
+        return held[0], held[1]
+
+    def _prepare(self, scene: DeviceScene, camera: Camera) -> _View:
+        """Project and order the splats of a view, and split them into batches whose pairs fit."""
         backend = self.backend
         buffers = self._view_buffers(scene, camera)
         backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
@@ -195,12 +274,17 @@ class Renderer:
         shown, pairs = self._sort(scene.count, buffers)
         self.splats_shown = shown
         batches = [(0, shown)] if pairs <= buffers.capacity else self._batches(buffers, shown)
-        self.pairs_listed = 0
-        for index, (start, stop) in enumerate(batches):
-            self._list_tiles(buffers, camera, start, stop - start)
+        return _View(buffers, camera, batches)
+
+    def _blend(self, view: _View, blend: str, extra: tuple[Any, ...] = (), again: bool = False) -> None:
+        """Blend all batches; `again`: the lists of a single batch are still there."""
+        backend, buffers, camera = self.backend, view.buffers, view.camera
+        for index, (start, stop) in enumerate(view.batches):
+            if not (again and len(view.batches) == 1):
+                self._list_tiles(buffers, camera, start, stop - start)
             backend.launch(
                 blend, (buffers.tiles,), buffers.tiles_x, backend.tile_blocks, camera.width, camera.height,
-                int(index > 0), int(index == len(batches) - 1), *self.background,
+                int(index > 0), int(index == len(view.batches) - 1), *self.background,
                 buffers.ends, buffers.pairs, buffers.records, buffers.state, buffers.image, *extra,
             )  # fmt: skip
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from flexgs_edge.kernels.twins.activate import activate
-from flexgs_edge.kernels.twins.blend import blend
+from flexgs_edge.kernels.twins.blend import blend, blend_removal, blend_residual, blend_stats
 from flexgs_edge.kernels.twins.dequantize import dequantize
 from flexgs_edge.kernels.twins.project import project
+from flexgs_edge.kernels.twins.score import residual, sh_costs, sh_residual
 from flexgs_edge.kernels.twins.sort import (
     exclusive_scan,
     sort_count,
@@ -31,6 +32,11 @@ TWINS: dict[str, Callable[..., None]] = {
     "tile_count": tile_count,
     "tile_scatter": tile_scatter,
     "blend": blend,
-    "blend_stats": blend,
+    "blend_stats": blend_stats,
+    "blend_removal": blend_removal,
+    "blend_residual": blend_residual,
+    "residual": residual,
+    "sh_costs": sh_costs,
+    "sh_residual": sh_residual,
     "dequantize": dequantize,
 }

@@ -6,10 +6,20 @@ Works on all 4x4 blocks of a group of tiles at once: step k blends the k-th spla
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from flexgs_edge.constants import ALPHA_MAX, ALPHA_MIN, BLOCK, FIXED_POINT_BITS, TILE, TRANSMITTANCE_MIN
+from flexgs_edge.constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    BLOCK,
+    FIXED_ERROR,
+    FIXED_LARGEST,
+    FIXED_WEIGHT,
+    TILE,
+    TRANSMITTANCE_MIN,
+)
 from flexgs_edge.kernels.twins.arithmetic import f32, fexp2, fma
 
 TILES_AT_ONCE = 256
@@ -36,28 +46,61 @@ def _block_lists(tile: np.ndarray, masks: np.ndarray, tiles: int) -> _Lists:
     return _Lists(pair[order], np.cumsum(counts) - counts, counts)
 
 
-def _add_statistics(
-    lists: _Lists, weight: np.ndarray, rows_of: np.ndarray, hits: np.ndarray, sums: np.ndarray, rows: int
-) -> None:
-    """Hits and fixed-point weights, summed in the kernel's order: lanes over blocks, then the pairwise tree over lanes."""
-    pairs = len(rows_of)
-    # Entries are ordered by block, so that adding them in order is adding block after block for each pair.
-    lanes = np.zeros((pairs, 16), f32)
-    block = np.repeat(np.arange(len(lists.counts)) % 16, lists.counts)
-    for b in range(16):
-        chosen = np.flatnonzero(block == b)
-        lanes[lists.pair[chosen]] += np.maximum(weight[chosen], 0)
-    count = np.bincount(lists.pair, weights=(weight >= 0).sum(axis=1), minlength=pairs).astype(np.uint32)
+@dataclass
+class _Entries:
+    """What the statistics need of every list entry and lane: hits, weights, and the squared error of removal."""
+
+    hit: np.ndarray
+    weight: np.ndarray
+    error: np.ndarray
+
+
+def _fixed(lanes: np.ndarray, unit: float) -> np.ndarray:
+    """[pairs] i64 of [pairs, 16] lanes: the pairwise tree, then fixed point."""
     eight = lanes[:, :8] + lanes[:, 8:]
     four = eight[:, :4] + eight[:, 4:]
     total = (four[:, 0] + four[:, 2]) + (four[:, 1] + four[:, 3])
-    fixed = (total * f32(2.0**FIXED_POINT_BITS)).astype(np.uint64)
-    np.add.at(hits, rows_of, count)
-    words = sums.astype(np.uint64)
-    both = words[0] + (words[1] << np.uint64(32))
-    np.add.at(both, rows_of, fixed)
-    sums[0] = both & np.uint64(0xFFFFFFFF)
-    sums[1] = both >> np.uint64(32)
+    return np.clip(total * f32(unit), f32(-FIXED_LARGEST), f32(FIXED_LARGEST)).astype(np.int64)
+
+
+def _add_sums(
+    stats: int,
+    lists: _Lists,
+    entries: _Entries,
+    target: np.ndarray | None,
+    rows_of: np.ndarray,
+    hits: np.ndarray,
+    sums: np.ndarray,
+) -> None:
+    """Adds to hits and to the fixed-point sums, in the kernel's order: lanes over blocks, then the tree over lanes.
+
+    `target` is [3, units, 16]. stats 1: weights; 2: squared errors and squared weights; 3: weights and weighted targets.
+    """
+    channels, unit = {1: (1, FIXED_WEIGHT), 2: (2, FIXED_ERROR), 3: (4, FIXED_WEIGHT)}[stats]
+    lanes = np.zeros((channels, len(rows_of), 16), f32)
+    owner = np.repeat(np.arange(len(lists.counts)), lists.counts)
+    for b in range(16):
+        chosen = np.flatnonzero(owner % 16 == b)
+        pair, weight = lists.pair[chosen], entries.weight[chosen]
+        if stats == 2:
+            lanes[0, pair] += entries.error[chosen]
+            lanes[1, pair] = fma(weight, weight, lanes[1, pair])
+            continue
+        lanes[0, pair] += weight
+        for c in range(channels - 1):
+            assert target is not None
+            lanes[1 + c, pair] = fma(weight, target[c, owner[chosen]], lanes[1 + c, pair])
+    count = np.bincount(lists.pair, weights=entries.hit.sum(axis=1), minlength=len(rows_of)).astype(np.uint32)
+    some = count > 0
+    if stats == 1:
+        np.add.at(hits, rows_of, count)
+    for c in range(channels):
+        low, high = sums[c].astype(np.uint64)
+        total = (low | high << np.uint64(32)).view(np.int64)
+        np.add.at(total, rows_of[some], _fixed(lanes[c][some], unit))
+        words = total.view(np.uint64)
+        sums[c, 0] = words & np.uint64(0xFFFFFFFF)
+        sums[c, 1] = words >> np.uint64(32)
 
 
 def blend(
@@ -77,8 +120,10 @@ def blend(
     state: np.ndarray,
     image: np.ndarray,
     hits: np.ndarray | None = None,
-    weights: np.ndarray | None = None,
+    sums: np.ndarray | None = None,
     rows: int = 0,
+    target: np.ndarray | None = None,
+    stats: int = 0,
 ) -> None:
     """Blend the tile lists into `state`, and into `image` ([3, padded height, padded width]) at the end."""
     tile_ends = np.concatenate([[0], ends[blocks - 1 : size[0] * blocks : blocks].astype(np.int64)])
@@ -98,13 +143,13 @@ def blend(
         else:
             colour = np.zeros((3, len(unit), 16), f32)
             trans = np.where((px < f32(width)) & (py < f32(height)), f32(1), f32(-1))
-        weight = _blend_blocks(lists, part[:, 0], records, px, py, colour, trans, hits is not None)
-        if weight is not None and hits is not None and weights is not None:
-            _add_statistics(lists, weight, part[:, 0], hits, weights, rows)
+        ys, xs = py.astype(np.int64), px.astype(np.int64)
+        own_target = target.reshape(image.shape)[:, ys, xs] if stats > 1 and target is not None else None
+        entries = _blend_blocks(lists, part[:, 0], records, (px, py), colour, trans, stats, own_target)
+        if entries is not None and hits is not None and sums is not None:
+            _add_sums(stats, lists, entries, own_target, part[:, 0], hits, sums)
         if finish:
-            out = fma(np.abs(trans), background[:, None, None], colour)
-            ys, xs = py.astype(np.int64), px.astype(np.int64)
-            image[:, ys, xs] = out
+            image[:, ys, xs] = fma(np.abs(trans), background[:, None, None], colour)
         else:
             own = np.concatenate([colour, trans[None]]).reshape(4, last - first, 16, 16)
             state[first:last] = own.transpose(1, 0, 2, 3).reshape(last - first, 4, 256)
@@ -114,14 +159,15 @@ def _blend_blocks(
     lists: _Lists,
     rows_of: np.ndarray,
     records: np.ndarray,
-    px: np.ndarray,
-    py: np.ndarray,
+    pixels: tuple[np.ndarray, np.ndarray],
     colour: np.ndarray,
     trans: np.ndarray,
-    keep_weights: bool,
-) -> np.ndarray | None:
-    """Blend every block's list; returns alpha T by entry and lane (-1 where it was no hit) when asked for."""
-    weight_of = np.full((len(lists.pair), 16), -1, f32) if keep_weights else None
+    stats: int,
+    target: np.ndarray | None,
+) -> _Entries | None:
+    """Blend every block's list into `colour` and `trans`; returns what the statistics need when asked for."""
+    shape = (len(lists.pair) if stats else 0, 16)
+    entries = _Entries(np.zeros(shape, bool), np.zeros(shape, f32), np.zeros(shape if stats == 2 else (0, 16), f32))
     by_length = np.argsort(-lists.counts, kind="stable")
     lengths = lists.counts[by_length]
     for step in range(int(lengths[0]) if len(lengths) else 0):
@@ -131,7 +177,7 @@ def _blend_blocks(
             break
         entry = lists.starts[units] + step
         r = records[rows_of[lists.pair[entry]]]
-        dx, dy = px[units] - r[:, 0:1], py[units] - r[:, 1:2]
+        dx, dy = pixels[0][units] - r[:, 0:1], pixels[1][units] - r[:, 1:2]
         q = fma(fma(r[:, 2:3], dx, r[:, 3:4] * dy), dx, (r[:, 4:5] * dy) * dy)
         alpha = np.fmin(fexp2(r[:, 5:6] - np.fmax(q, f32(0))), f32(ALPHA_MAX))
         t = trans[units]
@@ -139,9 +185,21 @@ def _blend_blocks(
         seen = alpha >= f32(ALPHA_MIN)
         hit = seen & (after >= f32(TRANSMITTANCE_MIN))
         weight = np.where(hit, alpha * t, f32(0))
-        for channel in range(3):
-            colour[channel, units] = fma(weight, r[:, 6 + channel : 7 + channel], colour[channel, units])
+        for c in range(3):
+            colour[c, units] = fma(weight, r[:, 6 + c : 7 + c], colour[c, units])
         trans[units] = np.where(hit, after, np.where(seen, -np.abs(t), t))
-        if weight_of is not None:
-            weight_of[entry] = np.where(hit, weight, f32(-1))
-    return weight_of
+        if not stats:
+            continue
+        entries.hit[entry], entries.weight[entry] = hit, weight
+        if stats == 2:
+            assert target is not None
+            ratio = np.where(hit, alpha / (f32(1) - alpha), f32(0))
+            behind = (target[c, units] - colour[c, units] for c in range(3))
+            er, eg, eb = (fma(weight, r[:, 6 + c : 7 + c], -(ratio * rest)) for c, rest in enumerate(behind))
+            entries.error[entry] = fma(eb, eb, fma(eg, eg, er * er))
+    return entries if stats else None
+
+
+blend_stats = partial(blend, stats=1)
+blend_removal = partial(blend, stats=2)
+blend_residual = partial(blend, stats=3)

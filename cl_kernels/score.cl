@@ -1,0 +1,108 @@
+// Reductions over views that follow the blend: residual images, costs of dropping SH degrees, SH terms of the colour refit.
+// Twins: flexgs_edge.kernels.twins.score
+
+// target - image, pixel by pixel.
+__kernel void residual(
+    const uint count,
+    __global const half *target,      // [count]
+    __global const float *image,      // [count]
+    __global float *out)              // [count]
+{
+  const size_t i = get_global_id(0) * W;
+#if W == 1
+  out[i] = vload_half(i, target) - image[i];
+#else
+  STOREF(CAT(vload_half, W)(0, target + i) - LOADF(image, i), out, i);
+#endif
+}
+
+// Fixed-point words (low, high) of W rows as float.
+inline FW sum_value(__global const uint *low, __global const uint *high, size_t row, float unit) {
+#if W == 1
+  return convert_float((long)((ulong)low[row] | (ulong)high[row] << 32)) * unit;
+#else
+  const CAT(ulong, W) words = CAT(convert_ulong, W)(CAT(vload, W)(0, low + row)) | CAT(convert_ulong, W)(CAT(vload, W)(0, high + row)) << 32;
+  return CAT(convert_float, W)(CAT(as_long, W)(words)) * (FW)unit;
+#endif
+}
+
+// acc[i] += value in fixed point: sums over views in any order give the same bits.
+inline void add_long(__global long *acc, size_t i, FW value) {
+  value = fmin(fmax(value * (FW)FIXED_WEIGHT, (FW)-FIXED_LARGEST), (FW)FIXED_LARGEST);
+#if W == 1
+  acc[i] += convert_long_rtz(value);
+#else
+  CAT(vstore, W)(CAT(vload, W)(0, acc + i) + CAT(CAT(convert_long, W), _rtz)(value), 0, acc + i);
+#endif
+}
+
+// For every lower degree L: with d the colour that the bands above L add in this view and w2 the sum of squared weights,
+// moments w2 d (three channels) and w2 |d|^2. From them the cost of dropping the bands with the weighted mean kept.
+__kernel void sh_costs(
+    const uint count,                   // rows of this chunk
+    const uint stride,
+    const uint base,                    // row of the scene that the chunk starts at
+    const uint degree,                  // SH degree of the chunk, at least 1
+    const uint rows,                    // elements of a plane of `sums`
+    __global const float *camera,       // [32]
+    __global const float *means,        // [3, stride]
+    __global const float *sh_rest,      // [3 * K, stride]
+    __global const uint *sums,          // [2, 2, rows] words from the removal blend: squared error, squared weight
+    __global long *moments)             // [degree, 4, stride]
+{
+  const size_t i = get_global_id(0) * W, s = stride;
+  if (i >= count) return;
+  const FW w2 = sum_value(sums + 2 * (size_t)rows, sums + 3 * (size_t)rows, base + i, 1.0f / FIXED_ERROR);
+  if (!ANY(MASK(w2 > (FW)0.0f))) return;
+  FW x, y, z;
+  view_direction(camera, LOADF(means, i), LOADF(means, s + i), LOADF(means, 2 * s + i), &x, &y, &z);
+  FW basis[24];
+#define KEEP_BASIS(k, value) basis[k] = value
+  FOR_EACH_BASIS(degree, x, y, z, KEEP_BASIS)
+  const int all = (int)((degree + 1) * (degree + 1)) - 1;
+  FW d[3] = {(FW)0.0f, (FW)0.0f, (FW)0.0f};
+  for (int level = (int)degree - 1; level >= 0; --level) {
+    FW square = (FW)0.0f;
+    for (int c = 0; c < 3; ++c) {
+      for (int k = (level + 1) * (level + 1) - 1; k < (level + 2) * (level + 2) - 1; ++k)
+        d[c] = fma(basis[k], LOADF(sh_rest, (size_t)(c * all + k) * s + i), d[c]);
+      square = fma(d[c], d[c], square);
+      add_long(moments, (size_t)(level * 4 + c) * s + i, w2 * d[c]);
+    }
+    add_long(moments, (size_t)(level * 4 + 3) * s + i, w2 * square);
+  }
+}
+
+// Adds one view to the sums of the colour refit: for every basis function k (k = 0: the constant), Y_k sum(alpha T r) of three
+// channels and |Y_k| sum(alpha T). Float sums, view after view for each row: the order of the views is part of the result.
+__kernel void sh_residual(
+    const uint count,                   // rows of this chunk
+    const uint stride,
+    const uint base,
+    const uint degree,                  // SH degree of the chunk, 0 as well
+    const uint rows,                    // elements of a plane of `sums`
+    __global const float *camera,       // [32]
+    __global const float *means,        // [3, stride]
+    __global const uint *sums,          // [4, 2, rows] words from the residual blend: weight, red, green, blue
+    __global float *normal)             // [K + 1, 4, stride] red, green, blue, weight
+{
+  const size_t i = get_global_id(0) * W, s = stride;
+  if (i >= count) return;
+  FW seen[4];
+  for (int c = 0; c < 4; ++c)
+    seen[(c + 3) & 3] =
+        sum_value(sums + (size_t)(2 * c) * rows, sums + (size_t)(2 * c + 1) * rows, base + i, 1.0f / FIXED_WEIGHT);
+  if (!ANY(MASK(seen[3] > (FW)0.0f))) return;
+  FW x, y, z;
+  view_direction(camera, LOADF(means, i), LOADF(means, s + i), LOADF(means, 2 * s + i), &x, &y, &z);
+#define ADD_NORMAL(k, value)                                                                    \
+  {                                                                                             \
+    const FW basis = value;                                                                     \
+    __global float *at = normal + (size_t)(k) * 4 * s + i;                                      \
+    for (int c = 0; c < 3; ++c) STOREF(fma(basis, seen[c], LOADF(at, c * s)), at, c * s);       \
+    STOREF(fma(fabs(basis), seen[3], LOADF(at, 3 * s)), at, 3 * s);                             \
+  }
+  ADD_NORMAL(0, (FW)SH_C0)
+#define ADD_BAND(k, value) ADD_NORMAL((k) + 1, value)
+  FOR_EACH_BASIS(degree, x, y, z, ADD_BAND)
+}

@@ -1,0 +1,5 @@
+"""What pruning and quantization broke, mended in the values that are kept: never changes the choice of Gaussians."""
+
+from flexgs_edge.refit.colour import refit_colours
+
+__all__ = ["refit_colours"]
