@@ -37,14 +37,6 @@ inline int any_alive(FW t) {
 }
 
 #if STATS
-// 64-bit fixed point by two 32-bit atomics: integer sums, so any order gives the same bits, and no 64-bit atomics are needed.
-inline void add_fixed(__global uint *low, __global uint *high, float value, float scale) {
-  const ulong fixed_value = (ulong)(long)(clamp(value * scale, -FIXED_LARGEST, FIXED_LARGEST));
-  const uint add = (uint)fixed_value;
-  const uint old = atomic_add(low, add);
-  const uint carry = (uint)(fixed_value >> 32) + (old + add < old ? 1u : 0u);
-  if (carry) atomic_add(high, carry);
-}
 #define ADD_SUM(k, v, scale)                                                                               \
   add_fixed(sums + (size_t)(2 * (k)) * rows + pair.x, sums + (size_t)(2 * (k) + 1) * rows + pair.x, \
             tree_sum(v), scale)
@@ -79,7 +71,7 @@ inline uint lane_count(const IW *v) {
 
 __kernel void blend(
     const uint tiles_x,
-    const uint blocks,                    // columns of `ends`
+    const uint blocks,                    // rows of `ends`
     const int width,                      // pixels
     const int height,
     const int resume,                     // 1: go on from `state`, 0: from an empty image
@@ -87,7 +79,7 @@ __kernel void blend(
     const float background_r,
     const float background_g,
     const float background_b,
-    __global const uint *ends,            // [tiles, blocks] end of each tile's pairs in the last column
+    __global const uint *ends,            // [blocks, tiles] the end of each tile's pairs in the last row
     __global const uint2 *pairs,          // row and block mask
     __global const float *records,        // [N, 16]
     __global float *state,                // [tiles, 4, 256] colour and signed transmittance, block by block
@@ -136,7 +128,8 @@ __kernel void blend(
   }
 #endif
 
-  const uint first = tile ? ends[(size_t)tile * blocks - 1] : 0u, last = ends[(size_t)(tile + 1) * blocks - 1];
+  ends += (size_t)(blocks - 1) * get_global_size(0);
+  const uint first = tile ? ends[tile - 1] : 0u, last = ends[tile];
   uint live = 0xFFFFu;
   for (uint n = first; n < last; ++n) {
     if (((n - first) & (RETIRE_EVERY - 1)) == 0) {
@@ -169,7 +162,7 @@ __kernel void blend(
         const int k = b * BLOCK_VECTORS + v;
         FW dx = (lane_x_at(v) + (FW)bx) - mx, dy = (lane_y(v) + (FW)by) - my;
         FW q = fma(fma(ca, dx, cb * dy), dx, (cc * dy) * dy);
-        FW alpha = fmin(fexp2(level - fmax(q, (FW)0.0f)), (FW)ALPHA_MAX);
+        FW alpha = fmin(fexp2_number(level - fmax(q, (FW)0.0f)), (FW)ALPHA_MAX);
         FW t = trans[k];
         FW next = t * ((FW)1.0f - alpha);
         IW seen = MASK(alpha >= (FW)ALPHA_MIN);

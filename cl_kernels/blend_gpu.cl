@@ -7,19 +7,20 @@
 #error "the GPU form is scalar: build with -DW=1"
 #endif
 #ifndef STATS
-#error "STATS (0: image only, 1: hits and weights as well) must be defined"
+#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual) must be defined"
 #endif
 
 #define BATCH 64   // splats in local memory at a time
 
-#if STATS
-inline void add_fixed(__global uint *low, __global uint *high, float value) {
-  const ulong fixed_value = (ulong)(value * 4294967296.0f);
-  const uint add = (uint)fixed_value;
-  const uint old = atomic_add(low, add);
-  const uint carry = (uint)(fixed_value >> 32) + (old + add < old ? 1u : 0u);
-  if (carry) atomic_add(high, carry);
-}
+#if STATS == 1
+#define SUMS 1
+#define SUM_UNIT FIXED_WEIGHT
+#elif STATS == 2
+#define SUMS 2
+#define SUM_UNIT FIXED_ERROR
+#elif STATS == 3
+#define SUMS 4
+#define SUM_UNIT FIXED_WEIGHT
 #endif
 
 __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
@@ -40,7 +41,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
 #if STATS
     ,
     __global uint *hits,
-    __global uint *weights,
+    __global uint *sums,
     const uint rows,
     __global const float *target
 #endif
@@ -49,7 +50,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
   __local uint2 list[BATCH];
   __local int open;
 #if STATS
-  __local float sums[256];
+  __local float parts[SUMS][256];
   __local uint counts;
 #endif
   // Work-items follow the blocks: item p is pixel p % 16 of block p / 16, which is also the layout of `state`.
@@ -65,7 +66,13 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
     blue = own[512];
     t = own[768];
   }
-  const uint first = tile ? ends[(size_t)tile * blocks - 1] : 0u, last = ends[(size_t)(tile + 1) * blocks - 1];
+  const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
+  const size_t here = (size_t)py * pitch + px;
+#if STATS > 1
+  const float target_r = target[here], target_g = target[plane + here], target_b = target[2 * plane + here];
+#endif
+  ends += (size_t)(blocks - 1) * get_num_groups(0);
+  const uint first = tile ? ends[tile - 1] : 0u, last = ends[tile];
   for (uint start = first; start < last; start += BATCH) {
     barrier(CLK_LOCAL_MEM_FENCE);
     if (p == 0) open = 0;
@@ -80,12 +87,12 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
     const int go_on = open;   // the same for the whole group: nobody writes `open` before the next barrier
     if (!go_on) break;
     for (uint n = 0; n < size; ++n) {
-      float weight = 0.0f;
+      float weight = 0.0f, alpha = 0.0f;
       int hit = 0;
       if (list[n].y >> b & 1u) {
         const float dx = (float)px - splats[n][0], dy = (float)py - splats[n][1];
         const float q = fma(fma(splats[n][2], dx, splats[n][3] * dy), dx, (splats[n][4] * dy) * dy);
-        const float alpha = fmin(fexp2(splats[n][5] - fmax(q, 0.0f)), ALPHA_MAX);
+        alpha = fmin(fexp2_number(splats[n][5] - fmax(q, 0.0f)), ALPHA_MAX);
         const float next = t * (1.0f - alpha);
         const int seen = alpha >= ALPHA_MIN;
         hit = seen && next >= TRANSMITTANCE_MIN;
@@ -97,29 +104,58 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
       }
 #if STATS
       if (p == 0) counts = 0;
-      sums[p] = weight;
+#if STATS == 2
+      const float ratio = hit ? alpha / (1.0f - alpha) : 0.0f;
+      const float er = fma(weight, splats[n][6], -(ratio * (target_r - red)));
+      const float eg = fma(weight, splats[n][7], -(ratio * (target_g - green)));
+      const float eb = fma(weight, splats[n][8], -(ratio * (target_b - blue)));
+      parts[0][p] = fma(eb, eb, fma(eg, eg, er * er));
+      parts[1][p] = weight;
+#else
+      parts[0][p] = weight;
+#endif
+#if STATS == 3
+      parts[1][p] = target_r;
+      parts[2][p] = target_g;
+      parts[3][p] = target_b;
+#endif
       barrier(CLK_LOCAL_MEM_FENCE);
       if (hit) atomic_inc(&counts);
-      // Each lane over the blocks in order, then the pairwise tree over lanes: the CPU form's order.
-      float sum = 0.0f;
+      // Each lane over the blocks in order, then the pairwise tree over lanes: the CPU form's order and its fused steps.
+      float sum[SUMS];
+      for (int c = 0; c < SUMS; ++c) sum[c] = 0.0f;
       if (p < 16)
-        for (int k = 0; k < 16; ++k) sum += sums[k * 16 + p];
+        for (int k = p; k < 256; k += 16) {
+          sum[0] += parts[0][k];
+#if STATS == 2
+          sum[1] = fma(parts[1][k], parts[1][k], sum[1]);
+#elif STATS == 3
+          for (int c = 1; c < 4; ++c) sum[c] = fma(parts[0][k], parts[c][k], sum[c]);
+#endif
+        }
       barrier(CLK_LOCAL_MEM_FENCE);
-      if (p < 16) sums[p] = sum;
+      if (p < 16)
+        for (int c = 0; c < SUMS; ++c) parts[c][p] = sum[c];
       barrier(CLK_LOCAL_MEM_FENCE);
       if (p == 0 && counts) {
-        for (int l = 0; l < 8; ++l) sums[l] += sums[l + 8];
-        for (int l = 0; l < 4; ++l) sums[l] += sums[l + 4];
-        atomic_add(hits + list[n].x, counts);
-        add_fixed(weights + list[n].x, weights + rows + list[n].x, (sums[0] + sums[2]) + (sums[1] + sums[3]));
+        const uint row = list[n].x;
+#if STATS == 1
+        atomic_add(hits + row, counts);
+#endif
+        for (int c = 0; c < SUMS; ++c) {
+          __local float *s = parts[c];
+          for (int l = 0; l < 8; ++l) s[l] += s[l + 8];
+          for (int l = 0; l < 4; ++l) s[l] += s[l + 4];
+          add_fixed(sums + (size_t)(2 * c) * rows + row, sums + (size_t)(2 * c + 1) * rows + row,
+                    (s[0] + s[2]) + (s[1] + s[3]), SUM_UNIT);
+        }
       }
       barrier(CLK_LOCAL_MEM_FENCE);
 #endif
     }
   }
   if (finish) {
-    const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
-    __global float *at = image + (size_t)py * pitch + px;
+    __global float *at = image + here;
     at[0] = fma(fabs(t), background_r, red);
     at[plane] = fma(fabs(t), background_g, green);
     at[2 * plane] = fma(fabs(t), background_b, blue);

@@ -16,18 +16,19 @@ __kernel void sort_count_first(
     const uint count,
     __global const uint *keys,        // [N]
     __global const uint *bounds,      // [N] tiles of each splat's bounding box
-    __global uint *counts,            // [DIGITS, blocks]
+    __global uint *counts,            // [blocks, DIGITS]
     __global ulong *pairs)            // [blocks] sum of bounds of the shown splats
 {
-  const uint blocks = get_global_size(0), block = get_global_id(0);
+  const uint block = get_global_id(0);
   uint start, end;
   block_range(count, &start, &end);
-  for (uint d = 0; d < DIGITS; ++d) counts[d * blocks + block] = 0;
+  __global uint *own = counts + block * DIGITS;
+  for (uint d = 0; d < DIGITS; ++d) own[d] = 0;
   ulong sum = 0;
   for (uint i = start; i < end; ++i) {
     const uint key = keys[i];
     if (key == (uint)CULLED) continue;
-    counts[(key & (DIGITS - 1)) * blocks + block] += 1;
+    own[key & (DIGITS - 1)] += 1;
     sum += bounds[i];
   }
   pairs[block] = sum;
@@ -36,17 +37,17 @@ __kernel void sort_count_first(
 __kernel void sort_scatter_first(
     const uint count,
     __global const uint *keys,        // [N]
-    __global uint *offsets,           // [DIGITS, blocks] from the scan; advanced
+    __global uint *offsets,           // [blocks, DIGITS] from the scan; advanced
     __global uint *keys_out,          // [N]
     __global uint *ids_out)           // [N] rows
 {
-  const uint blocks = get_global_size(0), block = get_global_id(0);
+  const uint block = get_global_id(0);
   uint start, end;
   block_range(count, &start, &end);
   for (uint i = start; i < end; ++i) {
     const uint key = keys[i];
     if (key == (uint)CULLED) continue;
-    const uint at = offsets[(key & (DIGITS - 1)) * blocks + block]++;
+    const uint at = offsets[block * DIGITS + (key & (DIGITS - 1))]++;
     keys_out[at] = key;
     ids_out[at] = i;
   }
@@ -56,13 +57,14 @@ __kernel void sort_count(
     const uint count,
     const uint shift,
     __global const uint *keys,        // [count]
-    __global uint *counts)            // [DIGITS, blocks]
+    __global uint *counts)            // [blocks, DIGITS]
 {
-  const uint blocks = get_global_size(0), block = get_global_id(0);
+  const uint block = get_global_id(0);
   uint start, end;
   block_range(count, &start, &end);
-  for (uint d = 0; d < DIGITS; ++d) counts[d * blocks + block] = 0;
-  for (uint i = start; i < end; ++i) counts[((keys[i] >> shift) & (DIGITS - 1)) * blocks + block] += 1;
+  __global uint *own = counts + block * DIGITS;
+  for (uint d = 0; d < DIGITS; ++d) own[d] = 0;
+  for (uint i = start; i < end; ++i) own[(keys[i] >> shift) & (DIGITS - 1)] += 1;
 }
 
 __kernel void sort_scatter(
@@ -70,31 +72,36 @@ __kernel void sort_scatter(
     const uint shift,
     __global const uint *keys,        // [count]
     __global const uint *ids,         // [count]
-    __global uint *offsets,           // [DIGITS, blocks] from the scan; advanced
+    __global uint *offsets,           // [blocks, DIGITS] from the scan; advanced
     __global uint *keys_out,          // [count]
     __global uint *ids_out)           // [count]
 {
-  const uint blocks = get_global_size(0), block = get_global_id(0);
+  const uint block = get_global_id(0);
   uint start, end;
   block_range(count, &start, &end);
   for (uint i = start; i < end; ++i) {
     const uint key = keys[i];
-    const uint at = offsets[((key >> shift) & (DIGITS - 1)) * blocks + block]++;
+    const uint at = offsets[block * DIGITS + ((key >> shift) & (DIGITS - 1))]++;
     keys_out[at] = key;
     ids_out[at] = ids[i];
   }
 }
 
-// In place; values[count] receives the total. One work-item: 65 k counters take 40 us, less than a second launch.
+// Offsets of every cell and block, cell by cell and block by block within a cell, in place; values[blocks * cells] receives the
+// total. One work-item: 65 k counters take 40 us, less than a second launch.
+// Each block has a row of its own: with the blocks of a cell side by side two cores would fight over every cache line.
 __kernel void exclusive_scan(
-    const uint count,
-    __global uint *values)            // [count + 1]
+    const uint cells,
+    const uint blocks,
+    __global uint *values)            // [blocks, cells] and the total
 {
   uint sum = 0;
-  for (uint i = 0; i < count; ++i) {
-    const uint value = values[i];
-    values[i] = sum;
-    sum += value;
-  }
-  values[count] = sum;
+  for (uint cell = 0; cell < cells; ++cell)
+    for (uint block = 0; block < blocks; ++block) {
+      const size_t i = (size_t)block * cells + cell;
+      const uint value = values[i];
+      values[i] = sum;
+      sum += value;
+    }
+  values[(size_t)blocks * cells] = sum;
 }

@@ -3,6 +3,8 @@
 // Twins: flexgs_edge.kernels.twins.tiles
 
 #define BANDS 16   // block rows (4 pixels high) worked on at a time: four rows of tiles
+#define EMPTY_FIRST (1 << 28)
+#define EMPTY_LAST (-1)
 
 // First and last block column of a splat in W block rows from `band` on; an empty row has first > last.
 // On the ellipse the right end over a row lies at its overall extreme, clamped into the row (it is convex); so does the left.
@@ -20,18 +22,17 @@ inline void block_spans(__global const float *r, int band, float width, IW *firs
   FW x0 = fmin(fmax(ceil((FW)r[0] + left - left_slack), (FW)0.0f), (FW)width);
   FW x1 = fmin(fmax(floor((FW)r[0] + right + right_slack), (FW)-1.0f), (FW)(width - 1.0f));
   IW some = MASK(low <= high) & MASK(x0 <= x1);
-  *first = picki(some, TO_I(x0) >> 2, (IW)1);
-  *last = picki(some, TO_I(x1) >> 2, (IW)0);
+  *first = picki(some, TO_I(x0) >> 2, (IW)EMPTY_FIRST);
+  *last = picki(some, TO_I(x1) >> 2, (IW)EMPTY_LAST);
 }
 
 // The 16-bit block mask of a tile: bit 4 * row + column. `first` and `last` are the spans of the tile's four block rows.
-inline uint tile_mask(const int *first, const int *last, int tile_x) {
-  uint mask = 0;
-  for (int row = 0; row < 4; ++row) {
-    const int from = max(first[row] - 4 * tile_x, 0), to = min(last[row] - 4 * tile_x, 3);
-    if (first[row] <= last[row] && from <= to) mask |= (((1u << (to + 1)) - 1u) & ~((1u << from) - 1u)) << (4 * row);
-  }
-  return mask;
+// Four lanes whatever W is: a tile has four block rows.
+inline uint tile_mask(int4 first, int4 last, int tile_x) {
+  const int4 from = max(first - 4 * tile_x, 0), to = min(last - 4 * tile_x, 3);
+  const uint4 upto = ((uint4)(2u) << as_uint4(max(to, 0))) - 1u, below = ((uint4)(1u) << as_uint4(min(from, 4))) - 1u;
+  const uint4 rows = select((uint4)(0u), upto & ~below, from <= to) << (uint4)(0u, 4u, 8u, 12u);
+  return (rows.s0 | rows.s1) | (rows.s2 | rows.s3);
 }
 
 // Calls EACH(tile, mask) for every tile that the splat may show in.
@@ -58,15 +59,11 @@ inline uint tile_mask(const int *first, const int *last, int tile_x) {
         STOREI(l, last, v);                                                                                     \
       }                                                                                                         \
       for (int t = 0; t < BANDS / 4 && top + t <= y1 / TILE; ++t) {                                             \
-        int from = INT_MAX, to = -1;                                                                            \
-        for (int row = 4 * t; row < 4 * t + 4; ++row)                                                           \
-          if (first[row] <= last[row]) {                                                                        \
-            from = min(from, first[row]);                                                                       \
-            to = max(to, last[row]);                                                                            \
-          }                                                                                                     \
-        if (to < 0) continue;                                                                                   \
+        const int4 f4 = vload4(t, first), l4 = vload4(t, last);                                                 \
+        const int from = min(min(f4.s0, f4.s1), min(f4.s2, f4.s3));                                             \
+        const int to = max(max(l4.s0, l4.s1), max(l4.s2, l4.s3));                                               \
         for (int tx = from >> 2; tx <= to >> 2; ++tx) {                                                         \
-          const uint mask = tile_mask(first + 4 * t, last + 4 * t, tx);                                         \
+          const uint mask = tile_mask(f4, l4, tx);                                                              \
           if (mask) EACH((top + t) * tiles_x + tx, mask);                                                       \
         }                                                                                                       \
       }                                                                                                         \
@@ -87,14 +84,14 @@ __kernel void tile_count(
     const int inria_extent,
     __global const uint *ids,         // [shown] rows in depth order
     __global const float *records,    // [N, 16]
-    __global uint *counts)            // [tiles, blocks]
+    __global uint *counts)            // [blocks, tiles]
 {
-  const uint blocks = get_global_size(0), block = get_global_id(0);
   const int tiles_x = ((int)width + TILE - 1) / TILE, tiles_y = ((int)height + TILE - 1) / TILE;
+  __global uint *own = counts + get_global_id(0) * (size_t)(tiles_x * tiles_y);
   uint start, end;
   splat_range(from, count, &start, &end);
-  for (int tile = 0; tile < tiles_x * tiles_y; ++tile) counts[(size_t)tile * blocks + block] = 0;
-#define COUNT_PAIR(tile, mask) counts[(size_t)(tile) * blocks + block] += 1
+  for (int tile = 0; tile < tiles_x * tiles_y; ++tile) own[tile] = 0;
+#define COUNT_PAIR(tile, mask) own[tile] += 1
   for (uint n = start; n < end; ++n) {
     FOR_EACH_TILE(COUNT_PAIR)
   }
@@ -108,14 +105,14 @@ __kernel void tile_scatter(
     const int inria_extent,
     __global const uint *ids,         // [shown]
     __global const float *records,    // [N, 16]
-    __global uint *offsets,           // [tiles, blocks] from the scan; advanced, so that a tile's end stands in its last column
+    __global uint *offsets,           // [blocks, tiles] from the scan; advanced, so that the last row has the tiles' ends
     __global uint2 *pairs)            // [capacity] row and block mask, tile by tile, in depth order
 {
-  const uint blocks = get_global_size(0), block = get_global_id(0);
   const int tiles_x = ((int)width + TILE - 1) / TILE, tiles_y = ((int)height + TILE - 1) / TILE;
+  __global uint *own = offsets + get_global_id(0) * (size_t)(tiles_x * tiles_y);
   uint start, end;
   splat_range(from, count, &start, &end);
-#define WRITE_PAIR(tile, mask) pairs[offsets[(size_t)(tile) * blocks + block]++] = (uint2)(ids[n], mask)
+#define WRITE_PAIR(tile, mask) pairs[own[tile]++] = (uint2)(ids[n], mask)
   for (uint n = start; n < end; ++n) {
     FOR_EACH_TILE(WRITE_PAIR)
   }

@@ -44,7 +44,7 @@ KERNELS: dict[str, KernelSpec] = {
     "sort_scatter_first": KernelSpec("sort.cl", "ubbbb"),
     "sort_count": KernelSpec("sort.cl", "uubb"),
     "sort_scatter": KernelSpec("sort.cl", "uubbbbb"),
-    "exclusive_scan": KernelSpec("sort.cl", "ub"),
+    "exclusive_scan": KernelSpec("sort.cl", "uub"),
     "tile_count": KernelSpec("tiles.cl", "uuffibbb"),
     "tile_scatter": KernelSpec("tiles.cl", "uuffibbbb"),
     "blend": KernelSpec("blend_{form}.cl", _BLEND, "tile", stats=0),

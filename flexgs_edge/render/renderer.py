@@ -301,13 +301,13 @@ class Renderer:
         (keys_a, ids_a), (keys_b, ids_b) = buffers.sorted
         cells = SORT_DIGITS * blocks
         backend.launch("sort_count_first", (blocks,), count, buffers.keys, buffers.bounds, buffers.digits, buffers.block_pairs)
-        backend.launch("exclusive_scan", (1,), cells, buffers.digits)
+        backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
         backend.launch("sort_scatter_first", (blocks,), count, buffers.keys, buffers.digits, keys_a, ids_a)
         shown = int(backend.read(buffers.digits, np.empty(1, np.uint32), cells)[0])
         pairs = int(backend.read(buffers.block_pairs).sum())
         for shift in (SORT_DIGIT_BITS, 2 * SORT_DIGIT_BITS):
             backend.launch("sort_count", (blocks,), shown, shift, keys_a, buffers.digits)
-            backend.launch("exclusive_scan", (1,), cells, buffers.digits)
+            backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
             backend.launch("sort_scatter", (blocks,), shown, shift, keys_a, ids_a, buffers.digits, keys_b, ids_b)
             (keys_a, ids_a), (keys_b, ids_b) = (keys_b, ids_b), (keys_a, ids_a)
         return shown, pairs
@@ -327,7 +327,7 @@ class Renderer:
         backend, blocks = self.backend, self.backend.tile_blocks
         shared = (start, count, camera.width, camera.height, self.inria_extent, buffers.sorted[0][1], buffers.records)
         backend.launch("tile_count", (blocks,), *shared, buffers.ends)
-        backend.launch("exclusive_scan", (1,), buffers.tiles * blocks, buffers.ends)
+        backend.launch("exclusive_scan", (1,), buffers.tiles, blocks, buffers.ends)
         backend.launch("tile_scatter", (blocks,), *shared, buffers.ends, buffers.pairs)
 
     def release(self) -> None:

@@ -32,7 +32,12 @@ def fma(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 def fexp2(x: np.ndarray) -> np.ndarray:
-    """2^x, as `fexp2` in common.clh."""
+    """2^x, as `fexp2` in common.clh: NaN passes."""
+    return np.where(x == x, fexp2_number(x), x)
+
+
+def fexp2_number(x: np.ndarray) -> np.ndarray:
+    """2^x of numbers, as `fexp2_number` in common.clh."""
     x = np.where(x < f32(EXP2_LOW), f32(EXP2_LOW), x)
     x = np.where(x > f32(EXP2_HIGH), f32(EXP2_HIGH), x)
     t = x + f32(EXP2_MAGIC)

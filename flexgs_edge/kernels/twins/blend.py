@@ -20,7 +20,7 @@ from flexgs_edge.constants import (
     TILE,
     TRANSMITTANCE_MIN,
 )
-from flexgs_edge.kernels.twins.arithmetic import f32, fexp2, fma
+from flexgs_edge.kernels.twins.arithmetic import f32, fexp2_number, fma
 
 TILES_AT_ONCE = 256
 """Bounds the twin's memory: block lists and, for statistics, one float a pixel of each listed block."""
@@ -126,7 +126,7 @@ def blend(
     stats: int = 0,
 ) -> None:
     """Blend the tile lists into `state`, and into `image` ([3, padded height, padded width]) at the end."""
-    tile_ends = np.concatenate([[0], ends[blocks - 1 : size[0] * blocks : blocks].astype(np.int64)])
+    tile_ends = np.concatenate([[0], ends[(blocks - 1) * size[0] : blocks * size[0]].astype(np.int64)])
     background = np.array([background_r, background_g, background_b], f32)
     for first in range(0, size[0], TILES_AT_ONCE):
         last = min(first + TILES_AT_ONCE, size[0])
@@ -179,7 +179,7 @@ def _blend_blocks(
         r = records[rows_of[lists.pair[entry]]]
         dx, dy = pixels[0][units] - r[:, 0:1], pixels[1][units] - r[:, 1:2]
         q = fma(fma(r[:, 2:3], dx, r[:, 3:4] * dy), dx, (r[:, 4:5] * dy) * dy)
-        alpha = np.fmin(fexp2(r[:, 5:6] - np.fmax(q, f32(0))), f32(ALPHA_MAX))
+        alpha = np.fmin(fexp2_number(r[:, 5:6] - np.fmax(q, f32(0))), f32(ALPHA_MAX))
         t = trans[units]
         after = t * (f32(1) - alpha)
         seen = alpha >= f32(ALPHA_MIN)

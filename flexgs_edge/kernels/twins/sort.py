@@ -21,8 +21,7 @@ def _count(cells: np.ndarray, counts: np.ndarray, blocks: int) -> None:
 def _scatter(cells: np.ndarray, offsets: np.ndarray, pairs: tuple[tuple[np.ndarray, np.ndarray], ...]) -> None:
     order = np.argsort(cells, kind="stable")
     ordered = cells[order]
-    first = np.searchsorted(ordered, ordered, side="left")
-    at = offsets[ordered] + (np.arange(len(cells)) - first)
+    at = offsets[ordered] + (np.arange(len(cells)) - np.searchsorted(ordered, ordered, side="left"))
     for values, out in pairs:
         out[at] = values[order]
     np.add.at(offsets, cells, np.uint32(1))
@@ -31,10 +30,10 @@ def _scatter(cells: np.ndarray, offsets: np.ndarray, pairs: tuple[tuple[np.ndarr
 def sort_count_first(
     size: tuple[int, ...], count: int, keys: np.ndarray, bounds: np.ndarray, counts: np.ndarray, pairs: np.ndarray
 ) -> None:
-    """Histogram of the first digit ([DIGITS, blocks]) and tiles of each block's shown splats."""
+    """Histogram of the first digit ([blocks, DIGITS]) and tiles of each block's shown splats."""
     shown, blocks = np.flatnonzero(keys[:count] != CULLED), size[0]
     block = block_of(count, blocks)[shown]
-    _count((keys[shown] % DIGITS).astype(np.int64) * blocks + block, counts, blocks)
+    _count(block * DIGITS + keys[shown] % DIGITS, counts, blocks)
     pairs[:] = np.bincount(block, weights=bounds[shown], minlength=blocks).astype(np.uint64)
 
 
@@ -43,14 +42,14 @@ def sort_scatter_first(
 ) -> None:
     """First pass: keys and rows of the shown splats, by the lowest digit."""
     shown, blocks = np.flatnonzero(keys[:count] != CULLED), size[0]
-    cells = (keys[shown] % DIGITS).astype(np.int64) * blocks + block_of(count, blocks)[shown]
+    cells = block_of(count, blocks)[shown] * DIGITS + keys[shown] % DIGITS
     _scatter(cells, offsets, ((keys[shown], keys_out), (shown.astype(np.uint32), ids_out)))
 
 
 def sort_count(size: tuple[int, ...], count: int, shift: int, keys: np.ndarray, counts: np.ndarray) -> None:
     """Histogram of the digit at `shift`."""
     digits = (keys[:count] >> np.uint32(shift)) % DIGITS
-    _count(digits.astype(np.int64) * size[0] + block_of(count, size[0]), counts, size[0])
+    _count(block_of(count, size[0]) * DIGITS + digits, counts, size[0])
 
 
 def sort_scatter(
@@ -65,12 +64,13 @@ def sort_scatter(
 ) -> None:
     """One pass by the digit at `shift`."""
     digits = (keys[:count] >> np.uint32(shift)) % DIGITS
-    cells = digits.astype(np.int64) * size[0] + block_of(count, size[0])
+    cells = block_of(count, size[0]) * DIGITS + digits
     _scatter(cells, offsets, ((keys[:count], keys_out), (ids[:count], ids_out)))
 
 
-def exclusive_scan(size: tuple[int, ...], count: int, values: np.ndarray) -> None:
-    """Exclusive prefix sum in place; `values[count]` receives the total."""
-    total = np.cumsum(values[:count], dtype=np.uint32)
-    values[1 : count + 1] = total
-    values[0] = 0
+def exclusive_scan(size: tuple[int, ...], cells: int, blocks: int, values: np.ndarray) -> None:
+    """Offsets of [blocks, cells] counts, cell by cell, in place; the total behind them."""
+    counts = values[: blocks * cells].reshape(blocks, cells)
+    total = np.cumsum(counts.T.reshape(-1), dtype=np.uint32)
+    values[blocks * cells] = total[-1]
+    counts[:] = np.concatenate([np.zeros(1, np.uint32), total[:-1]]).reshape(cells, blocks).T

@@ -8,6 +8,8 @@ from flexgs_edge.constants import BLOCK, SPAN_SLACK, SPAN_SLACK_RELATIVE, TILE
 from flexgs_edge.kernels.twins.arithmetic import f32, fma
 from flexgs_edge.kernels.twins.sort import block_of
 
+EMPTY = (1 << 28, -1)
+"""First and last block column of a row that the splat does not touch."""
 _BANDS = np.arange(TILE // BLOCK, dtype=np.int32)
 
 
@@ -26,7 +28,7 @@ def block_spans(records: np.ndarray, bands: np.ndarray, width: np.float32) -> tu
     x0 = np.fmin(np.fmax(np.ceil(mx + left - left_slack), f32(0)), width)
     x1 = np.fmin(np.fmax(np.floor(mx + right + right_slack), f32(-1)), width - f32(1))
     some = (low <= high) & (x0 <= x1)
-    return np.where(some, x0.astype(np.int32) >> 2, 1), np.where(some, x1.astype(np.int32) >> 2, 0)
+    return np.where(some, x0.astype(np.int32) >> 2, EMPTY[0]), np.where(some, x1.astype(np.int32) >> 2, EMPTY[1])
 
 
 def _expand(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,15 +60,11 @@ def list_pairs(
     y1 = np.fmin(np.floor(splats[:, 1] + splats[:, 10] + slack), height - f32(1)).astype(np.int64)
     splat, ty = _expand(y0 // TILE, y1 // TILE)
     first, last = block_spans(splats[splat], (ty[:, None] * (TILE // BLOCK) + _BANDS).astype(np.int32), width)
-    some = first <= last
-    row, tx = _expand(
-        np.where(some, first, np.iinfo(np.int32).max).min(axis=1, initial=np.iinfo(np.int32).max) >> 2,
-        np.where(some, last, -1).max(axis=1, initial=-1) >> 2,
-    )
+    row, tx = _expand(first.min(axis=1, initial=EMPTY[0]) >> 2, last.max(axis=1, initial=EMPTY[1]) >> 2)
     start = np.maximum(first[row] - 4 * tx[:, None], 0)
     end = np.minimum(last[row] - 4 * tx[:, None], 3)
     bits = ((1 << (np.clip(end, 0, 3) + 1)) - 1) & ~((1 << np.clip(start, 0, 4)) - 1)
-    mask = np.where(some[row] & (start <= end), bits << (4 * _BANDS), 0).sum(axis=1).astype(np.uint32)
+    mask = np.where(start <= end, bits << (4 * _BANDS), 0).sum(axis=1).astype(np.uint32)
     keep = mask != 0
     return splat[row][keep], (ty[row] * tiles_x + tx)[keep], mask[keep]
 
@@ -82,9 +80,9 @@ def tile_count(
     records: np.ndarray,
     counts: np.ndarray,
 ) -> None:
-    """Pairs by tile and block of splats ([tiles, blocks]) of the depth-ordered splats [start, start + count)."""
+    """Pairs by tile and block of splats ([blocks, tiles]) of the depth-ordered splats [start, start + count)."""
     splat, tile, _ = list_pairs(ids[start : start + count], records, f32(width), f32(height), inria_extent)
-    cells = tile * size[0] + block_of(count, size[0])[splat]
+    cells = block_of(count, size[0])[splat] * (len(counts) // size[0]) + tile
     counts[:-1] = np.bincount(cells, minlength=len(counts) - 1)
 
 
@@ -103,8 +101,8 @@ def tile_scatter(
     """Writes (row, mask) tile by tile in depth order; `offsets` end up at each cell's end."""
     batch = ids[start : start + count]
     splat, tile, mask = list_pairs(batch, records, f32(width), f32(height), inria_extent)
-    cells = tile * size[0] + block_of(count, size[0])[splat]
-    order = np.argsort(cells, kind="stable")
+    cells = block_of(count, size[0])[splat] * (len(offsets) // size[0]) + tile
+    order = np.argsort(tile, kind="stable")
     pairs[: len(order), 0] = batch[splat[order]]
     pairs[: len(order), 1] = mask[order]
     offsets[:-1] += np.bincount(cells, minlength=len(offsets) - 1).astype(np.uint32)
