@@ -1,0 +1,131 @@
+"""Version 2 files as sources: chunks are decoded when touched, the last one is kept."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.codec.coder import Chunk
+from flexgs_edge.codec.container2 import GridContainer
+from flexgs_edge.codec.octree import unmorton
+from flexgs_edge.codec.walk import ChunkCodes, base_kinds
+from flexgs_edge.grid import CODE_LIMIT, GridScene, from_grid
+from flexgs_edge.scene.source import Planes, Rows, SceneSource
+
+
+class GridSource(SceneSource):
+    """A `.fgs` file of version 2 as a scene.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Attributes
+    ----------
+    settings : dict
+        How the file was made.
+
+    Raises
+    ------
+    FormatError
+        When the file differs from the format, here or when a damaged chunk is read.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.container = GridContainer(path)
+        header = self.container.header
+        self.name, self.notes = str(path), ()
+        self.count, self.sh_degree = header.count, header.sh_degree
+        self.sh_count = self.count if self.sh_degree else 0
+        self.origin = np.array(header.origin, np.float64)
+        self.settings: dict[str, Any] = header.settings
+        self._model = self.container.read_model()
+        self._entries = self.container.read_table()
+        self._chunks = header.chunks()
+        self._starts = np.array([chunk.start for chunk in self._chunks], np.int64)
+        self._last: tuple[int, bool, GridScene] | None = None
+
+    def grid(self) -> GridScene:
+        """The codes of the whole scene; decodes every chunk."""
+        parts = [self._decode(i, False) for i in range(len(self._chunks))]
+        if not parts:
+            return self._scene(Chunk(0, 0, 0), _nothing(self.sh_degree))
+
+        def joined(name: str) -> np.ndarray:
+            return np.concatenate([getattr(part, name) for part in parts], axis=-1)
+
+        return GridScene(
+            self.count,
+            self.sh_degree,
+            self.origin,
+            self.container.header.grid_steps,
+            joined("position"),
+            joined("scale"),
+            joined("rotation"),
+            joined("opacity"),
+            joined("dc"),
+            joined("sh_degrees"),
+            tuple(np.concatenate(bands, axis=1) for bands in zip(*(part.sh for part in parts), strict=True)),
+            joined("layer"),
+        )
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`; a chunk is decoded as a whole, without its SH where they are not asked for."""
+        rows, planes = self.begin_read(rows, fields, out)
+        chosen = np.arange(rows.start, rows.stop) if isinstance(rows, slice) else rows
+        if len(chosen) == 0:
+            return planes
+        chunks = np.searchsorted(self._starts, chosen, side="right") - 1
+        starts = np.flatnonzero(np.diff(chunks, prepend=-1))
+        base_only = "sh_rest" not in planes
+        for start, stop in zip(starts.tolist(), [*starts[1:].tolist(), len(chosen)], strict=True):
+            chunk = int(chunks[start])
+            part = self._part(chunk, base_only)
+            values = from_grid(part, chosen[start:stop] - self._chunks[chunk].start, fields)
+            for field, plane in planes.items():
+                plane[:, start:stop] = values[field]
+        return planes
+
+    def _part(self, chunk: int, base_only: bool) -> GridScene:
+        if self._last is None or self._last[0] != chunk or (self._last[1] and not base_only):
+            self._last = None  # before the next one is decoded, not after: one chunk in memory, not two
+            self._last = (chunk, base_only, self._decode(chunk, base_only))
+        return self._last[2]
+
+    def _decode(self, index: int, base_only: bool) -> GridScene:
+        chunk = self._chunks[index]
+        codes = self.container.decode(self._model, chunk, self._entries[index], base_only)
+        return self._scene(chunk, codes)
+
+    def _scene(self, chunk: Chunk, codes: ChunkCodes) -> GridScene:
+        header = self.container.header
+        values = codes.base
+        low = np.array(header.low, np.int32)[:, None]
+        return GridScene(
+            chunk.stop - chunk.start,
+            self.sh_degree,
+            self.origin,
+            header.grid_steps,
+            np.clip(unmorton(codes.cells) + low, -CODE_LIMIT, CODE_LIMIT),
+            np.stack([values[f"scale {axis}"] for axis in "xyz"]),
+            np.stack([values[f"rotation {axis}"] for axis in "xyz"]),
+            values["opacity"],
+            np.stack([values[f"dc {colour}"] for colour in ("Y", "Co", "Cg")]),
+            values["sh degree"].astype(np.uint8),
+            codes.sh,
+            np.full(chunk.stop - chunk.start, chunk.layer, np.uint8),
+        )
+
+
+def _nothing(sh_degree: int) -> ChunkCodes:
+    """The codes of no rows."""
+    base = {kind.name: np.zeros(0, np.int32) for kind in base_kinds()}
+    return ChunkCodes(
+        np.zeros(0, np.uint64),
+        base,
+        tuple(np.zeros((3 * (2 * degree + 1), 0), np.int32) for degree in range(1, sh_degree + 1)),
+    )
