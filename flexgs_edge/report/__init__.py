@@ -1,0 +1,1 @@
+"""The result record of every job, its JSON and its text."""

@@ -1,0 +1,261 @@
+"""FOA for measured costs: a search over one multiplier, along one path of prune and rescore.
+
+Every step is a whole result: choice, steps, grid, refit, code, and its measured quality, so the answer is always a point that
+was itself measured to hold. Steps are counted, never timed: same command, same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexgs_edge.adapt import Measurement, Target
+from flexgs_edge.best.choice import BitModel, choose, drop_bands
+from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
+from flexgs_edge.best.steps import Slopes, choose_steps, probe_slopes
+from flexgs_edge.constants import SH_C0
+from flexgs_edge.errors import TargetError
+from flexgs_edge.grid import GridScene, Steps, from_grid, recolour, to_grid
+from flexgs_edge.refit import refit_colours
+
+PRUNED_PART = 0.45
+"""Part of the allowed loss that pruning alone has used up when a whole result meets the target (fox .45, the sample .55): where
+the search starts."""
+SLOPE = 0.6
+"""Slope of the log of the drop over the log of the multiplier before two points are measured (fox .55 to .77)."""
+SIZE_SLOPE = -0.45
+"""The same for the log of the size."""
+FINE_COLOUR = 2.0**-8
+"""Colour steps before the refit, as a share of the final ones: only geometry shall move."""
+MOST_ROUNDS = 24
+CLOSE = 0.03
+"""Excess (log of loss over limit) that counts as close enough below the target: about 1.5 % of the bytes."""
+EXTRA_STEPS = 3
+"""Steps beyond the effort's own while nothing close to the target holds."""
+AIM = -0.01
+LARGEST_STRIDE = 1.2
+"""Largest change of the log of the multiplier between two steps."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much work a search spends; fixed counts.
+
+    Parameters
+    ----------
+    keep : float
+        Share of the Gaussians that stays in each round of the path.
+    refit_rounds : int
+        Rounds on all coefficients before SH are put on their grid (one on the constant follows).
+    steps : int
+        Whole results that are measured.
+    views : int
+        Most scored poses.
+    """
+
+    keep: float
+    refit_rounds: int
+    steps: int
+    views: int
+
+
+EFFORTS = {
+    "fast": Effort(keep=0.66, refit_rounds=1, steps=3, views=24),
+    "balanced": Effort(keep=0.8, refit_rounds=2, steps=4, views=96),
+    "thorough": Effort(keep=0.88, refit_rounds=4, steps=6, views=400),
+}
+
+
+@dataclass(frozen=True)
+class RateStep:
+    """One whole result that the search looked at.
+
+    Parameters
+    ----------
+    multiplier : float
+        Squared error that a bit is worth.
+    count, sh_count : int
+        Gaussians kept, and those with SH.
+    size : int
+        Bytes of the file.
+    measurement : Measurement
+    excess : float
+        By how much the target was missed; zero or less holds.
+    seconds : float
+    """
+
+    multiplier: float
+    count: int
+    sh_count: int
+    size: int
+    measurement: Measurement
+    excess: float
+    seconds: float
+
+    @property
+    def holds(self) -> bool:
+        """The target holds here."""
+        return self.excess <= 0.0
+
+
+@dataclass(frozen=True)
+class RateResult:
+    """The answer of a search: the grid to write and the way to it."""
+
+    grid: GridScene
+    chosen: RateStep
+    reached: bool
+    steps: tuple[RateStep, ...]
+
+
+class RateSearch:
+    """Searches the multiplier whose whole result meets a target with the fewest bytes.
+
+    Parameters
+    ----------
+    path : PrunePath
+    size_of : callable
+        Exact bytes of a grid's file, and the coder's bit model.
+    measure : callable
+        Quality of a grid's decoded planes.
+    """
+
+    def __init__(
+        self,
+        path: PrunePath,
+        size_of: Callable[[GridScene], tuple[int, BitModel]],
+        measure: Callable[[dict[str, np.ndarray]], Measurement],
+        effort: Effort,
+        keep_unseen: bool = True,
+        refit: bool = True,
+        on_step: Callable[[RateStep], None] | None = None,
+    ) -> None:
+        self.path, self.size_of, self.measure = path, size_of, measure
+        self.effort, self.keep_unseen, self.refit, self.on_step = effort, keep_unseen, refit, on_step
+        self.bits = BitModel()
+        self._slopes: dict[int, Slopes] = {}
+
+    def run(self, target: Target, best_effort: bool = False) -> RateResult:
+        """Search; raises `TargetError` with the closest point when nothing holds and `best_effort` is not set."""
+        steps: list[RateStep] = []
+        best: tuple[RateStep, GridScene] | None = None
+        multiplier = self._start(target)
+        for count in range(self.effort.steps + EXTRA_STEPS):
+            step, grid = self._whole(multiplier, target)
+            steps.append(step)
+            if self.on_step:
+                self.on_step(step)
+            if best is None or _better(step, best[0], target):
+                best = (step, grid)
+            enough = best[0].holds and best[0].excess > -CLOSE
+            if (count + 1 >= self.effort.steps and enough) or step.multiplier < 1e-30:
+                break
+            multiplier = _next_multiplier(steps, target)
+        assert best is not None
+        chosen, grid = best
+        if not chosen.holds and not best_effort:
+            raise TargetError(
+                f"{target.describe()} is out of reach; the closest point has {target.report(chosen.size, chosen.measurement)}"
+                " (--best-effort writes it)"
+            )
+        return RateResult(grid, chosen, chosen.holds, tuple(steps))
+
+    def _start(self, target: Target) -> float:
+        """Walk down until pruning alone has used up its part of the target; the multiplier at that cut."""
+        for _ in range(MOST_ROUNDS):
+            last = self.path.snapshots[-1]
+            if target.limit_bytes is not None:
+                if last.count * self.bits.base / 8 <= target.limit_bytes:
+                    break
+            elif len(self.path.snapshots) > 1:
+                excess = target.excess(0, self.measure(last.planes))
+                if excess >= math.log(PRUNED_PART):
+                    break
+            if last.count < 16:
+                break
+            self.path.descend(self.effort.keep)
+        return self._cut(self.path.snapshots[-1])
+
+    def _cut(self, snapshot: Snapshot) -> float:
+        """The multiplier at which a snapshot would lose half a round more."""
+        costs = snapshot.costs.removal[snapshot.costs.weight2 > 0]
+        if not len(costs):
+            return 1.0
+        share = (1 - self.effort.keep) / 2
+        return max(float(np.quantile(costs, share)) / self.bits.base, 1e-30)
+
+    def _snapshot(self, multiplier: float) -> tuple[int, np.ndarray, np.ndarray]:
+        """The first snapshot that this multiplier would not cut by more than a round, and its choice; walks on if needed."""
+        for index in range(MOST_ROUNDS + 1):
+            if index == len(self.path.snapshots):
+                self.path.descend(self.effort.keep)
+            snapshot = self.path.snapshots[index]
+            keep, degrees = choose(snapshot.costs, self.bits, multiplier, self.keep_unseen)
+            if keep.mean() >= self.effort.keep or snapshot.count < 16:
+                break
+        return index, keep, degrees
+
+    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
+        started = time.perf_counter()
+        index, keep, degrees = self._snapshot(multiplier)
+        snapshot = self.path.snapshots[index]
+        rows = np.flatnonzero(keep)
+        degrees, weight2 = degrees[rows], snapshot.costs.weight2[rows]
+        planes = drop_bands(take_rows(snapshot.planes, rows), degrees, snapshot.costs.sh_mean[:, :, rows], SH_C0)
+        if index not in self._slopes:
+            self._slopes[index] = probe_slopes(self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras)
+        steps = choose_steps(self._slopes[index], weight2, degrees, len(snapshot.costs.sh), multiplier)
+        grid = self._finish(planes, degrees, steps)
+        size, bits = self.size_of(grid)
+        # The model follows the coder once, near the answer; then it stays, or every step would search another function.
+        if len(self._slopes) == 1 and self.bits == BitModel():
+            self.bits = bits
+        measurement = self.measure(from_grid(grid))
+        excess = target.excess(size, measurement)
+        sh_count = int((degrees > 0).sum())
+        seconds = time.perf_counter() - started
+        return RateStep(multiplier, len(rows), sh_count, size, measurement, excess, seconds), grid
+
+    def _finish(self, planes: dict[str, np.ndarray], degrees: np.ndarray, steps: Steps) -> GridScene:
+        """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
+        path = self.path
+        fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
+        grid, order = to_grid(planes, degrees, fine, path.origin)
+        degrees = degrees[order]
+        moved = from_grid(grid)
+        if self.refit:
+            shared = (path.origin, path.cameras, path.targets)
+            moved = refit_colours(path.renderer, moved, degrees, *shared, rounds=self.effort.refit_rounds, progress=path.progress)
+            coarse = from_grid(recolour(replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree])), moved["sh_dc"], moved["sh_rest"]))
+            moved = refit_colours(path.renderer, coarse, degrees, *shared, rounds=1, bands=False, progress=path.progress)
+        final = replace(grid.steps, dc=steps.dc, sh=steps.sh[: grid.sh_degree])
+        return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"])
+
+
+def _better(step: RateStep, other: RateStep, target: Target) -> bool:
+    """Whether `step` is the better answer: holding before missing, then fewer bytes (a size target: less loss)."""
+    if step.holds != other.holds:
+        return step.holds
+    if not step.holds:
+        return step.excess < other.excess
+    if target.limit_bytes is not None:
+        return step.measurement.loss(target.judge) < other.measurement.loss(target.judge)
+    return step.size < other.size
+
+
+def _next_multiplier(steps: Sequence[RateStep], target: Target) -> float:
+    """Where the excess is expected to be just below zero: false position in the logs between the closest points around."""
+    slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
+    points = [(math.log(s.multiplier), s.excess) for s in steps]
+    low = max((p for p in points if p[1] <= 0), key=lambda p: p[1], default=None)
+    high = min((p for p in points if p[1] > 0), key=lambda p: p[1], default=None)
+    if low and high and (high[1] - low[1]) / (high[0] - low[0] or 1e-12) * slope > 0:
+        at = low[0] + (AIM - low[1]) * (high[0] - low[0]) / (high[1] - low[1])
+        return math.exp(at)
+    nearest = min(points, key=lambda p: abs(p[1]))
+    stride = (AIM - nearest[1]) / slope
+    return math.exp(nearest[0] + max(-LARGEST_STRIDE, min(LARGEST_STRIDE, stride)))

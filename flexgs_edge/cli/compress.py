@@ -1,0 +1,156 @@
+"""`flexgs-edge compress`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from flexgs_edge.cli import words
+
+
+@click.command(cls=words.SectionCommand)
+@words.scene_argument
+@words.option("Output", "-o", "--output", metavar="OUT.fgs", help="File to write (not needed with --dry-run).")
+@words.option("Output", "--dry-run", is_flag=True, help="Do everything but write; the size shown is exact.")
+@words.option(
+    "Target (one of them; default --max-drop 1.0)",
+    "--max-drop",
+    metavar="DB",
+    type=float,
+    help="Fewest bytes that lose at most so many dB of PSNR: against the photos where there are photos, else modelled.",
+)
+@words.option(
+    "Target (one of them; default --max-drop 1.0)",
+    "--min-fidelity",
+    metavar="DB",
+    type=float,
+    help="Fewest bytes whose renders keep a PSNR of at least so many dB against the original's renders (42 is very good).",
+)
+@words.option(
+    "Target (one of them; default --max-drop 1.0)",
+    "--max-size",
+    type=words.SIZE,
+    help="Best quality in a file of at most so many bytes, such as 8MB (10^6) or 8MiB (2^20).",
+)
+@words.option(
+    "Target (one of them; default --max-drop 1.0)",
+    "--min-ratio",
+    metavar="R",
+    type=float,
+    help="Best quality in a file R times smaller than the PLY (248 bytes a Gaussian at SH degree 3).",
+)
+@words.option(
+    "Target (one of them; default --max-drop 1.0)",
+    "--best-effort",
+    is_flag=True,
+    help="Write the closest point when the target cannot be met (exit code 0 then, not 3).",
+)
+@words.cameras_option
+@words.images_option
+@words.holdout_option
+@words.option(
+    "Views",
+    "--select",
+    type=click.Choice(["test", "train"]),
+    default="test",
+    show_default=True,
+    help="Views that decide where to stop: the held-out ones, or the training poses (then fidelity and modelled drop decide).",
+)
+@words.drawing_options
+@words.option(
+    "Method",
+    "--method",
+    type=click.Choice(["paper"]),
+    default="paper",
+    show_default=True,
+    help="paper: FlexGaussian's, bit-packed without entropy coding.",
+)
+@words.option(
+    "Method",
+    "--score",
+    metavar="gs|meson|FILE",
+    default="gs",
+    show_default=True,
+    help="Importance of Gaussians: gs (opacity, volume, pixels hit), meson (MesonGS), or a .npy/.npz file with a number each.",
+)
+@words.option(
+    "Method", "--save-scores", metavar="FILE", help="Write the scores to a .npy file, for --score in later runs."
+)
+@words.option(
+    "Method",
+    "--prune-rate",
+    metavar="P",
+    type=float,
+    help="Remove this share of the Gaussians, from 0 to 1: with --sh-rate, instead of a search.",
+)
+@words.option(
+    "Method",
+    "--sh-rate",
+    metavar="S",
+    type=float,
+    help="Take the SH above degree 0 from this further share of the Gaussians, from 0 to 1.",
+)
+@words.option(
+    "Method",
+    "--bits",
+    metavar="SPEC",
+    default="paper",
+    show_default=True,
+    help="Bits for each value: paper (xyz=16, dc=8, scale=8, rot=8, opacity=4, rest=4), what shall differ from it, such as "
+    "rest=3,dc=7, auto (sensitivity search), or rtn8, rtn4, ... (one width for all, one range a channel: the baseline "
+    "that fails).",
+)
+@words.option(
+    "Method",
+    "--groups",
+    metavar="N",
+    type=int,
+    help="Ranges for each channel (the paper: 1000). Default: one for about 512 Gaussians.",
+)
+@words.base_psnr_option
+@words.option(
+    "Method",
+    "--effort",
+    type=click.Choice(["fast", "balanced", "thorough"]),
+    default="balanced",
+    show_default=True,
+    help="Steps of the search after the paper's list: 4, 10 or 32. Counted, never timed: same command, same bytes.",
+)
+@words.drop_invalid_option
+@words.device_option
+@words.memory_option
+@words.force_option
+@words.json_option
+@words.talk_options
+def command(input: str, output: str | None, json_path: str | None, quiet: bool, **options: Any) -> None:
+    r"""Compress a scene: the fewest bytes that hold a quality, or the best quality in a size.
+
+    INPUT is a .ply in INRIA's layout, a .fgs, or a model folder of the 3DGS training program. A cameras.json and an images/
+    folder beside it are used and named in the summary. Gaussians are scored over the training poses; then a search
+    finds how many to remove, how many lose their view-dependent colour, and measures each step by rendering. The figures
+    in the summary are measured on the finished file.
+
+    \b
+    Examples:
+      flexgs-edge compress point_cloud.ply -o scene.fgs
+          at most 1 dB worse against the photos
+      flexgs-edge compress output/garden -o garden.fgs --images data/garden/images_4 --max-drop 0.5
+          a model folder with photos elsewhere
+      flexgs-edge compress point_cloud.ply -o scene.fgs --max-size 8MB
+          the best that fits
+      flexgs-edge compress point_cloud.ply -o a.fgs --save-scores s.npy
+      flexgs-edge compress point_cloud.ply -o b.fgs --score s.npy --max-drop 2
+          score once, then try another target
+      flexgs-edge compress point_cloud.ply -o scene.fgs --prune-rate 0.3 --sh-rate 0.4
+          fixed rates, no search
+
+    Exit code 3 says that the target cannot be met, and names the closest point.
+    """
+    progress = words.start(quiet, json_path, options["force"])
+    from flexgs_edge.pipeline.compress import compress
+    from flexgs_edge.pipeline.options import CompressOptions
+    from flexgs_edge.report.summary import compress_text
+
+    result = compress(input, output, CompressOptions(**options), progress)
+    words.emit(compress_text(result), result.to_json(), json_path, options["force"])

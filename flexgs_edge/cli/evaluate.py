@@ -1,0 +1,49 @@
+"""`flexgs-edge evaluate`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from flexgs_edge.cli import words
+
+
+@click.command(cls=words.SectionCommand)
+@words.scene_argument
+@words.option(
+    "Quality", "--against", metavar="REF", required=True, help="The original: a .ply, a .fgs or a model folder."
+)
+@words.base_psnr_option
+@words.cameras_option
+@words.images_option
+@words.holdout_option
+@words.drawing_options
+@words.drop_invalid_option
+@words.device_option
+@words.memory_option
+@words.force_option
+@words.json_option
+@words.talk_options
+def command(
+    input: str, against: str, base_psnr: float, force: bool, json_path: str | None, quiet: bool, **options: Any
+) -> None:
+    r"""Measure what a scene lost against another one, view by view, mean and worst.
+
+    Fidelity is the PSNR (and SSIM) between the two scenes' renders. With photos, drop is the PSNR against the photos
+    that was lost on the way from REF to INPUT, in dB. Cameras and photos beside REF are used unless given, else those
+    beside INPUT. The held-out views are measured; all views with --holdout 0.
+
+    \b
+    Examples:
+      flexgs-edge evaluate scene.fgs --against point_cloud.ply
+      flexgs-edge evaluate decoded.ply --against point_cloud.ply --cameras cameras.json --images photos
+      flexgs-edge evaluate scene.fgs --against point_cloud.ply --holdout 0 --json quality.json
+    """
+    progress = words.start(quiet, json_path, force)
+    from flexgs_edge.pipeline.evaluate import evaluate
+    from flexgs_edge.pipeline.options import ViewOptions
+    from flexgs_edge.report.summary import evaluate_text
+
+    result = evaluate(input, against, ViewOptions(**options), base_psnr, progress)
+    words.emit(evaluate_text(result), result.to_json(), json_path, force)

@@ -1,0 +1,31 @@
+"""`flexgs-edge info`."""
+
+from __future__ import annotations
+
+import click
+
+from flexgs_edge.cli import words
+
+
+@click.command(cls=words.SectionCommand)
+@click.argument("file", metavar="FILE", type=click.Path())
+@words.force_option
+@words.json_option
+@words.talk_options
+def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
+    r"""Show what a scene file holds.
+
+    For a .fgs: Gaussians, SH degree, bits and bytes of every channel, the settings it was made with and the target it
+    reached. Only the header is read; use verify to check the rest. For a .ply or a model folder: counts, and what
+    lies beside it.
+
+    \b
+    Examples:
+      flexgs-edge info scene.fgs
+      flexgs-edge info scene.fgs --json - 2>/dev/null
+    """
+    words.start(quiet, json_path, force)
+    from flexgs_edge.pipeline.info import info, info_text
+
+    found = info(file)
+    words.emit(info_text(found), found, json_path, force)

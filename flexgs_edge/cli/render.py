@@ -1,0 +1,51 @@
+"""`flexgs-edge render`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from flexgs_edge.cli import words
+
+
+@click.command(cls=words.SectionCommand)
+@words.scene_argument
+@words.option(
+    "Output", "-o", "--output", metavar="DIR", required=True, help="Folder for the PNG files; made if missing."
+)
+@words.cameras_option
+@words.option(
+    "Views",
+    "--views",
+    type=words.VIEWS,
+    help="Views to draw, counted from 0 in order of name: 0,8,16 or START:STOP:STEP such as 0:50:8. Default: all.",
+)
+@words.drawing_options
+@words.drop_invalid_option
+@words.device_option
+@words.memory_option
+@words.force_option
+@words.json_option
+@words.talk_options
+def command(
+    input: str, output: str, views: list[int] | None, force: bool, json_path: str | None, quiet: bool, **options: Any
+) -> None:
+    r"""Draw views of a scene as PNG files, named after the cameras.
+
+    Near plane, background and extent are those that a .fgs was made with, unless given. The time of a view is
+    the median over all that were drawn; opening the device, compiling kernels and writing files are not in it.
+
+    \b
+    Examples:
+      flexgs-edge render scene.fgs -o views --cameras cameras.json
+      flexgs-edge render point_cloud.ply -o views --views 0:50:8 --background white
+      flexgs-edge render scene.fgs -o views --cameras cameras.json --views 0 --json - 2>/dev/null
+    """
+    progress = words.start(quiet, json_path, force)
+    from flexgs_edge.pipeline.options import ViewOptions
+    from flexgs_edge.pipeline.render import render_views
+    from flexgs_edge.report.summary import render_text
+
+    result = render_views(input, output, ViewOptions(**options), views, force, progress)
+    words.emit(render_text(result), result.to_json(), json_path, force)

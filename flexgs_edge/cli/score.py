@@ -1,0 +1,53 @@
+"""`flexgs-edge score`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from flexgs_edge.cli import words
+
+
+@click.command(cls=words.SectionCommand)
+@words.scene_argument
+@words.option("Output", "-o", "--output", metavar="SCORES.npy", required=True, help="NumPy file to write.")
+@words.option(
+    "Method",
+    "--score",
+    type=click.Choice(["gs", "meson"]),
+    default="gs",
+    show_default=True,
+    help="gs: opacity * volume^0.1 * pixels hit. meson: volume^0.1 * summed weights.",
+)
+@words.cameras_option
+@words.images_option
+@words.holdout_option
+@words.drawing_options
+@words.drop_invalid_option
+@words.device_option
+@words.memory_option
+@words.force_option
+@words.json_option
+@words.talk_options
+def command(
+    input: str, output: str, score: str, force: bool, json_path: str | None, quiet: bool, **options: Any
+) -> None:
+    r"""Score every Gaussian over the training poses, and save the scores.
+
+    The file holds one float64 a Gaussian, in the scene's order: the logarithm of the score, -inf for those that no
+    training pose sees. `compress --score FILE` then takes only a search. Photos are not compared, but scale the
+    views where they are smaller than the cameras say.
+
+    \b
+    Examples:
+      flexgs-edge score point_cloud.ply -o scores.npy
+      flexgs-edge compress point_cloud.ply -o scene.fgs --score scores.npy --max-drop 0.5
+    """
+    progress = words.start(quiet, json_path, force)
+    from flexgs_edge.pipeline.options import ViewOptions
+    from flexgs_edge.pipeline.score import score_gaussians
+    from flexgs_edge.report.summary import score_text
+
+    result = score_gaussians(input, output, ViewOptions(**options), score, force, progress)
+    words.emit(score_text(result), result.to_json(), json_path, force)

@@ -1,0 +1,131 @@
+"""`--method best`: measured costs along a path of prune and rescore, one multiplier, grids of equal slope, the real coder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+
+import numpy as np
+
+from flexgs_edge.adapt import Measurement, SearchResult, Step, Target
+from flexgs_edge.best.choice import BitModel
+from flexgs_edge.best.path import PrunePath
+from flexgs_edge.best.search import EFFORTS, RateResult, RateSearch, RateStep
+from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.cameras import Camera
+from flexgs_edge.codec.container2 import coded_size
+from flexgs_edge.constants import ALPHA_MIN
+from flexgs_edge.grid import GridScene
+from flexgs_edge.pipeline.judge import Judge, measurement_of
+from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.pipeline.workspace import Stopwatch
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.prune import Choice
+from flexgs_edge.render import Renderer
+from flexgs_edge.render.targets import TargetViews
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import MemorySource, SceneSource
+
+COPIES = 3
+"""Copies of the scene's planes that the path holds at most: the scene, the snapshots together, and one in work (measured on fox:
+snapshots at 0.8 of each other sum to four scenes less what the smallest ones share)."""
+
+
+SETTINGS_MOST = 1536
+"""Bytes that the settings in the header take at most: the search counts them before they are known."""
+
+
+def search_best(
+    renderer: Renderer,
+    source: SceneSource,
+    cameras: list[Camera],
+    judge: Judge,
+    target: Target,
+    options: CompressOptions,
+    budget: MemoryBudget,
+    clock: Stopwatch,
+    on_step: Callable[[Step], None] | None = None,
+    progress: Progress = SILENT,
+) -> tuple[GridScene, SearchResult]:
+    """The grid to write, and the steps that led to it.
+
+    Parameters
+    ----------
+    source : SceneSource
+        A checked scene; held in memory as a whole.
+    cameras : list of Camera
+        Training poses; at most as many as the effort scores are used, evenly spread.
+    judge : Judge
+        Prepared on the views that decide.
+
+    Raises
+    ------
+    TargetError
+        When nothing holds and `best_effort` is not set.
+    BudgetError
+        When the scene does not fit.
+    """
+    plan = EFFORTS[options.effort]
+    scored = [cameras[i * len(cameras) // min(plan.views, len(cameras))] for i in range(min(plan.views, len(cameras)))]
+    size = COPIES * source.count * sum(4 * field.width(source.sh_degree) for field in FIELD.values())
+    budget.take("the scene and its path", size)
+    try:
+        planes = source.read(slice(0, source.count), list(FIELD))
+        with ExitStack() as stack:
+            with clock.stage("references"), renderer.load(source) as scene:
+                targets = stack.enter_context(TargetViews(renderer, scene, scored, progress=progress))
+            with clock.stage("search"):
+                rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
+                path = PrunePath(renderer, planes, rows, source.origin, scored, targets, progress)
+
+                def measure(kept: dict[str, np.ndarray]) -> Measurement:
+                    with renderer.load(MemorySource(kept, origin=source.origin)) as kept_scene:
+                        return measurement_of(judge.compare(kept_scene))
+
+                def report(step: RateStep) -> None:
+                    if on_step:
+                        on_step(as_step(step, source.count))
+
+                search = RateSearch(path, size_and_bits, measure, plan, options.unseen == "keep", options.refit, report)
+                found = search.run(target, options.best_effort)
+        return found.grid, _as_search(found, source.count)
+    finally:
+        budget.give(size)
+
+
+def alive(logits: np.ndarray) -> np.ndarray:
+    """[n] bool: opacity reaches 1/255 (the renderer culls the rest everywhere, so they go first and cost nothing)."""
+    return logits >= np.float32(-np.log(1 / ALPHA_MIN - 1) - 1e-3)
+
+
+def size_and_bits(grid: GridScene) -> tuple[int, BitModel]:
+    """Exact bytes of a grid's file, and what its Gaussians cost: the base from a second coding without SH, the rest shared
+    among the SH coefficients."""
+    size = coded_size(grid, {}) + SETTINGS_MOST
+    if grid.sh_degree == 0:
+        return size, BitModel(8 * size / max(grid.count, 1), ())
+    bare = replace(grid, sh_degree=0, steps=replace(grid.steps, sh=()), sh_degrees=np.zeros_like(grid.sh_degrees), sh=())
+    base = coded_size(bare, {}) + SETTINGS_MOST
+    rows = [int(np.count_nonzero(grid.sh_degrees >= level)) for level in range(1, grid.sh_degree + 1)]
+    values = sum((2 * level + 1) * count for level, count in enumerate(rows, start=1))
+    each = 8 * (size - base) / max(values, 1)
+    return size, BitModel(8 * base / max(grid.count, 1), tuple((2 * level + 1) * each for level in range(1, grid.sh_degree + 1)))
+
+
+def as_step(step: RateStep, count: int) -> Step:
+    """The step as every search records it: rates are shares of the scene's rows."""
+    prune = round(1000 * (1 - step.count / count))
+    return Step(
+        choice=Choice(prune, min(round(1000 * (step.count - step.sh_count) / count), 1000 - prune)),
+        size=step.size,
+        measurement=step.measurement,
+        excess=step.excess,
+        phase="multiplier",
+        seconds=step.seconds,
+    )
+
+
+def _as_search(found: RateResult, count: int) -> SearchResult:
+    steps = tuple(as_step(step, count) for step in found.steps)
+    return SearchResult(steps[found.steps.index(found.chosen)], found.reached, steps)

@@ -1,0 +1,357 @@
+"""`compress`: open, score, search, write, and measure what was written."""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.adapt import SearchResult, Step, Target, adapt, measure_fixed
+from flexgs_edge.bitspec import PAPER, BitSpec
+from flexgs_edge.budget import MemoryBudget, format_size
+from flexgs_edge.codec import FgsSource, coded_size, open_fgs, write_grid
+from flexgs_edge.codec.container import write_container
+from flexgs_edge.errors import InputError
+from flexgs_edge.grid import GridScene, from_grid
+from flexgs_edge.pipeline.best import search_best
+from flexgs_edge.pipeline.evaluator import SceneEvaluator
+from flexgs_edge.pipeline.inputs import Scene, Views, companions_of, find_views, load_scene, resolve_drawing
+from flexgs_edge.pipeline.judge import Judge
+from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.pipeline.plan import EVERYTHING, Plan, make_settings
+from flexgs_edge.pipeline.records import scene_info, views_info
+from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, run_info
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.prune import Choice, nonzero_sh, order_from_scores
+from flexgs_edge.quantize import QuantizedScene
+from flexgs_edge.render.quality import Quality, error_for_drop
+from flexgs_edge.report.result import CompressResult
+from flexgs_edge.scene import MemorySource, SceneSource, check_writable
+from flexgs_edge.score import load_scores, save_scores, score_scene
+from flexgs_edge.sensitivity import ALLOWED_DROP, Sensitivity, search_bits
+
+LOG = logging.getLogger("flexgs_edge")
+
+SENSITIVITY_VIEWS = 8
+"""Training poses that `--bits auto` measures on, evenly spread."""
+
+
+def compress(
+    input: str | Path,
+    output: str | Path | None,
+    options: CompressOptions | None = None,
+    progress: Progress = SILENT,
+    **words: Any,
+) -> CompressResult:
+    """Compress a scene to the fewest bytes that hold a target.
+
+    Parameters
+    ----------
+    input : path
+        A `.ply`, a `.fgs`, or INRIA's model folder.
+    output : path or None
+        The `.fgs` file to write (None only in a dry run).
+    options : CompressOptions, optional
+        What the command line would say.
+    progress : Progress, optional
+        Bars on long work.
+    **words
+        Single options by the names of `CompressOptions`, such as `max_drop=0.5`.
+
+    Returns
+    -------
+    CompressResult
+        Sizes, quality of the decoded file, every step of the search, times.
+
+    Raises
+    ------
+    FlexGSError
+        `InputError`, `TargetError`, `DeviceError` or `BudgetError`; nothing is left behind then.
+    """
+    options = replace(options or CompressOptions(), **words)
+    target_path = _check_outputs(output, options)
+    clock = Stopwatch()
+    budget = MemoryBudget.from_limit(options.memory_limit)
+    with clock.stage("open"):
+        companions = companions_of(input)
+        scene = load_scene(input, options.drop_invalid)
+        options = resolve_drawing(options, scene, companions)
+        views = find_views(options, companions)
+        # Before any work: the words of the scores file and of the views must fit together.
+        plan = Plan.make(options, scene, views)
+        scores = (
+            None if plan.computes_scores or not plan.needs_scores else load_scores(options.score, scene.source.count)
+        )
+    with ExitStack() as stack:
+        workspace = stack.enter_context(Workspace(options, budget, clock)) if views is not None else None
+        job = _Job(options, scene, views, plan, budget, clock, workspace, progress)
+        return job.run(target_path, scores)
+
+
+def _check_outputs(output: str | Path | None, options: CompressOptions) -> Path | None:
+    if options.save_scores is not None:
+        check_writable(options.save_scores, options.force)
+    if options.dry_run:
+        return None
+    if output is None:
+        raise InputError("-o OUT.fgs is missing: give the file to write, or --dry-run")
+    if Path(output).suffix.lower() != ".fgs":
+        raise InputError(f"-o {output}: expected a name that ends in .fgs")
+    check_writable(output, options.force)
+    return Path(output)
+
+
+class _Job:
+    """One run of `compress`, stage by stage."""
+
+    def __init__(
+        self,
+        options: CompressOptions,
+        scene: Scene,
+        views: Views | None,
+        plan: Plan,
+        budget: MemoryBudget,
+        clock: Stopwatch,
+        workspace: Workspace | None,
+        progress: Progress,
+    ) -> None:
+        self.options, self.scene, self.views, self.plan = options, scene, views, plan
+        self.budget, self.clock, self.workspace, self.progress = budget, clock, workspace, progress
+        self.source = scene.source
+        self.groups = options.bit_spec()[1]
+        self.sensitivity: list[Sensitivity] = []
+
+    def run(self, output: Path | None, scores: np.ndarray | None) -> CompressResult:
+        """The whole job; `scores` come from a file, or are computed."""
+        decide, report = self._judges()
+        if self.options.method == "best":
+            return self._run_best(output, decide, report)
+        if self.workspace is not None:
+            scores = self._look_at_original(decide, report, scores)
+        if self.options.save_scores is not None and scores is not None:
+            save_scores(self.options.save_scores, scores, self.options.force)
+        order = np.arange(self.source.count) if scores is None else order_from_scores(scores)
+        with self.clock.stage("open"):
+            has_sh = nonzero_sh(self.source)
+        evaluator = self._evaluator(order, has_sh, PAPER, decide)
+        bits, _ = self.options.bit_spec()
+        if bits is None:
+            with self.clock.stage("sensitivity"):
+                bits = self._search_bits(evaluator)
+        evaluator.bits = bits
+        with self.clock.stage("search"):
+            search = self._search(evaluator)
+        if decide is not None and decide is not report:
+            decide.close()
+        choice = search.chosen.choice if search else self.options.fixed
+        assert choice is not None
+        with evaluator.quantized(choice) as quantized:
+            quality = self._write(output, quantized, search, report)
+        return self._result(output, evaluator.size(choice), choice, quantized, search, quality)
+
+    def _run_best(self, output: Path | None, decide: Judge | None, report: Judge | None) -> CompressResult:
+        """The job by measured costs: see `flexgs_edge.pipeline.best`."""
+        options, plan = self.options, self.plan
+        assert self.workspace is not None and self.views is not None and plan.target is not None
+        assert decide is not None and report is not None
+        renderer = self.workspace.renderer
+        self._look_at_original(decide, report, None)
+        LOG.info("searching for %s", plan.target.describe())
+        grid, search = search_best(
+            renderer,
+            self.source,
+            self.views.of(self.views.train),
+            decide,
+            plan.target,
+            options,
+            self.budget,
+            self.clock,
+            on_step=lambda step: LOG.info("%s", _step_words(step, plan.target)),
+            progress=self.progress,
+        )
+        if decide is not report:
+            decide.close()
+        settings = make_settings(options, plan, self.scene, self.views, search, None)
+        if output is None:
+            size, quality = coded_size(grid, settings), self._measure_source(MemorySource(from_grid(grid), origin=grid.origin), report)
+        else:
+            with temporary_name(output, options.force) as place:
+                with self.clock.stage("write"):
+                    size = write_grid(place, grid, settings)
+                if plan.target.limit_bytes is not None and size > plan.target.limit_bytes:
+                    raise AssertionError(f"the file has {size} bytes, more than the search allowed for")
+                quality = self._measure_source(open_fgs(place), report)
+            LOG.info("wrote %s, %s", output, format_size(size))
+        return self._result(output, size, search.chosen.choice, grid, search, quality)
+
+    def _measure_source(self, source: SceneSource, report: Judge) -> Quality:
+        assert self.workspace is not None
+        with self.clock.stage("measure"), self.workspace.renderer.load(source) as scene:
+            return report.compare(scene, with_ssim=True, progress=self.progress)
+
+    def _judges(self) -> tuple[Judge | None, Judge | None]:
+        """The judge that decides and the one that reports; one and the same unless the training poses decide."""
+        if self.workspace is None or self.views is None:
+            return None, None
+
+        def judge(indices: list[int], photos: bool) -> Judge:
+            assert self.workspace is not None and self.views is not None
+            return Judge(
+                self.workspace.renderer, self.source, self.views, indices, self.budget, photos, self.options.base_psnr
+            )
+
+        report = judge(self.plan.report, True)
+        on_train = self.plan.decide != self.plan.report
+        return (judge(self.plan.decide, False) if on_train else report), report
+
+    def _look_at_original(
+        self, decide: Judge | None, report: Judge | None, scores: np.ndarray | None
+    ) -> np.ndarray | None:
+        """Reference renders and scores, with the original loaded once."""
+        assert self.workspace is not None and self.views is not None and decide is not None and report is not None
+        renderer = self.workspace.renderer
+        with self.clock.stage("load"):
+            device_scene = renderer.load(self.source)
+        with device_scene:
+            with self.clock.stage("references"):
+                report.prepare(device_scene, self.progress)
+                if decide is not report:
+                    decide.prepare(device_scene, self.progress)
+            if self.plan.computes_scores:
+                cameras = self.views.of(self.views.train)
+                LOG.info("scoring %d Gaussians over %d training poses", self.source.count, len(cameras))
+                with self.clock.stage("score"):
+                    scores = score_scene(
+                        renderer, device_scene, self.source, cameras, self.options.score, self.progress
+                    )
+        renderer.release()
+        return scores
+
+    def _evaluator(self, order: np.ndarray, has_sh: np.ndarray, bits: BitSpec, judge: Judge | None) -> SceneEvaluator:
+        renderer = self.workspace.renderer if self.workspace else None
+        return SceneEvaluator(self.source, order, has_sh, bits, self.groups, renderer, judge, self.budget)
+
+    def _search_bits(self, evaluator: SceneEvaluator) -> BitSpec:
+        """`--bits auto` on a few training poses, with nothing pruned."""
+        assert self.workspace is not None and self.views is not None
+        renderer, train = self.workspace.renderer, self.views.train
+        indices = [
+            train[i * len(train) // min(SENSITIVITY_VIEWS, len(train))]
+            for i in range(min(SENSITIVITY_VIEWS, len(train)))
+        ]
+        judge = Judge(renderer, self.source, self.views, indices, self.budget, False, self.options.base_psnr)
+        with renderer.load(self.source) as original:
+            judge.prepare(original, self.progress)
+
+        def error(bits: BitSpec) -> float:
+            with evaluator.quantized(EVERYTHING, bits) as quantized, renderer.load_quantized(quantized) as scene:
+                return judge.compare(scene).error
+
+        kept, with_sh = evaluator.counts(EVERYTHING)
+        allowed = error_for_drop(ALLOWED_DROP, self.options.base_psnr)
+        bits, self.sensitivity = search_bits(error, self.source.sh_degree, with_sh / kept, allowed)
+        judge.close()
+        LOG.info("bits found by sensitivity: %s", bits)
+        return bits
+
+    def _search(self, evaluator: SceneEvaluator) -> SearchResult | None:
+        fixed = self.options.fixed
+        if evaluator.judge is None:
+            return None
+        if fixed is not None:
+            return measure_fixed(evaluator, fixed)
+        assert self.plan.target is not None
+        LOG.info("searching for %s", self.plan.target.describe())
+
+        def on_step(step: Step) -> None:
+            LOG.info("%s", _step_words(step, self.plan.target))
+
+        return adapt(evaluator, self.plan.target, self.options.effort, self.options.best_effort, on_step)
+
+    def _write(
+        self, output: Path | None, quantized: QuantizedScene, search: SearchResult | None, report: Judge | None
+    ) -> Quality | None:
+        """Write the file under another name, measure what it decodes to, and only then give it its name."""
+        settings = make_settings(self.options, self.plan, self.scene, self.views, search, quantized.bits)
+        if output is None:
+            return self._measure(quantized, report)
+        with temporary_name(output, self.options.force) as place:
+            with self.clock.stage("write"):
+                size = write_container(place, quantized, settings)
+            quality = None
+            if report is not None:
+                self.budget.take("the decoded file", size)
+                quality = self._measure(FgsSource(place).quantized(), report)
+                self.budget.give(size)
+        LOG.info("wrote %s, %s", output, format_size(size))
+        return quality
+
+    def _measure(self, quantized: QuantizedScene, report: Judge | None) -> Quality | None:
+        if self.workspace is None or report is None:
+            return None
+        with self.clock.stage("measure"), self.workspace.renderer.load_quantized(quantized) as scene:
+            return report.compare(scene, with_ssim=True, progress=self.progress)
+
+    def _result(
+        self,
+        output: Path | None,
+        size: int,
+        choice: Choice,
+        scene: QuantizedScene | GridScene,
+        search: SearchResult | None,
+        quality: Quality | None,
+    ) -> CompressResult:
+        options, plan = self.options, self.plan
+        fixed = options.fixed is not None
+        return CompressResult(
+            scene=scene_info(self.scene),
+            views=views_info(self.views) if self.views else None,
+            output=None if output is None else os.fspath(output),
+            size=size,
+            count=scene.count,
+            sh_count=scene.sh_count,
+            prune_rate=choice.prune / 1000,
+            sh_rate=choice.sh / 1000,
+            method=options.method,
+            score=options.score if plan.needs_scores else None,
+            select=options.select,
+            bits=asdict(scene.bits) if isinstance(scene, QuantizedScene) else {},
+            groups={name: a.groups for name, a in scene.arrays.items()} if isinstance(scene, QuantizedScene) else {},
+            steps=scene.steps.to_json() if isinstance(scene, GridScene) else None,
+            target=plan.target.describe() if plan.target else None,
+            decided_by=plan.decided_by,
+            reached=search.reached if search and not fixed else None,
+            decision_views=plan.kind_of(plan.decide, self.views),
+            search=search,
+            sensitivity=tuple(self.sensitivity),
+            quality=quality,
+            quality_views=plan.kind_of(plan.report, self.views),
+            scores_saved=options.save_scores,
+            run=run_info(self.budget, self.clock, self.workspace),
+        )
+
+
+def _step_words(step: Step, target: Target | None) -> str:
+    figure = target.report(step.size, step.measurement) if target else ""
+    return f"{step.phase}: prune {step.choice.prune / 1000:g}, SH {step.choice.sh / 1000:g}: {figure}, {step.seconds:.1f} s"
+
+
+@contextmanager
+def temporary_name(output: Path, force: bool) -> Iterator[Path]:
+    """A name beside `output` that becomes `output` when the block ends well, and is removed when it does not."""
+    target = check_writable(output, force)
+    place = target.with_name(f".flexgs-{secrets.token_hex(8)}.tmp.fgs")
+    try:
+        yield place
+        check_writable(output, force)
+        os.replace(place, target)
+    finally:
+        with suppress(FileNotFoundError):
+            place.unlink()

@@ -1,0 +1,83 @@
+"""`evaluate`: a scene against a reference, view by view."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.constants import DEFAULT_BASE_PSNR
+from flexgs_edge.errors import InputError
+from flexgs_edge.pipeline.inputs import (
+    NO_CAMERAS,
+    companions_of,
+    find_views,
+    load_scene,
+    merge_companions,
+    resolve_drawing,
+)
+from flexgs_edge.pipeline.judge import Judge
+from flexgs_edge.pipeline.options import ViewOptions
+from flexgs_edge.pipeline.records import scene_info, views_info
+from flexgs_edge.pipeline.workspace import Stopwatch, Workspace
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.report.result import EvaluateResult
+
+
+def evaluate(
+    input: str | Path,
+    against: str | Path,
+    options: ViewOptions | None = None,
+    base_psnr: float = DEFAULT_BASE_PSNR,
+    progress: Progress = SILENT,
+    **words: Any,
+) -> EvaluateResult:
+    """Measure what a scene lost against another one.
+
+    Parameters
+    ----------
+    input : path
+        The scene to judge (`.fgs`, `.ply` or model folder).
+    against : path
+        The original. Cameras and photos beside it are used unless given; else those beside `input`.
+    options : ViewOptions, optional
+        What the command line would say; `holdout=0` evaluates every view, otherwise the held-out views.
+    base_psnr : float
+        PSNR of the original that the modelled drop starts from, dB.
+    **words
+        Single options by the names of `ViewOptions`.
+    """
+    options = replace(options or ViewOptions(), **words)
+    if not 0.0 < base_psnr < 200.0:
+        raise InputError(f"--base-psnr {base_psnr:g}: expected decibels between 0 and 200")
+    clock = Stopwatch()
+    budget = MemoryBudget.from_limit(options.memory_limit)
+    with clock.stage("open"):
+        companions = merge_companions(companions_of(against), companions_of(input))
+        reference = load_scene(against, options.drop_invalid)
+        scene = load_scene(input, options.drop_invalid)
+        # Both are drawn alike; a compressed scene knows how its original was.
+        options = resolve_drawing(options, scene if scene.settings else reference, companions)
+        views = find_views(options, companions)
+        if views is None:
+            raise InputError(f"{against}: {NO_CAMERAS}")
+        indices = views.held_out or views.train
+    with ExitStack() as stack:
+        workspace = stack.enter_context(Workspace(options, budget, clock))
+        renderer = workspace.renderer
+        judge = Judge(renderer, reference.source, views, indices, budget, True, base_psnr)
+        stack.callback(judge.close)
+        with clock.stage("references"), renderer.load(reference.source) as original:
+            judge.prepare(original, progress)
+        with clock.stage("measure"), renderer.load(scene.source) as compressed:
+            quality = judge.compare(compressed, with_ssim=True, progress=progress)
+        return EvaluateResult(
+            scene=scene_info(scene),
+            reference=scene_info(reference),
+            views=views_info(views),
+            quality=quality,
+            quality_views="held-out" if views.held_out else "training",
+            run=workspace.run_info(),
+        )

@@ -1,0 +1,135 @@
+"""The views that judge: renders of the original and photos, kept in memory as far as the budget goes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexgs_edge.adapt import Measurement
+from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.constants import DEFAULT_BASE_PSNR
+from flexgs_edge.pipeline.inputs import Views
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.render import DeviceScene, Renderer
+from flexgs_edge.render.quality import Quality, ViewQuality, compare_view, mse
+from flexgs_edge.scene import SceneSource
+
+SHARE = 4
+"""Reference images may take this part of the free budget (one in four): the rest is for the scene and its views."""
+LIBRARY_BYTES = 48 * 2**20
+"""What Pillow, scikit-image and SciPy take when they are loaded (measured: 45 MiB)."""
+WORK_BYTES = 100
+"""Bytes a pixel that decoding a photo, or SSIM, holds for a moment (measured: 72 for SSIM)."""
+
+
+class Judge:
+    """Compares a scene with the original (and with photos) over some views.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        Draws both.
+    source : SceneSource
+        The original; drawn again whenever a reference was not kept.
+    views : Views
+        All views.
+    indices : sequence of int
+        The views that judge.
+    budget : MemoryBudget
+        Kept images are taken from it, at most a quarter of what is free.
+    with_photos : bool
+        Compare with photos as well, where there are any.
+    base_psnr : float
+        For the modelled drop, dB.
+    """
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        source: SceneSource,
+        views: Views,
+        indices: Sequence[int],
+        budget: MemoryBudget,
+        with_photos: bool = True,
+        base_psnr: float = DEFAULT_BASE_PSNR,
+    ) -> None:
+        self.renderer = renderer
+        self.source = source
+        self.cameras = views.of(indices)
+        self.photos = views.photos if with_photos else None
+        self.base_psnr = base_psnr
+        self._indices = list(indices)
+        self._budget = budget
+        self._kept: dict[tuple[str, int], np.ndarray] = {}
+        self._original_error: list[float] = []
+        # Taken now and not when images come: scenes that are loaded later must not count on it.
+        pixels = [camera.width * camera.height for camera in self.cameras]
+        wanted = sum(pixels) * 12 * (1 if self.photos is None else 2)
+        self._work = LIBRARY_BYTES + WORK_BYTES * max(pixels)
+        budget.take("comparing views", self._work)
+        self._room = min(wanted, budget.free // SHARE)
+        budget.take("reference images", self._room)
+        self._left = self._room
+
+    def prepare(self, scene: DeviceScene, progress: Progress = SILENT) -> None:
+        """Draw the references from `scene` (the original, loaded), and measure them against the photos."""
+        self._original_error = []
+        for i, camera in enumerate(progress.track(self.cameras, "drawing the original", len(self.cameras))):
+            # Clamped once, and contiguous by channel as renders are: comparing is then four times as fast.
+            image = _planes(self.renderer.render(scene, camera))
+            self._keep(("original", i), image)
+            if self.photos is not None:
+                photo = _planes(self.photos.load(self._indices[i]))
+                self._original_error.append(mse(image, photo))
+                self._keep(("photo", i), photo)
+
+    def close(self) -> None:
+        """Give the memory of the kept images back."""
+        self._kept = {}
+        self._budget.give(self._room + self._work)
+        self._room = self._work = 0
+
+    @property
+    def kept(self) -> int:
+        """Reference renders held in memory."""
+        return sum(kind == "original" for kind, _ in self._kept)
+
+    def compare(self, scene: DeviceScene, with_ssim: bool = False, progress: Progress = SILENT) -> Quality:
+        """Quality of `scene` over the views (about 0.3 s a megapixel and pair more with SSIM)."""
+        found: list[ViewQuality] = []
+        for i, camera in enumerate(progress.track(self.cameras, "comparing views", len(self.cameras))):
+            image = self.renderer.render(scene, camera)
+            error = self._original_error[i] if self.photos is not None else None
+            found.append(compare_view(camera.name, image, self._original(i), self._photo(i), error, with_ssim))
+        return Quality(tuple(found), self.base_psnr)
+
+    def _keep(self, key: tuple[str, int], image: np.ndarray) -> None:
+        if image.nbytes <= self._left:
+            self._left -= image.nbytes
+            self._kept[key] = image
+
+    def _original(self, i: int) -> np.ndarray:
+        if ("original", i) in self._kept:
+            return self._kept["original", i]
+        with self.renderer.load(self.source) as scene:
+            return self.renderer.render(scene, self.cameras[i])
+
+    def _photo(self, i: int) -> np.ndarray | None:
+        if self.photos is None:
+            return None
+        if ("photo", i) in self._kept:
+            return self._kept["photo", i]
+        return self.photos.load(self._indices[i])
+
+
+def measurement_of(quality: Quality) -> Measurement:
+    """The means that a search decides by."""
+    return Measurement(quality.drop, quality.fidelity, quality.modelled_drop)
+
+
+def _planes(image: np.ndarray) -> np.ndarray:
+    """[H, W, 3] in [0, 1] whose memory is contiguous by channel."""
+    planes = np.ascontiguousarray(image.transpose(2, 0, 1))
+    np.clip(planes, 0.0, 1.0, out=planes)
+    return planes.transpose(1, 2, 0)

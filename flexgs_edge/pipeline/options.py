@@ -1,0 +1,204 @@
+"""The words of the command line as one record, checked before any work starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flexgs_edge.adapt import REFINE_STEPS, Judge, MaxDrop, MinFidelity, Target, min_ratio
+from flexgs_edge.adapt.targets import MaxSize
+from flexgs_edge.bitspec import PAPER, BitSpec
+from flexgs_edge.cameras import split_views
+from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, MAX_VIEW_WIDTH
+from flexgs_edge.errors import InputError
+from flexgs_edge.prune import Choice
+
+NO_PHOTOS = "none"
+"""`--images none`: leave photos that lie beside the scene alone."""
+METHODS = ("best", "paper")
+SELECTS = ("test", "train")
+UNSEEN = ("keep", "drop")
+DEFAULT_MAX_DROP = 1.0
+PAPER_ONLY = {"prune_rate": None, "sh_rate": None, "score": "gs", "save_scores": None, "bits": "paper", "groups": None}
+"""Options that only `--method paper` knows, with their defaults."""
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Where views come from and how they are drawn.
+
+    Parameters
+    ----------
+    cameras : str, optional
+        INRIA's cameras.json or a folder with one. Default: the one beside the scene.
+    images : str, optional
+        Folder of photos; `none` for no photos. Default: `images/` beside the scene.
+    holdout : int
+        Every holdout-th view by name is held out; 0 holds out none.
+    resolution : int
+        Wider views are scaled down to this many pixels.
+    near : float, optional
+        Near plane, scene units. Default: what a `.fgs` says, else 0.2.
+    background : tuple of float, optional
+        Red, green, blue in [0, 1]. Default: what a `.fgs` or `cfg_args` says, else black.
+    extent : str, optional
+        `exact` or `inria`. Default: what a `.fgs` says, else `exact`.
+    drop_invalid : bool
+        Leave rows with NaN, infinity or zero quaternions out.
+    memory_limit : int, optional
+        Bytes for the whole process. Default: 3/4 of what is free.
+    device : str, optional
+        OpenCL device (number, part of its name, `cpu`, `gpu`) or `numpy`.
+    """
+
+    cameras: str | None = None
+    images: str | None = None
+    holdout: int = DEFAULT_HOLDOUT
+    resolution: int = MAX_VIEW_WIDTH
+    near: float | None = None
+    background: tuple[float, float, float] | None = None
+    extent: str | None = None
+    drop_invalid: bool = False
+    memory_limit: int | None = None
+    device: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.resolution < 1:
+            raise InputError(f"--resolution {self.resolution}: expected a width of at least 1 pixel")
+        split_views(0, self.holdout)
+        if self.near is not None and not 0.0 < self.near < float("inf"):
+            raise InputError(f"--near {self.near:g}: expected a distance above 0 in scene units")
+        if self.background is not None and not all(0.0 <= c <= 1.0 for c in self.background):
+            raise InputError(f"--background {self.background}: expected red, green and blue from 0 to 1")
+
+
+@dataclass(frozen=True)
+class CompressOptions(ViewOptions):
+    """Everything that `compress` may be told, beside input and output.
+
+    Parameters
+    ----------
+    method : {"best", "paper"}
+        Measured costs, one multiplier and the real coder, or the paper's method as it is.
+    select : {"test", "train"}
+        Views that decide where to stop: the held-out ones, or the training poses.
+    score : str
+        `gs`, `meson`, or a .npy/.npz file with one number a Gaussian.
+    save_scores : str, optional
+        Write the scores here (.npy).
+    max_drop, min_fidelity : float, optional
+        Quality targets, dB.
+    max_size : int, optional
+        Size target, bytes.
+    min_ratio : float, optional
+        Size target, PLY bytes / file bytes.
+    prune_rate, sh_rate : float, optional
+        Fixed rates from 0 to 1: no search.
+    bits : str
+        Bits per attribute, `auto`, or `rtn4`, `rtn8`, ...
+    groups : int, optional
+        Quantization groups per channel. Default: one for about 512 rows.
+    base_psnr : float
+        PSNR of the original against its photos that the modelled drop starts from, dB.
+    effort : {"fast", "balanced", "thorough"}
+        Steps of the search.
+    best_effort : bool
+        Write the closest point when the target cannot be met.
+    unseen : {"keep", "drop"}
+        What becomes of Gaussians that no training pose sees (`best`).
+    refit : bool
+        Refit colours after pruning and quantizing (`best`).
+    dry_run : bool
+        Do everything but write.
+    force : bool
+        Overwrite files that exist.
+    """
+
+    method: str = "paper"
+    select: str = "test"
+    score: str = "gs"
+    save_scores: str | None = None
+    max_drop: float | None = None
+    min_fidelity: float | None = None
+    max_size: int | None = None
+    min_ratio: float | None = None
+    prune_rate: float | None = None
+    sh_rate: float | None = None
+    bits: str = "paper"
+    groups: int | None = None
+    base_psnr: float = DEFAULT_BASE_PSNR
+    effort: str = "balanced"
+    best_effort: bool = False
+    unseen: str = "keep"
+    refit: bool = True
+    dry_run: bool = False
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for word, value, known in (
+            ("--method", self.method, METHODS),
+            ("--select", self.select, SELECTS),
+            ("--unseen", self.unseen, UNSEEN),
+            ("--effort", self.effort, tuple(REFINE_STEPS)),
+        ):
+            if value not in known:
+                raise InputError(f"{word} {value!r}: expected one of {', '.join(known)}")
+        if not 0.0 < self.base_psnr < 200.0:
+            raise InputError(
+                f"--base-psnr {self.base_psnr:g}: expected decibels between 0 and 200 (most scenes: 22 to 36)"
+            )
+        if self.groups is not None and self.groups < 1:
+            raise InputError(f"--groups {self.groups}: expected 1 or more")
+        for name, default in PAPER_ONLY.items():
+            if self.method != "paper" and getattr(self, name) != default:
+                raise InputError(f"--{name.replace('_', '-')} belongs to --method paper: leave it out, or ask for that method")
+        self._check_targets()
+        self.bit_spec()
+
+    def _check_targets(self) -> None:
+        words = ("max_drop", "min_fidelity", "max_size", "min_ratio")
+        given = ["--" + word.replace("_", "-") for word in words if getattr(self, word) is not None]
+        if len(given) > 1:
+            raise InputError(f"{' and '.join(given)}: give one target")
+        if (self.prune_rate is None) != (self.sh_rate is None):
+            raise InputError("--prune-rate and --sh-rate: give both (fixed rates, no search) or none")
+        if self.fixed is not None and given:
+            raise InputError(
+                f"{given[0]} with --prune-rate and --sh-rate: fixed rates leave nothing to search; give one or the other"
+            )
+        self.target("drop", 1)
+
+    @property
+    def fixed(self) -> Choice | None:
+        """The fixed rates, if they were given."""
+        if self.prune_rate is None or self.sh_rate is None:
+            return None
+        choice = Choice.from_rates(self.prune_rate, self.sh_rate)
+        if choice.prune == 1000:
+            raise InputError(f"--prune-rate {self.prune_rate:g}: expected less than 1: nothing would be left to draw")
+        return choice
+
+    def target(self, judge: Judge, ply_bytes: int) -> Target | None:
+        """The target; `judge` is the figure that decides on drops, `None` comes back for fixed rates."""
+        if self.fixed is not None:
+            return None
+        if self.min_fidelity is not None:
+            return MinFidelity(self.min_fidelity)
+        if self.max_size is not None:
+            return MaxSize(self.max_size, judge)
+        if self.min_ratio is not None:
+            return min_ratio(self.min_ratio, ply_bytes, judge)
+        return MaxDrop(DEFAULT_MAX_DROP if self.max_drop is None else self.max_drop, judge)
+
+    def bit_spec(self) -> tuple[BitSpec | None, int | None]:
+        """Bits (`None`: to be searched) and groups that `--bits` and `--groups` ask for."""
+        words = self.bits.strip().lower()
+        if words == "auto":
+            return None, self.groups
+        if words == "paper":
+            return PAPER, self.groups
+        if words.startswith("rtn"):
+            if not words[3:].isdigit():
+                raise InputError(f"--bits {self.bits}: expected rtn and a number of bits, such as rtn8")
+            return BitSpec.rtn(int(words[3:])), 1 if self.groups is None else self.groups
+        return BitSpec.parse(self.bits), self.groups

@@ -1,0 +1,124 @@
+"""What a run of `compress` needs, decided before any work, and what its file will say about it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from flexgs_edge._version import __version__
+from flexgs_edge.adapt import Judge, SearchResult, Target
+from flexgs_edge.bitspec import BitSpec
+from flexgs_edge.errors import InputError
+from flexgs_edge.pipeline.inputs import NO_CAMERAS, Scene, Views
+from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.prune import Choice
+
+EVERYTHING = Choice(0, 0)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run needs, decided before any work.
+
+    `decide` and `report` are the views that decide where to stop and that the final figures come from: the held-out ones,
+    unless the training poses were asked to decide (then the held-out ones, which decided nothing, still report).
+    """
+
+    decide: list[int]
+    report: list[int]
+    judge: Judge
+    target: Target | None
+    needs_scores: bool
+    computes_scores: bool
+
+    @classmethod
+    def make(cls, options: CompressOptions, scene: Scene, views: Views | None) -> Plan:
+        fixed = options.fixed
+        needs_scores = fixed != EVERYTHING and options.method == "paper"
+        computes = needs_scores and options.score in ("gs", "meson")
+        bits, _ = options.bit_spec()
+        if views is None:
+            if options.method != "paper":
+                raise InputError(f"{scene.path}: {NO_CAMERAS}. Views are needed to measure what each Gaussian is worth")
+            if fixed is None or computes or bits is None:
+                why = (
+                    "to score Gaussians and to judge the result"
+                    if fixed is None or bits is None
+                    else "to score Gaussians"
+                )
+                raise InputError(
+                    f"{scene.path}: {NO_CAMERAS}. Views are needed {why}; without them only fixed rates work: "
+                    "--prune-rate and --sh-rate with --score FILE, or both rates 0"
+                )
+            return cls([], [], "modelled drop", None, needs_scores, False)
+        if options.select == "test" and not views.held_out:
+            raise InputError(
+                "--holdout 0 leaves no view to decide on: use --select train as well, or another --holdout"
+            )
+        if not views.train and (options.method != "paper" or computes or bits is None or options.select == "train"):
+            raise InputError(
+                f"{views.cameras_path}: {len(views.cameras)} views, all of them held out (every {options.holdout}th by name): "
+                "give more views, or --holdout 0 --select train"
+            )
+        on_train = options.select == "train"
+        judge: Judge = "drop" if views.photos is not None and not on_train else "modelled drop"
+        return cls(
+            decide=views.train if on_train else views.held_out,
+            report=views.held_out or views.train,
+            judge=judge,
+            target=options.target(judge, scene.ply_bytes),
+            needs_scores=needs_scores,
+            computes_scores=computes,
+        )
+
+    @property
+    def decided_by(self) -> str | None:
+        """The figure that decides: `drop`, `modelled drop`, `fidelity` or `size`; `None` for fixed rates."""
+        if self.target is None:
+            return None
+        return "size" if self.target.limit_bytes is not None else self.target.judge
+
+    @staticmethod
+    def kind_of(indices: list[int], views: Views | None) -> str:
+        """`held-out`, `training` or `none`."""
+        if not indices or views is None:
+            return "none"
+        return "held-out" if indices == views.held_out else "training"
+
+
+def make_settings(
+    options: CompressOptions,
+    plan: Plan,
+    scene: Scene,
+    views: Views | None,
+    search: SearchResult | None,
+    bits: BitSpec | None,
+) -> dict[str, Any]:
+    """What the file says about its making: the same for every run and machine, so no times, paths or devices."""
+    choice = search.chosen.choice if search else options.fixed
+    assert choice is not None and options.background is not None
+    found = search.chosen.measurement if search else None
+    return {
+        "program": f"flexgs-edge {__version__}",
+        "method": options.method,
+        "score": None if not plan.needs_scores else options.score if plan.computes_scores else "file",
+        "prune_rate": choice.prune / 1000,
+        "sh_rate": choice.sh / 1000,
+        "bits": None if bits is None else options.bits if options.bits in ("auto", "paper") else str(bits),
+        "source_count": scene.input_count,
+        "source_sh_degree": scene.source.sh_degree,
+        "target": plan.target.describe() if plan.target else None,
+        "decided_by": plan.decided_by,
+        "reached": search.reached if search and plan.target else None,
+        "select": options.select if views else None,
+        "holdout": options.holdout if views else None,
+        "views": len(views.cameras) if views else 0,
+        "effort": options.effort if plan.target else None,
+        "base_psnr": options.base_psnr,
+        "quality": {
+            name: None if value is None else round(value, 3) for name, value in (asdict(found) if found else {}).items()
+        },
+        "near": options.near,
+        "background": list(options.background),
+        "extent": options.extent,
+    }

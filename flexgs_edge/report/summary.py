@@ -1,0 +1,220 @@
+"""The text that people read, made from the result records and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from flexgs_edge.budget import format_mib, format_size
+from flexgs_edge.render.quality import Quality, ViewQuality
+from flexgs_edge.report.result import (
+    CompressResult,
+    DecompressResult,
+    EvaluateResult,
+    RenderResult,
+    RunInfo,
+    SceneInfo,
+    ScoreResult,
+    ViewsInfo,
+)
+
+
+def compress_text(result: CompressResult) -> str:
+    """Summary of a `compress`."""
+    lines = [*_scene_lines("scene", result.scene), *_view_lines(result.views)]
+    size = f"{result.size} bytes ({format_size(result.size)})"
+    if result.output is None:
+        lines.append(_line("would write", f"{size}; nothing was written (--dry-run)"))
+    else:
+        lines.append(_line("wrote", f"{result.output}, {size}"))
+    lines.append(
+        _line(
+            "ratio",
+            f"{result.ratio:.2f}x of the PLY's {format_size(result.scene.ply_bytes)} ({_saved(result):.1f} % smaller)",
+        )
+    )
+    share = f"{result.count} of {result.scene.count} Gaussians, {result.sh_count} of them with SH"
+    lines.append(_line("kept", f"{share} (prune rate {result.prune_rate:g}, SH rate {result.sh_rate:g})"))
+    bits = " ".join(f"{name}={bits}" for name, bits in result.bits.items())
+    lines.append(_line("bits", bits + (" (found by sensitivity)" if result.sensitivity else "")))
+    lines += _decision_lines(result)
+    if result.quality is not None:
+        decoded = "decoded file" if result.output else "as it would decode"
+        lines += _quality_lines(
+            result.quality, f"{decoded}, {len(result.quality.views)} {result.quality_views} views"
+        )
+    if result.scores_saved:
+        lines.append(_line("scores", f"saved to {result.scores_saved}"))
+    return _text([*lines, *_run_lines(result.run)])
+
+
+def _saved(result: CompressResult) -> float:
+    return 100.0 * (1.0 - 1.0 / result.ratio)
+
+
+def _decision_lines(result: CompressResult) -> list[str]:
+    if result.target is None:
+        return [_line("target", "none: fixed rates, no search")]
+    steps = result.search.steps if result.search else ()
+    verdict = "reached" if result.reached else "NOT reached: this is the closest point (--best-effort)"
+    lines = [_line("target", f"{result.target}: {verdict}, after {len(steps)} steps")]
+    by = {
+        "drop": "the drop against the photos",
+        "modelled drop": "the modelled drop (no photos decide: error against the original's renders)",
+        "fidelity": "the fidelity (PSNR against the original's renders)",
+        "size": "the size; among points that fit, quality",
+    }[result.decided_by or "size"]
+    where = {
+        "held-out": "on the held-out views, which decide only where to stop",
+        "training": "on the training poses",
+        "none": "without views",
+    }[result.decision_views]
+    lines.append(_line("decided by", f"{by}, {where}"))
+    return lines
+
+
+def evaluate_text(result: EvaluateResult) -> str:
+    """Summary of an `evaluate`, with a row a view."""
+    lines = [
+        *_scene_lines("scene", result.scene),
+        *_scene_lines("against", result.reference),
+        *_view_lines(result.views),
+    ]
+    lines += _quality_lines(result.quality, f"{len(result.quality.views)} {result.quality_views} views")
+    lines += ["", *_view_table(result.quality.views)]
+    return _text([*lines, "", *_run_lines(result.run)])
+
+
+def _view_table(views: Iterable[ViewQuality]) -> list[str]:
+    rows = [("view", "fidelity", "SSIM to ref.", "drop", "PSNR", "of original", "SSIM", "of original")]
+    for view in views:
+        photo = view.photo_error is not None
+        rows.append(
+            (
+                view.name,
+                _decibel(view.fidelity),
+                _similar(view.ssim_original),
+                _decibel(view.drop) if photo else "-",
+                _decibel(view.psnr) if photo else "-",
+                _decibel(view.original_psnr) if photo else "-",
+                _similar(view.ssim_photo),
+                _similar(view.original_ssim),
+            )
+        )
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return [
+        "  ".join(
+            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        )
+        for row in rows
+    ]
+
+
+def render_text(result: RenderResult) -> str:
+    """Summary of a `render`."""
+    lines = [*_scene_lines("scene", result.scene), *_view_lines(result.views)]
+    first = result.files[0] if result.files else "no files"
+    last = f" ... {result.files[-1]}" if len(result.files) > 1 else ""
+    lines.append(_line("wrote", f"{len(result.files)} PNG files: {first}{last}"))
+    lines.append(
+        _line(
+            "time",
+            f"{result.ms_per_view:.1f} ms a view (median); start-up {1000 * result.run.startup_seconds:.0f} ms and "
+            f"kernel compilation {1000 * result.run.compile_seconds:.0f} ms apart",
+        )
+    )
+    return _text([*lines, *_run_lines(result.run)])
+
+
+def score_text(result: ScoreResult) -> str:
+    """Summary of a `score`."""
+    lines = [*_scene_lines("scene", result.scene), *_view_lines(result.views)]
+    unseen = f"; {result.unseen} Gaussians are in none of them" if result.unseen else ""
+    lines.append(_line("scored", f"{result.score}, over {result.scored_views} training poses{unseen}"))
+    lines.append(_line("wrote", result.output))
+    return _text([*lines, *_run_lines(result.run)])
+
+
+def decompress_text(result: DecompressResult) -> str:
+    """Summary of a `decompress`."""
+    lines = _scene_lines("scene", result.scene)
+    lines.append(_line("wrote", f"{result.output}, {result.size} bytes ({format_size(result.size)})"))
+    lines += [_line("note", note) for note in result.notes]
+    return _text([*lines, *_run_lines(result.run)])
+
+
+def _scene_lines(label: str, scene: SceneInfo) -> list[str]:
+    lines = [_line(label, f"{scene.path}: {scene.count} Gaussians, SH degree {scene.sh_degree}")]
+    return lines + [_line("note", note) for note in scene.notes]
+
+
+def _view_lines(views: ViewsInfo | None) -> list[str]:
+    if views is None:
+        return [_line("views", "none")]
+    split = f"{views.total} views of {views.width}x{views.height} ({views.train} training, {views.held_out} held out)"
+    photos = f"photos from {views.images}" if views.images else "no photos"
+    lines = [_line("views", f"{split}; cameras from {views.cameras}, {photos}")]
+    return lines + [_line("note", note) for note in views.notes]
+
+
+def _quality_lines(quality: Quality, where: str) -> list[str]:
+    lines = []
+    if quality.drop is not None:
+        ssim = (
+            ""
+            if quality.ssim_photo is None
+            else f", SSIM {_similar(quality.original_ssim)} -> {_similar(quality.ssim_photo)}"
+        )
+        lines.append(
+            _line(
+                "drop",
+                f"{_decibel(quality.drop)} dB against the photos: PSNR {_decibel(quality.original_psnr)} -> "
+                f"{_decibel(quality.psnr)} dB{ssim} (mean, {where})",
+            )
+        )
+    identical = f", {quality.identical} views identical" if quality.identical and quality.fidelity is not None else ""
+    unit = "" if quality.fidelity is None else " dB"
+    ssim = "" if quality.ssim_original is None else f", SSIM {_similar(quality.ssim_original)}"
+    lines.append(
+        _line(
+            "fidelity",
+            f"{_decibel(quality.fidelity)}{unit} against the original's renders{identical}{ssim}; modelled drop "
+            f"{quality.modelled_drop:.3f} dB from a base of {quality.base_psnr:g} dB (mean, {where})",
+        )
+    )
+    worst = quality.worst
+    if worst is not None:
+        drop = "" if worst.drop is None else f"drop {_decibel(worst.drop)} dB, "
+        lines.append(_line("worst view", f"{worst.name}: {drop}fidelity {_decibel(worst.fidelity)}{unit}"))
+    return lines
+
+
+def _run_lines(run: RunInfo) -> list[str]:
+    stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in run.stages.items())
+    lines = [_line("took", f"{run.seconds:.1f} s ({stages})")]
+    lines.append(_line("memory", f"peak {format_mib(run.peak_memory)} of a limit of {format_mib(run.memory_limit)}"))
+    if run.device is not None:
+        lines.append(_line("device", device_words(run.device)))
+    return lines
+
+
+def device_words(device: dict[str, object]) -> str:
+    """What ran the kernels, in a line."""
+    if device.get("backend") == "numpy":
+        return "NumPy twins (--device numpy): same results as OpenCL, far slower"
+    return f"{device.get('name')} ({device.get('platform')})"
+
+
+def _decibel(value: float | None) -> str:
+    return "identical" if value is None else f"{value:.3f}"
+
+
+def _similar(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"
+
+
+def _line(label: str, text: str) -> str:
+    return f"{label + ':':<12} {text}"
+
+
+def _text(lines: list[str]) -> str:
+    return "\n".join(lines) + "\n"
