@@ -162,7 +162,7 @@ __kernel void blend(
         const int k = b * BLOCK_VECTORS + v;
         FW dx = (lane_x_at(v) + (FW)bx) - mx, dy = (lane_y(v) + (FW)by) - my;
         FW q = fma(fma(ca, dx, cb * dy), dx, (cc * dy) * dy);
-        FW alpha = fmin(fexp2_number(level - fmax(q, (FW)0.0f)), (FW)ALPHA_MAX);
+        FW alpha = smaller(fexp2_number(level - larger(q, (FW)0.0f)), (FW)ALPHA_MAX);
         FW t = trans[k];
         FW next = t * ((FW)1.0f - alpha);
         IW seen = MASK(alpha >= (FW)ALPHA_MIN);

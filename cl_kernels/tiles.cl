@@ -12,18 +12,18 @@ inline void block_spans(__global const float *r, int band, float width, IW *firs
   const FW my = (FW)r[1], hh = (FW)r[10], slope = (FW)r[11];
   FW top = TO_F((LANE_INDEX + (IW)band) * (IW)BLOCK) - my;
   FW slack = fma(hh, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
-  FW low = fmax(top, -(hh + slack)), high = fmin(top + (FW)(BLOCK - 1), hh + slack);
-  FW right_dy = fmin(fmax((FW)r[9], low), high), left_dy = fmin(fmax((FW)-r[9], low), high);
-  FW right_root = sqrt(fmax((FW)r[14] - right_dy * right_dy * (FW)r[12], (FW)0.0f) * (FW)r[13]);
-  FW left_root = sqrt(fmax((FW)r[14] - left_dy * left_dy * (FW)r[12], (FW)0.0f) * (FW)r[13]);
+  FW low = larger(top, -(hh + slack)), high = smaller(top + (FW)(BLOCK - 1), hh + slack);
+  FW right_dy = smaller(larger((FW)r[9], low), high), left_dy = smaller(larger((FW)-r[9], low), high);
+  FW right_root = sqrt(larger((FW)r[14] - right_dy * right_dy * (FW)r[12], (FW)0.0f) * (FW)r[13]);
+  FW left_root = sqrt(larger((FW)r[14] - left_dy * left_dy * (FW)r[12], (FW)0.0f) * (FW)r[13]);
   FW right = fma(slope, right_dy, right_root), left = fma(slope, left_dy, -left_root);
   FW right_slack = fma(fabs(slope * right_dy) + right_root, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
   FW left_slack = fma(fabs(slope * left_dy) + left_root, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
-  FW x0 = fmin(fmax(ceil((FW)r[0] + left - left_slack), (FW)0.0f), (FW)width);
-  FW x1 = fmin(fmax(floor((FW)r[0] + right + right_slack), (FW)-1.0f), (FW)(width - 1.0f));
+  FW x0 = round_up(smaller(larger((FW)r[0] + left - left_slack, (FW)0.0f), (FW)width));
+  FW x1 = round_down(smaller(larger((FW)r[0] + right + right_slack, (FW)-1.0f), (FW)(width - 1.0f)));
   IW some = MASK(low <= high) & MASK(x0 <= x1);
-  *first = picki(some, TO_I(x0) >> 2, (IW)EMPTY_FIRST);
-  *last = picki(some, TO_I(x1) >> 2, (IW)EMPTY_LAST);
+  *first = picki(some, whole(x0) >> 2, (IW)EMPTY_FIRST);
+  *last = picki(some, whole(x1) >> 2, (IW)EMPTY_LAST);
 }
 
 // The 16-bit block mask of a tile: bit 4 * row + column. `first` and `last` are the spans of the tile's four block rows.

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from flexgs_edge.pipeline.options import CompressOptions, ViewOptions
     from flexgs_edge.pipeline.render import render_views
     from flexgs_edge.pipeline.score import score_gaussians
+    from flexgs_edge.pipeline.trim import trim
     from flexgs_edge.progress import Progress
     from flexgs_edge.scene import SceneSource, write_ply
 
@@ -41,6 +42,7 @@ _HOMES = {
     "score_gaussians": "pipeline.score",
     "info": "pipeline.info",
     "verify": "pipeline.info",
+    "trim": "pipeline.trim",
     "list_devices": "device.select",
     "read_scene": "pipeline.inputs",
     "read_cameras": "cameras",
@@ -68,6 +70,7 @@ __all__ = [
     "score_gaussians",
     "info",
     "verify",
+    "trim",
     "list_devices",
     "read_scene",
     "read_cameras",

@@ -128,6 +128,11 @@ class GridScene:
     sh: tuple[np.ndarray, ...]
     layer: np.ndarray
 
+    @property
+    def sh_count(self) -> int:
+        """Rows with SH above degree 0."""
+        return int(np.count_nonzero(self.sh_degrees))
+
     def take(self, rows: np.ndarray) -> GridScene:
         """The rows `rows` (ascending), with the SH degree that is left."""
         rows = np.arange(self.count)[rows]

@@ -122,12 +122,16 @@ def test_the_sample_by_file_and_by_folder() -> None:
     ("name", "words"),
     [
         ("none.json", "no such camera file; supported: INRIA"),
-        ("cameras.bin", "unknown kind of camera file; supported: INRIA"),
-        ("empty", "no cameras.json in this folder; supported: INRIA"),
+        ("cameras.xml", "unknown kind of camera file; supported: INRIA"),
+        ("half", "expected cameras and images, both .bin or both .txt; found cameras.bin only"),
+        ("half/cameras.bin", "found cameras.bin only"),
+        ("empty", "no cameras.json, transforms.json or COLMAP model in this folder; supported: INRIA"),
     ],
 )
 def test_paths_that_are_no_cameras(tmp_path: Path, name: str, words: str) -> None:
-    (tmp_path / "cameras.bin").touch()
-    (tmp_path / "empty").mkdir()
+    for folder in ("half", "empty"):
+        (tmp_path / folder).mkdir()
+    for file in ("half/cameras.bin", "cameras.xml"):
+        (tmp_path / file).touch()
     with pytest.raises(InputError, match=words):
         read_cameras(tmp_path / name)

@@ -37,6 +37,9 @@ CLOSE = 0.03
 EXTRA_STEPS = 3
 """Steps beyond the effort's own while nothing close to the target holds."""
 AIM = -0.01
+"""Excess that steps aim at."""
+NEAREST = 0.1
+"""A new step keeps this share of the interval between its neighbours away from both: curves are not quite smooth."""
 LARGEST_STRIDE = 1.2
 """Largest change of the log of the multiplier between two steps."""
 
@@ -144,6 +147,7 @@ class RateSearch:
         steps: list[RateStep] = []
         best: tuple[RateStep, GridScene] | None = None
         multiplier = self._start(target)
+        self._calibrate(multiplier)
         for count in range(self.effort.steps + EXTRA_STEPS):
             step, grid = self._whole(multiplier, target)
             steps.append(step)
@@ -199,8 +203,13 @@ class RateSearch:
                 break
         return index, keep, degrees
 
-    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
-        started = time.perf_counter()
+    def _calibrate(self, multiplier: float) -> None:
+        """Ask the coder what Gaussians cost near the answer. Once: or every step would search another function."""
+        grid, _ = to_grid(*self._choice(multiplier), self.path.origin)
+        _, self.bits = self.size_of(grid)
+
+    def _choice(self, multiplier: float) -> tuple[dict[str, np.ndarray], np.ndarray, Steps]:
+        """Planes of the Gaussians that this multiplier keeps, their SH degrees, and the grid steps."""
         index, keep, degrees = self._snapshot(multiplier)
         snapshot = self.path.snapshots[index]
         rows = np.flatnonzero(keep)
@@ -208,17 +217,18 @@ class RateSearch:
         planes = drop_bands(take_rows(snapshot.planes, rows), degrees, snapshot.costs.sh_mean[:, :, rows], SH_C0)
         if index not in self._slopes:
             self._slopes[index] = probe_slopes(self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras)
-        steps = choose_steps(self._slopes[index], weight2, degrees, len(snapshot.costs.sh), multiplier)
+        return planes, degrees, choose_steps(self._slopes[index], weight2, degrees, len(snapshot.costs.sh), multiplier)
+
+    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
+        started = time.perf_counter()
+        planes, degrees, steps = self._choice(multiplier)
         grid = self._finish(planes, degrees, steps)
-        size, bits = self.size_of(grid)
-        # The model follows the coder once, near the answer; then it stays, or every step would search another function.
-        if len(self._slopes) == 1 and self.bits == BitModel():
-            self.bits = bits
+        size, _ = self.size_of(grid)
         measurement = self.measure(from_grid(grid))
         excess = target.excess(size, measurement)
         sh_count = int((degrees > 0).sum())
         seconds = time.perf_counter() - started
-        return RateStep(multiplier, len(rows), sh_count, size, measurement, excess, seconds), grid
+        return RateStep(multiplier, len(degrees), sh_count, size, measurement, excess, seconds), grid
 
     def _finish(self, planes: dict[str, np.ndarray], degrees: np.ndarray, steps: Steps) -> GridScene:
         """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
@@ -248,14 +258,17 @@ def _better(step: RateStep, other: RateStep, target: Target) -> bool:
 
 
 def _next_multiplier(steps: Sequence[RateStep], target: Target) -> float:
-    """Where the excess is expected to be just below zero: false position in the logs between the closest points around."""
+    """Where the excess is expected to be just below zero: false position in the logs, kept away from points already asked."""
     slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
-    points = [(math.log(s.multiplier), s.excess) for s in steps]
-    low = max((p for p in points if p[1] <= 0), key=lambda p: p[1], default=None)
-    high = min((p for p in points if p[1] > 0), key=lambda p: p[1], default=None)
-    if low and high and (high[1] - low[1]) / (high[0] - low[0] or 1e-12) * slope > 0:
-        at = low[0] + (AIM - low[1]) * (high[0] - low[0]) / (high[1] - low[1])
-        return math.exp(at)
-    nearest = min(points, key=lambda p: abs(p[1]))
-    stride = (AIM - nearest[1]) / slope
-    return math.exp(nearest[0] + max(-LARGEST_STRIDE, min(LARGEST_STRIDE, stride)))
+    points = sorted((math.log(s.multiplier), s.excess) for s in steps)
+    if slope < 0:
+        points.reverse()
+    # In the order of rising excess: the last point that holds before the first one that misses.
+    first_miss = next((i for i, (_, excess) in enumerate(points) if excess > 0), len(points))
+    if 0 < first_miss < len(points):
+        (low, below), (high, above) = points[first_miss - 1], points[first_miss]
+        part = (AIM - below) / (above - below)
+        return math.exp(low + (high - low) * min(max(part, NEAREST), 1 - NEAREST))
+    edge, excess = points[-1] if first_miss else points[0]
+    stride = (AIM - excess) / slope
+    return math.exp(edge + max(-LARGEST_STRIDE, min(LARGEST_STRIDE, stride)))

@@ -31,6 +31,8 @@ class Camera:
         Focal lengths, pixels.
     cx, cy : float
         Principal point, pixels, integer pixel centres: (W - 1) / 2 is the middle.
+    distortion : str, optional
+        The lens distortion that was left out: the pose is good for scores, but photos of this camera do not match its renders.
     """
 
     name: str
@@ -42,6 +44,7 @@ class Camera:
     fy: float
     cx: float
     cy: float
+    distortion: str | None = None
 
     def __post_init__(self) -> None:
         for field, shape in (("rotation", (3, 3)), ("translation", (3,))):

@@ -72,8 +72,14 @@ class Photos:
             When the folder or a photo is missing or damaged, or sizes do not match the cameras.
         """
         folder = Path(images_dir)
+        bent = next((camera for camera in cameras if camera.distortion), None)
+        if bent is not None:
+            raise InputError(
+                f"{folder}: photos cannot be compared: camera {bent.name!r} has lens distortion ({bent.distortion}), "
+                "which was ignored; undistort photos and cameras, or leave the photos out (--images none)"
+            )
         paths = _match(folder, cameras)
-        sizes = [_size(path) for path in paths]
+        sizes = [photo_size(path) for path in paths]
         scaled, note = _scale_to(sizes, paths, cameras)
         notes: tuple[str, ...] = () if note is None else (note,)
         if max_width is not None:
@@ -146,7 +152,7 @@ def _match(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
     return found
 
 
-def _size(path: Path) -> Size:
+def photo_size(path: Path) -> Size:
     """Size from the file's header; nothing is decoded."""
     from PIL import Image
 

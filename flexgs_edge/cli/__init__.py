@@ -20,6 +20,7 @@ COMMANDS = {
     "compress": "Compress a scene to the fewest bytes that hold a quality, or the best quality in a size.",
     "decompress": "Decode a .fgs file to a PLY that every viewer opens.",
     "info": "Show what a scene file holds: counts, bits and bytes of every channel, settings.",
+    "trim": "Cut a layered .fgs file to a size, at the speed of copying.",
     "verify": "Check every byte of a .fgs file against its checksums.",
     "render": "Draw views of a scene as PNG files, and time them.",
     "evaluate": "Measure what a scene lost against another: PSNR, SSIM, fidelity and drop of every view.",

@@ -15,9 +15,9 @@ from flexgs_edge.cli import words
 def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
     r"""Show what a scene file holds.
 
-    For a .fgs: Gaussians, SH degree, bits and bytes of every channel, the settings it was made with and the target it
-    reached. Only the header is read; use verify to check the rest. For a .ply or a model folder: counts, and what
-    lies beside it.
+    For a .fgs: Gaussians, SH degree, bits and bytes of every channel and SH degree, layers, the settings it was made with
+    and the target it reached (files of --method best are decoded for this; use verify to check every byte). For a .ply or a
+    model folder: counts, and what lies beside it.
 
     \b
     Examples:

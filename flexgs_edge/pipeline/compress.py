@@ -90,7 +90,7 @@ def compress(
             None if plan.computes_scores or not plan.needs_scores else load_scores(options.score, scene.source.count)
         )
     with ExitStack() as stack:
-        workspace = stack.enter_context(Workspace(options, budget, clock)) if views is not None else None
+        workspace = stack.enter_context(Workspace(options, budget, clock, views.cameras)) if views is not None else None
         job = _Job(options, scene, views, plan, budget, clock, workspace, progress)
         return job.run(target_path, scores)
 

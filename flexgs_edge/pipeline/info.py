@@ -7,11 +7,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flexgs_edge._version import __version__
 from flexgs_edge.budget import format_size
-from flexgs_edge.codec.container import Section, read_header
-from flexgs_edge.codec.container import verify as verify_container
-from flexgs_edge.codec.layout import Header
+from flexgs_edge.codec import channel_bytes, read_header
+from flexgs_edge.codec import verify as verify_container
+from flexgs_edge.codec.container2 import GridContainer
+from flexgs_edge.codec.layout import Header, Section
+from flexgs_edge.codec.layout2 import GridHeader
 from flexgs_edge.errors import InputError
 from flexgs_edge.quantize import array_bytes
 from flexgs_edge.scene import FIELDS, SceneSource, find_companions, inria_dtype, open_scene
@@ -23,16 +27,18 @@ def info(path: str | Path) -> dict[str, Any]:
     Parameters
     ----------
     path : path
-        A `.fgs` (only its header is read), a `.ply` or a model folder.
+        A `.fgs` (of version 1 only the header is read; version 2 is decoded, since entropy coding shares the bytes out), a
+        `.ply` or a model folder.
     """
     place = Path(path)
     if place.suffix.lower() == ".fgs" and place.is_file():
-        return _fgs_info(place, read_header(place))
+        header = read_header(place)
+        return _packed_info(place, header) if isinstance(header, Header) else _grid_info(place)
     return _scene_info(place, open_scene(place))
 
 
-def _fgs_info(path: Path, header: Header) -> dict[str, Any]:
-    size = os.stat(path).st_size
+def _packed_info(path: Path, header: Header) -> dict[str, Any]:
+    """A file of version 1: bit-packed arrays, whose bytes follow from the header."""
     channels: dict[str, dict[str, Any]] = {}
     for field in FIELDS:
         rows, width, bits = header.rows(field.name), header.width(field.name), header.bits.of(field.name)
@@ -48,6 +54,54 @@ def _fgs_info(path: Path, header: Header) -> dict[str, Any]:
             "bytes": total,
             "bytes_per_channel": total // width if width else 0,
         }
+    return _fgs_record(path, header, 1, header.sh_count, channels)
+
+
+def _grid_info(path: Path) -> dict[str, Any]:
+    """A file of version 2: what each channel takes is known once its symbols have been decoded."""
+    container = GridContainer(path)
+    header, model, entries = container.header, container.read_model(), container.read_table()
+    rows_of_degree = np.zeros(header.sh_degree + 1, np.int64)
+    layers = [{"rows": rows, "bytes": 0} for rows in header.layers]
+    for chunk, entry in zip(header.chunks(), entries, strict=True):
+        degrees = container.decode(model, chunk, entry, base_only=True).base["sh degree"]
+        rows_of_degree += [int(np.count_nonzero(degrees >= degree)) for degree in range(header.sh_degree + 1)]
+        layers[chunk.layer]["bytes"] += entry.section.length
+    taken = channel_bytes(path)
+    channels = {}
+    for name, parts in _grid_parts(header.sh_degree).items():
+        degree = int(name.split()[1]) if name.startswith("sh ") and name != "sh degree" else 0
+        rows, total = int(rows_of_degree[degree]), sum(taken[part] for part in parts)
+        channels[name] = {
+            "rows": rows,
+            "step": header.steps["sh"][degree - 1] if degree else header.steps.get(name),
+            "bytes": round(total),
+            "bits_per_row": round(8 * total / rows, 3) if rows else None,
+            "bits_per_gaussian": round(8 * total / header.count, 3) if header.count else None,
+        }
+    sh_count = int(rows_of_degree[1]) if header.sh_degree else 0
+    return {
+        **_fgs_record(path, header, 2, sh_count, channels),
+        "chroma": header.steps["chroma"],
+        "model_bytes": round(taken["model"]),
+        "layers": layers,
+        "cut_from": header.cut_from,
+    }
+
+
+def _grid_parts(sh_degree: int) -> dict[str, tuple[str, ...]]:
+    """Kinds of value of version 2, and the coder's channels that make them up."""
+    parts: dict[str, tuple[str, ...]] = {"position": ("position", "repeats")}
+    parts |= {name: tuple(f"{name} {axis}" for axis in "xyz") for name in ("scale", "rotation")}
+    parts |= {"opacity": ("opacity",), "dc": ("dc Y", "dc Co", "dc Cg"), "sh degree": ("sh degree",)}
+    return parts | {f"sh {d}": tuple(f"sh {d} {c}" for c in ("Y", "Co", "Cg")) for d in range(1, sh_degree + 1)}
+
+
+def _fgs_record(
+    path: Path, header: Header | GridHeader, version: int, sh_count: int, channels: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
+    """What files of both versions tell."""
+    size = os.stat(path).st_size
     settings = dict(header.settings)
     count, degree = settings.get("source_count"), settings.get("source_sh_degree")
     known = isinstance(count, int) and isinstance(degree, int) and 0 <= degree <= 4
@@ -57,9 +111,10 @@ def _fgs_info(path: Path, header: Header) -> dict[str, Any]:
         "command": "info",
         "path": os.fspath(path),
         "format": "fgs",
+        "version": version,
         "size": size,
         "count": header.count,
-        "sh_count": header.sh_count,
+        "sh_count": sh_count,
         "sh_degree": header.sh_degree,
         "origin": list(header.origin),
         "bits_per_gaussian": round(8 * size / header.count, 3) if header.count else None,
@@ -95,34 +150,78 @@ def _scene_info(path: Path, source: SceneSource) -> dict[str, Any]:
 
 def info_text(found: dict[str, Any]) -> str:
     """The text of what `info` found."""
-    lines = [f"{found['path']}: {found['format']}, {found['size']} bytes ({format_size(found['size'])})"]
+    version = f" version {found['version']}" if "version" in found else ""
+    lines = [f"{found['path']}: {found['format']}{version}, {found['size']} bytes ({format_size(found['size'])})"]
     with_sh = f", {found['sh_count']} of them with SH" if found["format"] == "fgs" else ""
     lines.append(f"Gaussians:   {found['count']}{with_sh}, SH degree {found['sh_degree']}")
     if found.get("ratio"):
         of = f"of the original's PLY, {format_size(found['source_ply_bytes'])}"
-        lines.append(f"ratio:       {found['ratio']:.2f}x {of}; {found['bits_per_gaussian']:.1f} bits a Gaussian kept")
+        each = f"; {found['bits_per_gaussian']:.1f} bits a Gaussian kept" if found["count"] else ""
+        lines.append(f"ratio:       {found['ratio']:.2f}x {of}{each}")
     if any(found["origin"]):
         lines.append("origin:      " + ", ".join(f"{value:g}" for value in found["origin"]))
     for word in ("cameras", "images"):
         if word in found:
             lines.append(f"{word + ':':<12} {found[word] or 'none beside it'}")
     lines += [f"note:        {note}" for note in found["notes"]]
+    lines += _layer_lines(found)
     if "channels" in found:
-        lines += ["", *_channel_table(found["channels"]), f"headers and checksums: {found['overhead_bytes']} bytes"]
+        lines += ["", *_channel_table(found["channels"], found["version"])]
+        if "chroma" in found:
+            lines.append(f"steps of dc and sh are those of luma; of chroma, {found['chroma']:g} times as much")
+        lines.append(_overhead_line(found))
         lines += ["", "settings:", *_settings_lines(found["settings"])]
     return "\n".join(lines) + "\n"
 
 
-def _channel_table(channels: dict[str, dict[str, Any]]) -> list[str]:
-    rows = [("attribute", "channels", "rows", "bits", "groups", "bytes a channel", "ranges", "bytes")]
+def _layer_lines(found: dict[str, Any]) -> list[str]:
+    lines = []
+    if len(found.get("layers", ())) > 1:
+        parts = (f"{layer['rows']} in {layer['bytes']} bytes" for layer in found["layers"])
+        lines.append(f"layers:      {len(found['layers'])} (Gaussians: {', '.join(parts)}); see flexgs-edge trim")
+    if found.get("cut_from"):
+        cut = found["cut_from"]
+        lines.append(f"cut from:    {cut['bytes']} bytes, {cut['count']} Gaussians in {cut['layers']} layers")
+    return lines
+
+
+def _overhead_line(found: dict[str, Any]) -> str:
+    model = f" (of these the coder's tables: {found['model_bytes']})" if "model_bytes" in found else ""
+    return f"headers and checksums: {found['overhead_bytes']} bytes{model}"
+
+
+_PACKED_COLUMNS = {
+    "channels": "channels",
+    "rows": "rows",
+    "bits": "bits",
+    "groups": "groups",
+    "bytes a channel": "bytes_per_channel",
+    "ranges": "range_bytes",
+    "bytes": "bytes",
+}
+_GRID_COLUMNS = {
+    "rows": "rows",
+    "step": "step",
+    "bits a row": "bits_per_row",
+    "bits a Gaussian": "bits_per_gaussian",
+    "bytes": "bytes",
+}
+
+
+def _channel_table(channels: dict[str, dict[str, Any]], version: int) -> list[str]:
+    columns = _PACKED_COLUMNS if version == 1 else _GRID_COLUMNS
+    rows = [("attribute", *columns)]
     for name, item in channels.items():
-        words = ("channels", "rows", "bits", "groups", "bytes_per_channel", "range_bytes", "bytes")
-        rows.append((name, *(str(item[word]) for word in words)))  # type: ignore[arg-type]
+        rows.append((name, *(_cell(item[word]) for word in columns.values())))
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return [
         "  ".join([row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))])
         for row in rows
     ]
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _settings_lines(settings: dict[str, Any]) -> list[str]:

@@ -18,8 +18,8 @@ from flexgs_edge.scene.source import SceneSource
 CHUNK_ROWS = 1 << 18
 """Most rows of a chunk: 60 MB of planes at SH degree 3, large enough that launches cost nothing."""
 MIN_CHUNK_ROWS = 1 << 10
-VIEW_BYTES = 64 + 4 + 4 + 4 * 4
-"""Bytes a row that a view needs beside the scene: record, key, bound, and the sort's two pairs of buffers."""
+VIEW_BYTES = 64 + 4 + 4 + 4 * 4 + 12
+"""Bytes a row that a view needs beside the scene: record, key, bound, the sort's two pairs of buffers, and sums."""
 
 
 def plane_bytes(sh_degree: int) -> int:
@@ -149,9 +149,13 @@ class DeviceScene:
     planes : SourcePlanes or QuantizedPlanes
         Asked for each chunk once when the scene fits into the budget, once a view when it does not.
     budget : MemoryBudget
+    reserve : int
+        Bytes that the views' own buffers will need.
     """
 
-    def __init__(self, backend: Backend, planes: SourcePlanes | QuantizedPlanes, budget: MemoryBudget) -> None:
+    def __init__(
+        self, backend: Backend, planes: SourcePlanes | QuantizedPlanes, budget: MemoryBudget, reserve: int = 0
+    ) -> None:
         self.backend = backend
         self.count = planes.count
         self.sh_degree = planes.sh_degree if planes.sh_count else 0
@@ -161,7 +165,7 @@ class DeviceScene:
         self._resident: list[Chunk] = []
         activated, on_top = plane_bytes(planes.sh_degree), planes.upload_bytes
         sh_less = plane_bytes(0)
-        view = VIEW_BYTES * self.count
+        view = VIEW_BYTES * self.count + reserve
         whole = planes.sh_count * activated + (self.count - planes.sh_count) * sh_less + view
         most = min(CHUNK_ROWS, max(self.count, 1))
         least = min(MIN_CHUNK_ROWS, most)

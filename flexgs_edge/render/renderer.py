@@ -22,6 +22,8 @@ SORT_DIGITS = 1 << SORT_DIGIT_BITS
 PAIR_BYTES = 8
 DEFAULT_PAIRS = 1 << 22
 """Pairs of a batch when memory allows: 32 MiB, one batch for most views."""
+SUM_BYTES = 12
+"""Bytes a row of hits and one fixed-point sum."""
 EXTENTS = ("exact", "inria")
 
 
@@ -101,7 +103,9 @@ class _ViewBuffers:
             self.state = array((self.tiles, 4, TILE * TILE), np.float32)
             self.image = array((3, self.padded_height, self.padded_width), np.float32)
             # One splat may touch every tile, so no batch can be smaller than that.
-            self.capacity = budget.rows("the tile lists", PAIR_BYTES, 0, minimum=self.tiles, most=max(DEFAULT_PAIRS, self.tiles))
+            # The sums of a scoring pass come after this buffer, so their room is kept free.
+            most = max(DEFAULT_PAIRS, self.tiles)
+            self.capacity = budget.rows("the tile lists", PAIR_BYTES, SUM_BYTES * count, minimum=self.tiles, most=most)
             self.pairs = array((self.capacity, 2), np.uint32)
         except BaseException:
             self.release()
@@ -164,6 +168,7 @@ class Renderer:
         self.inria_extent = int(extent == "inria")
         self.splats_shown = 0
         self._buffers: _ViewBuffers | None = None
+        self._reserve = 0
 
     @property
     def camera_array(self) -> Any:
@@ -171,15 +176,21 @@ class Renderer:
         assert self._buffers is not None
         return self._buffers.camera
 
+    def expect(self, cameras: Sequence[Camera]) -> None:
+        """Tell the largest view that is to come: scenes loaded from now on leave its buffers room."""
+        tiles = max((-(-c.width // TILE) * -(-c.height // TILE) for c in cameras), default=0)
+        blocks = self.backend.tile_blocks
+        self._reserve = tiles * (TILE * TILE * (4 + 3) * 4 + 4 * blocks + PAIR_BYTES) + 4 * SORT_DIGITS * self.backend.sort_blocks
+
     def load(self, source: SceneSource) -> DeviceScene:
         """Bring a scene to the backend (all of it, or chunk by chunk for each view when it does not fit)."""
         self.release()
-        return DeviceScene(self.backend, SourcePlanes(self.backend, source), self.budget)
+        return DeviceScene(self.backend, SourcePlanes(self.backend, source), self.budget, self._reserve)
 
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
         """Bring a quantized scene to the backend, dequantized there."""
         self.release()
-        return DeviceScene(self.backend, QuantizedPlanes(self.backend, quantized), self.budget)
+        return DeviceScene(self.backend, QuantizedPlanes(self.backend, quantized), self.budget, self._reserve)
 
     def render(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
         """The image of `scene` from `camera` (world coordinates).

@@ -34,8 +34,12 @@ def compress_text(result: CompressResult) -> str:
     )
     share = f"{result.count} of {result.scene.count} Gaussians, {result.sh_count} of them with SH"
     lines.append(_line("kept", f"{share} (prune rate {result.prune_rate:g}, SH rate {result.sh_rate:g})"))
-    bits = " ".join(f"{name}={bits}" for name, bits in result.bits.items())
-    lines.append(_line("bits", bits + (" (found by sensitivity)" if result.sensitivity else "")))
+    if result.steps is not None:
+        steps = (f"{name} {value:.3g}" for name, value in result.steps.items() if not isinstance(value, list))
+        lines.append(_line("grid steps", ", ".join(steps)))
+    else:
+        bits = " ".join(f"{name}={bits}" for name, bits in result.bits.items())
+        lines.append(_line("bits", bits + (" (found by sensitivity)" if result.sensitivity else "")))
     lines += _decision_lines(result)
     if result.quality is not None:
         decoded = "decoded file" if result.output else "as it would decode"

@@ -39,7 +39,9 @@ def open_scene(path: str | os.PathLike[str]) -> SceneSource:
         return PlySource(latest_iteration(place))
     if not place.exists():
         raise InputError(f"{path}: no such file or folder; {supported}")
-    opener = _READERS.get(place.suffix.lower())
+    # The longest suffix wins: .compressed.ply is another format than .ply.
+    suffixes = [suffix for suffix in _READERS if place.name.lower().endswith(suffix) and place.suffix]
+    opener = _READERS[max(suffixes, key=len)] if suffixes else None
     if opener is None:
         raise InputError(f"{path}: unknown kind of scene {place.suffix!r}; {supported}")
     return opener(place)

@@ -1,0 +1,1 @@
+"""Measurements of speed, memory and of the tests themselves; see README.md."""

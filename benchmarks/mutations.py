@@ -1,0 +1,260 @@
+"""Plants one fault at a time in a copy of the kernels and shows which test turns red.
+
+    python -m benchmarks.mutations                    # all, and writes docs/mutations.md
+    python -m benchmarks.mutations --only conic -v    # those whose name holds a word; writes nothing
+
+The twins stay as they are, so that the comparison with them sees every fault by construction. What counts is the first
+column: tests against the float64 reference, which knows neither kernels nor twins.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.harness import ROOT, SCENES
+
+TABLE = ROOT / "docs" / "mutations.md"
+REFERENCE = ("tests/test_render_reference.py", "tests/test_score.py", "tests/test_kernels_dequantize.py")
+TWINS = ("tests/test_kernels_twins.py", "tests/test_kernels_arithmetic.py")
+GOLDEN = ("tests/test_golden_fox.py",)
+SURVIVED = "survived"
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """One fault.
+
+    Parameters
+    ----------
+    name : str
+        What is wrong, for the table.
+    file : str
+        The kernel file.
+    old, new : str
+        Text to replace, everywhere in the file (it must be there).
+    form : str
+        Which form of the kernels the tests run on: `w16` or `gpu`.
+    reference : bool
+        Whether the reference can see it (some faults only break the equality of bits between forms).
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    form: str = "w16"
+    reference: bool = True
+
+
+def constant(name: str, literal: str, words: str) -> Mutation:
+    """A wrong constant: defined again in front of everything else."""
+    first_line = "#pragma OPENCL FP_CONTRACT OFF\n"
+    return Mutation(words, "common.clh", first_line, f"{first_line}#undef {name}\n#define {name} {literal}\n")
+
+
+MUTATIONS = (
+    Mutation("sign of the conic's B", "project.cl", "out[3] = -(b + b) * k", "out[3] = (b + b) * k"),
+    Mutation("sign of the span's slope", "project.cl", "out[11] = b * ic", "out[11] = -b * ic"),
+    Mutation("sign of where the ellipse turns", "project.cl", "out[9] = (b / a)", "out[9] = -(b / a)"),
+    Mutation("half width from the wrong axis", "project.cl", "half_width = sqrt(t2 * a)", "half_width = sqrt(t2 * c)"),
+    constant("DILATION", "0.0f", "no +0.3"),
+    constant("DILATION", "0.25f", "+0.25 for +0.3"),
+    constant("ALPHA_MAX", "1.0f", "no cap of alpha at 0.99"),
+    constant("ALPHA_MAX", "0.98f", "cap of alpha at 0.98"),
+    constant("ALPHA_MIN", "(1.0f / 256.0f)", "1/256 for 1/255"),
+    constant("ALPHA_MIN", "(1.0f / 250.0f)", "1/250 for 1/255"),
+    constant("TRANSMITTANCE_MIN", "1e-3f", "pixels end at 1e-3"),
+    constant("TRANSMITTANCE_MIN", "1e-5f", "pixels end at 1e-5"),
+    constant("EXTENT_SLACK", "-0.01f", "ellipse too small"),
+    constant("EXP2_POLY_5", "0.0f", "exp2 of degree 4"),
+    constant("SIGMA_RADIUS_INRIA", "2.5f", "2.5 sigma for --extent inria"),
+    Mutation("no Jacobian clamp in x", "project.cl", "uc = fmin(fmax(u, CAM(17)), CAM(18))", "uc = u"),
+    Mutation("no Jacobian clamp in y", "project.cl", "vc = fmin(fmax(v, CAM(19)), CAM(20))", "vc = v"),
+    Mutation("clamp moved by half a pixel", "project.cl", "fmax(u, CAM(17))", "fmax(u, CAM(17) + (FW)0.5f / CAM(12))"),
+    Mutation("principal point off by half a pixel", "project.cl", "u, CAM(14))", "u, CAM(14) + (FW)0.5f)"),
+    Mutation("focal length of x used for y", "project.cl", "fma(CAM(13), v", "fma(CAM(12), v"),
+    Mutation("sign in SH of degree 1", "sh.clh", "BAND(0, (FW)-SH_C1 * y)", "BAND(0, (FW)SH_C1 * y)"),
+    Mutation("sign in SH of degree 3", "sh.clh", "BAND(11, (FW)SH_C3_3", "BAND(11, (FW)-SH_C3_3"),
+    Mutation(
+        "SH looked up in the opposite direction", "sh.clh", "dx = px - (FW)camera[21]", "dx = (FW)camera[21] - px"
+    ),
+    Mutation("colours below 0 kept", "project.cl", "return fmax(c + (FW)0.5f, (FW)0.0f)", "return c + (FW)0.5f"),
+    Mutation("depth order reversed", "project.cl", "as_uint(key_lanes[l]) :", "~as_uint(key_lanes[l]) :"),
+    Mutation(
+        "ties of depth in reversed order",
+        "sort.cl",
+        "for (uint i = start; i < end; ++i) {\n    const uint key = keys[i];\n    if",
+        "for (uint j = start; j < end; ++j) {\n    const uint i = end - 1 - (j - start);\n    const uint key = keys[i];\n    if",
+    ),
+    Mutation("no near plane", "project.cl", "MASK(z > CAM(16))", "MASK(z > (FW)0.0f)"),
+    Mutation("near plane itself is drawn", "project.cl", "MASK(z > CAM(16))", "MASK(z >= CAM(16))"),
+    Mutation("no opacity cull", "activate.cl", "pick(MASK(opacity >= (FW)ALPHA_MIN), level, (FW)-INFINITY)", "level"),
+    Mutation(
+        "quaternions not normalised",
+        "activate.cl",
+        "inv = (FW)1.0f / sqrt(fma(z, z, fma(y, y, fma(x, x, w * w))))",
+        "inv = (FW)1.0f",
+    ),
+    Mutation("determinant not checked", "project.cl", "MASK(det < (FW)INFINITY)", "MASK(det == det)"),
+    Mutation(
+        "hit counted on the splat that ends",
+        "blend_cpu.cl",
+        "hit_sum[v] += hit;",
+        "hit_sum[v] += seen & MASK(t > (FW)0.0f);",
+    ),
+    Mutation("ended pixels go on", "blend_cpu.cl", "pick(seen, -fabs(t), t)", "t"),
+    Mutation(
+        "the splat that ends is blended",
+        "blend_cpu.cl",
+        "hit = seen & MASK(next >= (FW)TRANSMITTANCE_MIN)",
+        "hit = seen & MASK(t > (FW)0.0f)",
+    ),
+    Mutation(
+        "background without transmittance",
+        "blend_cpu.cl",
+        "fma(t, (FW)background_g, green[k])",
+        "green[k] + (FW)background_g",
+    ),
+    Mutation("no background", "blend_cpu.cl", "fma(t, (FW)background_r, red[k])", "red[k]"),
+    Mutation(
+        "fused multiply-add in dequantize", "dequantize.cl", "lo + (float)plane[i] * by", "fma((float)plane[i], by, lo)"
+    ),
+    Mutation(
+        "fused multiply-add in dequantize, odd widths",
+        "dequantize.cl",
+        "lo + (float)((window >> (bit & 7)) & keep) * by",
+        "fma((float)((window >> (bit & 7)) & keep), by, lo)",
+    ),
+    Mutation(
+        "groups one row too long",
+        "dequantize.cl",
+        "(uint)((group + 1) * count / groups))",
+        "(uint)((group + 1) * count / groups) + 1)",
+    ),
+    Mutation("contraction left to the compiler", "common.clh", "#pragma OPENCL FP_CONTRACT OFF\n", "", reference=False),
+    Mutation(
+        "sums in another order",
+        "blend_cpu.cl",
+        "(f.s0 + f.s2) + (f.s1 + f.s3)",
+        "(f.s0 + f.s1) + (f.s2 + f.s3)",
+        reference=False,
+    ),
+    Mutation(
+        "GPU form: hit counted on the splat that ends",
+        "blend_gpu.cl",
+        "if (hit) atomic_inc",
+        "if (hit || t < 0.0f) atomic_inc",
+        "gpu",
+    ),
+    Mutation("GPU form: ended pixels go on", "blend_gpu.cl", "seen ? -fabs(t) : t", "t", "gpu"),
+    Mutation("GPU form: no background", "blend_gpu.cl", "fma(fabs(t), background_r, red)", "red", "gpu"),
+)
+
+
+def kernel_folder(parent: Path, mutation: Mutation | None) -> Path:
+    """A copy of the kernels with the fault in it (or none); raises when its text is not there any more."""
+    folder = parent / "cl_kernels"
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(ROOT / "cl_kernels", folder, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
+    if mutation is not None:
+        path = folder / mutation.file
+        text = path.read_text()
+        if mutation.old not in text:
+            raise LookupError(
+                f"{mutation.name}: {mutation.file} has no text {mutation.old!r}: bring the mutation up to date"
+            )
+        path.write_text(text.replace(mutation.old, mutation.new))
+    return folder
+
+
+@contextmanager
+def workplace() -> Iterator[Path]:
+    """A temporary folder for kernels and the compiler's cache."""
+    with tempfile.TemporaryDirectory(prefix="mutations-") as name:
+        yield Path(name)
+
+
+def run_tests(place: Path, files: tuple[str, ...], keywords: str) -> str | None:
+    """The first test that fails on the kernels in `place`, or None."""
+    environment = {**os.environ, "FLEXGS_KERNEL_DIR": str(place / "cl_kernels"), "POCL_CACHE_DIR": str(place / "pocl")}
+    there = [file for file in files if (ROOT / file).is_file()]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--no-cov", "-k", keywords, *there]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    failed = re.search(r"^(?:FAILED|ERROR) tests/(\S+)", done.stdout, re.MULTILINE)
+    if done.returncode not in (0, 1) or (done.returncode == 1 and not failed):
+        raise RuntimeError(f"pytest ended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+    return failed.group(1) if failed else None
+
+
+def judge(place: Path, mutation: Mutation | None, verbose: bool = False) -> tuple[str | None, ...]:
+    """First red test against the reference, the twins and the golden renders."""
+    kernel_folder(place, mutation)
+    form = mutation.form if mutation else "w16 or gpu"
+    found = tuple(
+        run_tests(place, files, keywords)
+        for files, keywords in ((REFERENCE, form), (TWINS, form), (GOLDEN, "images or statistics"))
+    )
+    if verbose:
+        print(f"{mutation.name if mutation else 'no fault'}: {found}", flush=True)
+    return found
+
+
+def table(rows: list[tuple[Mutation, tuple[str | None, ...]]]) -> str:
+    """The page."""
+    lines = [
+        "# Planted faults",
+        "",
+        "Each row is one fault planted in a copy of the OpenCL kernels, and the first test that turned red: against the",
+        "float64 reference of the tests, against the NumPy twins (which are left as they are), and against the golden",
+        "renders of the fox scene. Made by `python -m benchmarks.mutations`; three of the rows run with every test run",
+        "(`tests/test_kernels_mutations.py`), and so does the check that the text of all of them is still in the kernels.",
+        "",
+        "| planted fault | against the float64 reference | against the twins | fox goldens |",
+        "|---|---|---|---|",
+    ]
+    for mutation, (reference, twins, golden) in rows:
+        first = f"`{reference}`" if reference else "not a matter of value" if not mutation.reference else SURVIVED
+        second = f"`{twins}`" if twins else SURVIVED
+        lines.append(f"| {mutation.name} | {first} | {second} | {'red' if golden else 'within limits'} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    """Run the mutations; 1 when one survives."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", metavar="WORD", help="mutations whose name holds this word; the page is not written")
+    parser.add_argument("-v", "--verbose", action="store_true", help="a line for each mutation as it is done")
+    options = parser.parse_args()
+    if not options.only and not (SCENES["fox"] / "golden.npz").is_file():
+        parser.error(
+            f"the page has a column for the fox scene, and there is none at {SCENES['fox']}: set FLEXGS_SCENES"
+        )
+    chosen = [mutation for mutation in MUTATIONS if not options.only or options.only in mutation.name]
+    with workplace() as place:
+        healthy = judge(place, None)
+        if any(healthy):
+            print(f"the tests fail on the kernels as they are: {healthy}", file=sys.stderr)
+            return 2
+        rows = [(mutation, judge(place, mutation, options.verbose)) for mutation in chosen]
+    page = table(rows)
+    if options.only:
+        print(page)
+    else:
+        TABLE.write_text(page)
+    survivors = [m.name for m, found in rows if not found[1] or (m.reference and not found[0])]
+    print(f"{len(rows)} faults, {len(survivors)} survived" + "".join(f"\n  {name}" for name in survivors))
+    return 1 if survivors else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

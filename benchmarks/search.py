@@ -1,0 +1,70 @@
+"""One step of the search: prune, quantize, dequantize, render the held-out views, compare with renders and photos.
+
+python -m benchmarks.search [--scene fox|sample] [--device SPEC] [--repeats N]
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+
+import numpy as np
+
+from benchmarks.harness import SCENES, Bench, backend_of, check, parse
+from flexgs_edge.bitspec import PAPER
+from flexgs_edge.pipeline.evaluator import SceneEvaluator
+from flexgs_edge.pipeline.inputs import find_views, load_scene, resolve_drawing
+from flexgs_edge.pipeline.judge import Judge
+from flexgs_edge.pipeline.options import ViewOptions
+from flexgs_edge.prune import Choice, nonzero_sh, order_from_scores
+from flexgs_edge.quantize import quantized_bytes
+from flexgs_edge.render import Renderer
+from flexgs_edge.scene import find_companions
+
+CHOICE = Choice(400, 400)
+"""Where the search begins: 40 % of the Gaussians pruned, a further 40 % without SH."""
+PARTS = ("prune and quantize", "load and dequantize", "render and compare")
+
+
+def main() -> None:
+    options = parse(__doc__, repeats=5)
+    backend, budget = backend_of(options)
+    bench = Bench(backend.name, options.repeats)
+    path = SCENES[options.scene] / "point_cloud.ply"
+    scene, companions = load_scene(path), find_companions(path)
+    views = find_views(resolve_drawing(ViewOptions(), scene, companions), companions)
+    assert views is not None
+    renderer = Renderer(backend, budget)
+    judge = Judge(renderer, scene.source, views, views.held_out, budget)
+    with renderer.load(scene.source) as original:
+        judge.prepare(original)
+    # Which Gaussians go does not change the cost of a step much: by opacity and volume will do.
+    stored = scene.source.read(slice(0, scene.source.count), ["log_scales", "opacity_logits"])
+    scores = stored["opacity_logits"][0] + 0.1 * stored["log_scales"].sum(axis=0)
+    order = order_from_scores(scores.astype(np.float64))
+    evaluator = SceneEvaluator(scene.source, order, nonzero_sh(scene.source), PAPER, None, renderer, judge, budget)
+    measured = evaluator.measure(CHOICE)
+    check(measured.fidelity is not None and 15 < measured.fidelity < 60, f"fidelity {measured.fidelity}")
+    with evaluator.quantized(CHOICE) as quantized:
+        bits = quantized_bytes(quantized.count, quantized.sh_count, quantized.sh_degree, PAPER)
+        check(sum(array.nbytes for array in quantized.arrays.values()) == bits, "bytes as predicted")
+
+    note = f"{len(views.held_out)} held-out views" + (" with photos" if views.photos else "") + ", kernels built before"
+    bench.time("search step", lambda: evaluator.measure(CHOICE), "s", 1, note)
+    parts: dict[str, list[float]] = defaultdict(list)
+    for _ in range(options.repeats):
+        marks = [time.perf_counter()]
+        with evaluator.quantized(CHOICE) as quantized:
+            marks.append(time.perf_counter())
+            with renderer.load_quantized(quantized) as loaded:
+                marks.append(time.perf_counter())
+                judge.compare(loaded)
+                marks.append(time.perf_counter())
+        for name, start, stop in zip(PARTS, marks, marks[1:]):
+            parts[name].append(stop - start)
+    for name, seconds in parts.items():
+        bench.add(f"search step: {name}", seconds, "s")
+
+
+if __name__ == "__main__":
+    main()

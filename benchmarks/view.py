@@ -1,0 +1,142 @@
+"""Views: ms by stage and ns by tile pair, hit counting over the training views, and the first image of a process.
+
+python -m benchmarks.view [--scene fox|sample] [--device SPEC] [--repeats N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections import defaultdict
+
+import numpy as np
+
+from benchmarks.harness import SCENES, Bench, backend_of, check, parse, run_module
+from flexgs_edge.cameras import Camera, read_cameras, split_views
+from flexgs_edge.render import DeviceScene, Renderer, Statistics
+from flexgs_edge.scene.ply import PlySource
+
+STAGES = {
+    "projection": ("project",),
+    "sort": ("sort_count_first", "sort_scatter_first", "sort_count", "sort_scatter", "exclusive_scan"),
+    "tile lists": ("tile_count", "tile_scatter"),
+    "blend": ("blend",),
+}
+"""Kernels of each stage (the scans of the tile lists, 0.1 ms, count as sorting)."""
+VIEWS = 10
+
+
+def tile_pairs(renderer: Renderer) -> int:
+    """Pairs of the last view: the total behind its tile counters."""
+    buffers = renderer._buffers
+    assert buffers is not None
+    return int(renderer.backend.read(buffers.ends)[-1])
+
+
+def bench_views(bench: Bench, renderer: Renderer, scene: DeviceScene, cameras: list[Camera]) -> None:
+    """Whole views, then stage by stage with a wait after every kernel."""
+    chosen = cameras[:: max(len(cameras) // VIEWS, 1)][:VIEWS]
+    pairs = []
+    for camera in chosen:
+        renderer.render(scene, camera)
+        pairs.append(tile_pairs(renderer))
+    size = f"{chosen[0].width}x{chosen[0].height}"
+    note = f"{len(chosen)} views {size}, {np.mean(pairs):.0f} pairs, kernels built before"
+
+    def all_views() -> None:
+        for camera in chosen:
+            renderer.render(scene, camera)
+
+    bench.time("view", all_views, "ms", len(chosen), note)
+    backend, by_stage = renderer.backend, defaultdict(list)
+    for _ in range(bench.repeats):
+        backend.profile = defaultdict(float)
+        all_views()
+        for stage, kernels in STAGES.items():
+            by_stage[stage].append(sum(backend.profile[kernel] for kernel in kernels) / len(chosen))
+    backend.profile = None
+    for stage, seconds in by_stage.items():
+        bench.add(f"view: {stage}", [s * 1e3 for s in seconds], "ms", "a wait after each kernel")
+        bench.add(f"view: {stage}, by pair", [s * 1e9 / (sum(pairs) / len(pairs)) for s in seconds], "ns/pair")
+
+
+def bench_counting(
+    bench: Bench, renderer: Renderer, scene: DeviceScene, cameras: list[Camera], golden: np.ndarray | None
+) -> None:
+    """Hits and weights of every Gaussian over the training views."""
+    train, _ = split_views(len(cameras))
+    counted = []
+
+    def count() -> None:
+        statistics = Statistics.zeros(scene.count)
+        for view in train:
+            renderer.add_statistics(scene, cameras[view], statistics)
+        counted.append(statistics.hits)
+
+    bench.repeats = min(bench.repeats, 3)
+    count()
+    if golden is not None:
+        check(abs(counted[0].sum() - golden.sum()) <= 1e-4 * golden.sum(), "hits over the training views")
+    bench.time(
+        "hit counting",
+        count,
+        "s",
+        1,
+        f"{len(train)} training views" + (", total checked" if golden is not None else ""),
+    )
+
+
+def bench_first_image(bench: Bench, scene: str, device: str | None) -> None:
+    """From the start of a process to its first image, without and with the compiler's cache."""
+    arguments = ["--first-image", "--scene", scene, *(["--device", device] if device else [])]
+    cold: list[float] = []
+    warm: list[float] = []
+    for _ in range(3):
+        with tempfile.TemporaryDirectory() as cache:
+            environment = {"POCL_CACHE_DIR": cache}
+            for values in (cold, warm):
+                start = time.perf_counter()
+                run_module("view", *arguments, environment=environment)
+                values.append(time.perf_counter() - start)
+    bench.add("first image, cold", cold, "s", "new process, PoCL's kernel cache empty")
+    bench.add("first image, warm", warm, "s", "new process, PoCL's kernel cache filled")
+
+
+def main() -> None:
+    options = parse(__doc__, repeats=7)
+    folder = SCENES[options.scene]
+    backend, budget = backend_of(options)
+    cameras = read_cameras(folder / "cameras.json")
+    renderer = Renderer(backend, budget)
+    with renderer.load(PlySource(folder / "point_cloud.ply")) as scene:
+        if options.first_image:
+            check(bool(renderer.render(scene, cameras[0]).any()), "an empty image")
+            return
+        golden = _check_image(renderer, scene, cameras, options)
+        bench = Bench(backend.name, options.repeats)
+        bench_views(bench, renderer, scene, cameras)
+        bench_counting(bench, renderer, scene, cameras, golden)
+    renderer.release()
+    if not backend.is_numpy and "POCL_CACHE_DIR" not in os.environ:
+        bench_first_image(bench, options.scene, options.device)
+
+
+def _check_image(
+    renderer: Renderer, scene: DeviceScene, cameras: list[Camera], options: argparse.Namespace
+) -> np.ndarray | None:
+    """The golden image where there is one; returns the golden hits over the training views."""
+    path = SCENES[options.scene] / "golden.npz"
+    image = np.clip(renderer.render(scene, cameras[0]), 0, 1).astype(np.float64)
+    check(np.isfinite(image).all() and image.any(), "an image of finite numbers")
+    if not path.is_file():
+        return None
+    with np.load(path) as archive:
+        error = np.mean((image - np.clip(archive["image_0"].astype(np.float64), 0, 1)) ** 2)
+        check(error <= 1e-7, f"view 0 against its golden image: mean squared error {error:.3g}")
+        return archive["hits_train"].astype(np.int64)
+
+
+if __name__ == "__main__":
+    main()

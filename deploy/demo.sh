@@ -1,0 +1,39 @@
+#!/usr/bin/env bash
+# Sets everything up, then compresses the bundled scene, says what was lost, and opens the result again.
+#
+#   deploy/demo.sh
+#
+# The results lie in demo-output/ afterwards.
+set -euo pipefail
+# shellcheck source=deploy/lib.sh
+. "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
+cd "$ROOT"
+
+code=0
+deploy/setup.sh || code=$?
+device=()
+if [ "$code" -eq "$NO_DEVICE" ]; then
+  say "running on --device numpy: the same results, but minutes instead of seconds"
+  device=(--device numpy)
+elif [ "$code" -ne 0 ]; then
+  exit "$code"
+fi
+
+run() {
+  printf '\n$ flexgs-edge %s\n' "$*"
+  flexgs_edge "$@"
+}
+
+mkdir -p demo-output
+scene=samples/still_life
+run compress "$scene/point_cloud.ply" -o demo-output/still_life.fgs -f "${device[@]}"
+run info demo-output/still_life.fgs
+run verify demo-output/still_life.fgs
+run decompress demo-output/still_life.fgs -o demo-output/still_life.ply -f
+run render demo-output/still_life.fgs -o demo-output/views -f --cameras "$scene/cameras.json" --views 0,40 "${device[@]}"
+
+echo
+say "compressed scene   demo-output/still_life.fgs"
+say "for any viewer     demo-output/still_life.ply"
+say "two views of it    demo-output/views/"
+if [ ${#device[@]} -gt 0 ]; then say "made on --device numpy, since no OpenCL device passes the self-test"; fi

@@ -1,0 +1,213 @@
+"""A rig for scenes without cameras: views chosen so that the Gaussians are seen as they were trained to be seen.
+
+Two things in a trained scene tell where its cameras stood. SH above degree 0 start at zero and grow only along directions that
+were looked from, so view-dependent colour is strong towards the training cameras and fades elsewhere (measured: a third of it
+behind a captured wall, two thirds under a floor). And cameras stood in the open with matter in sight. Candidates are a lattice
+in and around the scene; those in opaque matter are dropped by a coarse grid of optical depth; views are then picked one by one
+for what they add. Objects get outside rings that way, and surroundings views inside out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.cameras.witnesses import Gaussians, Witnesses, gather_witnesses
+from flexgs_edge.errors import InputError
+
+DEFAULT_VIEWS = 48
+DEFAULT_SIZE = (640, 480)
+FIELD_OF_VIEW = math.radians(50.0)
+"""Across the image's width: phones' and the field's usual lenses have 40 to 70 degrees."""
+LATTICE = 16
+"""Candidates along the longest side."""
+MARGIN = 1.2
+"""The lattice reaches this many half sides beyond the middle box on each side."""
+POSITIONS = 200
+"""Best candidates that views are made from."""
+QUICK = 5
+"""Every 5th witness judges all candidates, all of them judge the better ones: a third of the time, the same views."""
+DIRECTIONS = 192
+OPEN_DEPTH = 0.25
+"""Largest optical depth, along its side, of a cell in which a camera may stand."""
+NEAR_SHARE = 0.15
+"""Nothing much may be in a view nearer than this share of the extent."""
+NEAR_CLEAR = 0.7
+"""Light that must get through that near part, in the mean over the view."""
+SHARP_PIXELS = 5.0
+"""Deviation of a splat in pixels as cameras usually saw it; a factor of 3 either way is one standard deviation."""
+AGREEMENT_POWER = 3.0
+SEEN_POWER = 1.0
+"""A witness that n views show as well as any place can counts (1 + n)^-SEEN_POWER."""
+APART = 0.2
+"""Views nearer to each other than this share of the extent add less."""
+LEVEL = 0.2
+"""Views whose mean direction is within this of level do not tell which way is up."""
+
+
+def automatic_rig(
+    source: Gaussians, views: int = DEFAULT_VIEWS, width: int = DEFAULT_SIZE[0], height: int = DEFAULT_SIZE[1]
+) -> tuple[list[Camera], str]:
+    """Cameras for a scene that has none; the same scene always gets the same ones.
+
+    Parameters
+    ----------
+    source : SceneSource
+        Checked: finite and not empty.
+    views : int, optional
+        Cameras to make; named auto_000, auto_001, ... in order of what they add, so that every hold-out is a mixture.
+    width, height : int, optional
+        Pixels.
+
+    Returns
+    -------
+    cameras : list of Camera
+        World coordinates.
+    note : str
+        How the rig was made, for the summary.
+
+    Raises
+    ------
+    InputError
+        For less than one view, or a scene without extent.
+    """
+    if views < 1:
+        raise InputError(f"{views} automatic views: expected at least 1")
+    scene = gather_witnesses(source)
+    focal = width / 2 / math.tan(FIELD_OF_VIEW / 2)
+    places = open_places(scene)
+    for part, kept in ((scene.thinned(QUICK), 4 * POSITIONS), (scene, POSITIONS)):
+        merit = _merit(part, places, focal)
+        best = np.argsort(-merit.sum(axis=1), kind="stable")[:kept]
+        places, merit = places[best], merit[best]
+    # A circle of the frame's area: what is in its corners and beside it evens out.
+    frame = _Frame(fibonacci(DIRECTIONS), math.atan(math.sqrt(width * height / math.pi) / focal))
+    chosen = _choose(scene, places, merit, frame, views)
+    directions = frame.directions
+    up, name = up_axis(places[[p for p, _ in chosen]], directions[[d for _, d in chosen]])
+    cameras = [
+        look(f"auto_{index:03d}", places[p] + source.origin, directions[d], up, width, height, focal)
+        for index, (p, d) in enumerate(chosen)
+    ]
+    return cameras, _note(scene, places[[p for p, _ in chosen]], name)
+
+
+def open_places(scene: Witnesses) -> np.ndarray:
+    """[n, 3] f64: candidates on a lattice in and around the scene, none of them in opaque matter."""
+    reach = (1 + MARGIN) * np.maximum(scene.half, 0.5 * scene.half.max())
+    step = 2 * float(reach.max()) / LATTICE
+    axes = [np.arange(-math.floor(r / step), math.floor(r / step) + 1) * step for r in reach]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij")).reshape(3, -1) + scene.middle[:, None]
+    offsets = np.stack(np.meshgrid(*[np.array([-1.0, 0.0, 1.0])] * 3, indexing="ij")).reshape(3, -1) * scene.cell
+    worst = np.zeros(lattice.shape[1])
+    for offset in offsets.T:
+        worst = np.maximum(worst, scene.optical_depth(lattice + offset[:, None]))
+    # Thin fog everywhere: the clearest quarter is the best there is.
+    limit = max(OPEN_DEPTH, float(np.quantile(worst, 0.25)))
+    return np.ascontiguousarray(lattice[:, worst <= limit].T)
+
+
+def _merit(scene: Witnesses, places: np.ndarray, focal: float) -> np.ndarray:
+    """[n, M] f64: how well each place shows each witness."""
+    merit = np.empty((len(places), scene.weights.size))
+    for row, place in enumerate(places):
+        distance = np.linalg.norm(scene.means - place[:, None], axis=0)
+        pixels = focal * scene.sizes / np.maximum(distance, 1e-6 * scene.extent)
+        sharp = np.exp(-0.5 * (np.log(np.maximum(pixels, 1e-30) / SHARP_PIXELS) / math.log(3)) ** 2)
+        agreement = scene.agreement(place) ** AGREEMENT_POWER
+        merit[row] = scene.weights * scene.transmittance(place, scene.means) * sharp * agreement
+    return merit
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """Directions of view ([D, 3]), and the half angle of what a view shows."""
+
+    directions: np.ndarray
+    cone: float
+
+    def shows(self, place: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """[D, n] bool: which of `points` ([3, n]) are in a view from `place`."""
+        lines = points - place[:, None]
+        lines /= np.maximum(np.linalg.norm(lines, axis=0), 1e-12)
+        inside: np.ndarray = self.directions @ lines > math.cos(self.cone)
+        return inside
+
+    def clear(self, scene: Witnesses, place: np.ndarray) -> np.ndarray:
+        """[D] bool: directions in which nothing much is near."""
+        ahead = self.directions.T * (NEAR_SHARE * scene.extent + 2 * scene.cell)
+        through = scene.transmittance(place, place[:, None] + ahead)
+        around = self.directions @ self.directions.T > math.cos(self.cone)
+        clear: np.ndarray = around @ through >= NEAR_CLEAR * around.sum(axis=1)
+        return clear
+
+
+def _choose(
+    scene: Witnesses, places: np.ndarray, merit: np.ndarray, frame: _Frame, views: int
+) -> list[tuple[int, int]]:
+    """(place, direction) of each view, greedily by the merit that it adds."""
+    # Where nothing is clear the best of the rest is taken.
+    clear = [np.where(frame.clear(scene, place), 1.0, 1e-6) for place in places]
+    seen, room = np.zeros(merit.shape[1]), np.ones(len(places))
+    fullest = np.maximum(merit.max(axis=0), 1e-300)
+    # What a view adds only ever gets less, so an older figure bounds it: few places are looked at again for each view.
+    bounds, directions = np.full(len(places), np.inf), np.zeros(len(places), np.int64)
+    chosen: list[tuple[int, int]] = []
+    for _ in range(views):
+        wanted = (1 + seen) ** -SEEN_POWER
+        fresh = np.zeros(len(places), bool)
+        while not fresh[best := int(np.argmax(bounds))]:
+            gains = frame.shows(places[best], scene.means) @ (merit[best] * wanted) * clear[best] * room[best]
+            directions[best], bounds[best], fresh[best] = np.argmax(gains), gains.max(), True
+        chosen.append((best, int(directions[best])))
+        seen += frame.shows(places[best], scene.means)[directions[best]] * (merit[best] / fullest)
+        distance = np.linalg.norm(places - places[best], axis=1) / (APART * scene.extent)
+        room *= 1 - 0.7 * np.exp(-0.5 * distance**2)
+    return chosen
+
+
+def up_axis(places: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, str]:
+    """Up ([3] f64, a coordinate axis), and its name.
+
+    People walk around a scene more than they climb, and look down on it more than up: up is y or z, along which places
+    ([n, 3]) and directions ([n, 3]) vary least, against the mean direction. Where views are level, it is -y or +z, the
+    conventions of COLMAP and NeRF.
+    """
+    mean = directions.mean(axis=0)
+    spread = places.std(axis=0) / max(float(places.std()), 1e-300) + 2 * mean * mean
+    axis = 1 if spread[1] < spread[2] else 2
+    sign = -np.sign(mean[axis]) if abs(mean[axis]) > LEVEL else (-1.0 if axis == 1 else 1.0)
+    up = np.zeros(3)
+    up[axis] = sign
+    return up, f"{'+' if sign > 0 else '-'}{'xyz'[axis]}"
+
+
+def look(
+    name: str, position: np.ndarray, direction: np.ndarray, up: np.ndarray, width: int, height: int, focal: float
+) -> Camera:
+    """A camera at `position` that looks along `direction`, the image's top towards `up` (all [3], world)."""
+    forward = direction / np.linalg.norm(direction)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-3:  # straight up or down: any roll is as good
+        right = np.cross(forward, np.roll(up, 1))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Camera(name, width, height, rotation, -rotation @ position, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def fibonacci(count: int) -> np.ndarray:
+    """[count, 3] f64: unit vectors spread evenly over all directions."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.arange(count) * math.pi * (3 - math.sqrt(5))
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+def _note(scene: Witnesses, places: np.ndarray, up: str) -> str:
+    inside = float(np.mean(np.all(np.abs(places - scene.middle) < scene.half, axis=1)))
+    kind = "inside out" if inside > 0.75 else "from outside" if inside < 0.25 else "from inside and outside"
+    told = "where SH are strongest" if scene.tells.any() else "by what is in sight (no SH tell where cameras stood)"
+    return f"{len(places)} automatic views {kind}, placed {told}; up is taken to be {up}"

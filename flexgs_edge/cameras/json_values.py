@@ -1,0 +1,157 @@
+"""Values out of JSON camera files, checked, with messages that name file, entry and key."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.errors import FormatError, InputError
+
+ROTATION_TOLERANCE = 1e-3
+"""Largest entry of |R R^T - 1|: files keep 6 digits and more, a scaled or sheared matrix is off by far more."""
+MAX_SIDE = 65535
+"""Pixels: more is a damaged file (JPEG ends here too)."""
+
+
+def load_json(path: Path) -> Any:
+    """The value of a JSON file.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read; `FormatError` when it is not JSON.
+    """
+    try:
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the cameras ({error.strerror})") from error
+    except json.JSONDecodeError as error:
+        raise FormatError(f"{path}: not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from error
+    except (UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise FormatError(f"{path}: not JSON: {error}") from error
+
+
+def kind(value: Any) -> str:
+    """What a JSON value is, for messages."""
+    names = {dict: "an object", list: "a list", str: "a string", bool: "a boolean", type(None): "null"}
+    return names.get(type(value), "a number")
+
+
+class Entry:
+    """One object of a file, with its place for messages; every method raises `FormatError`.
+
+    Parameters
+    ----------
+    place : str
+        Such as "cameras.json: camera 3".
+    entry : Any
+        Must be an object.
+    """
+
+    def __init__(self, place: str, entry: Any) -> None:
+        self.place = place
+        if not isinstance(entry, dict):
+            raise FormatError(f"{self.place}: expected an object, found {kind(entry)}")
+        self.entry = entry
+
+    def has(self, key: str) -> bool:
+        """Whether the key is there and not null."""
+        return self.entry.get(key) is not None
+
+    def get(self, key: str) -> Any:
+        """Any value."""
+        if key not in self.entry:
+            raise FormatError(f"{self.place}: missing key {key!r}; found {', '.join(map(repr, self.entry)) or 'none'}")
+        return self.entry[key]
+
+    def fail(self, key: str, expected: str, found: str) -> FormatError:
+        """An error to raise."""
+        return FormatError(f"{self.place}: {key}: expected {expected}, found {found}")
+
+    def name(self, key: str) -> str:
+        """A string that is not blank."""
+        name = self.get(key)
+        if not isinstance(name, str) or not name.strip():
+            raise self.fail(key, "a name", repr(name)[:80])
+        return name
+
+    def number(self, key: str, expected: str) -> float:
+        """Any number, NaN and infinities included."""
+        value = self.get(key)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise self.fail(key, expected, kind(value))
+        try:
+            return float(value)
+        except OverflowError:
+            raise self.fail(key, expected, "a number beyond float64") from None
+
+    def finite(self, key: str, expected: str) -> float:
+        """A finite number."""
+        value = self.number(key, expected)
+        if not math.isfinite(value):
+            raise self.fail(key, expected, f"{value:g}")
+        return value
+
+    def side(self, key: str) -> int:
+        """Width or height in pixels."""
+        expected = f"a whole number of pixels from 1 to {MAX_SIDE}"
+        value = self.number(key, expected)
+        if not 1 <= value <= MAX_SIDE or value != int(value):
+            raise self.fail(key, expected, f"{value:g}")
+        return int(value)
+
+    def focal(self, key: str) -> float:
+        """A focal length in pixels."""
+        expected = "a focal length above 0 pixels"
+        value = self.finite(key, expected)
+        if value <= 0:
+            raise self.fail(key, expected, f"{value:g}")
+        return value
+
+    def array(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
+        """Nested lists of finite numbers as an array ([*shape] f64)."""
+        expected = " x ".join(map(str, shape)) + " finite numbers"
+        value = self.get(key)
+        if _shape(value) != shape:
+            raise self.fail(key, expected, repr(value)[:80])
+        leaves = np.array(value, dtype=object)
+        if not all(isinstance(leaf, (int, float)) and not isinstance(leaf, bool) for leaf in leaves.flat):
+            raise self.fail(key, expected, repr(value)[:80])
+        try:
+            array = leaves.astype(np.float64)
+        except OverflowError:
+            raise self.fail(key, expected, "a number beyond float64") from None
+        if not np.all(np.isfinite(array)):
+            raise self.fail(key, expected, f"{array.tolist()}")
+        return array
+
+    def check_rotation(self, key: str, rotation: np.ndarray) -> None:
+        """Raise unless `rotation` ([3, 3]) is orthonormal (to the digits that files keep) and no reflection."""
+        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        if not error <= ROTATION_TOLERANCE:
+            raise self.fail(key, f"an orthonormal matrix (within {ROTATION_TOLERANCE})", f"one off by {error:.3g}")
+        if np.linalg.det(rotation) < 0:
+            raise self.fail(key, "a rotation (determinant 1)", "a reflection (determinant -1)")
+
+
+def check_names(path: Path, names: list[str], entries: str, key: str) -> None:
+    """Raise `FormatError` where a name appears twice (names find photos and order the views)."""
+    first: dict[str, int] = {}
+    for index, name in enumerate(names):
+        if first.setdefault(name, index) != index:
+            raise FormatError(
+                f"{path}: {entries} {first[name]} and {index}: {key} {name!r} appears twice; names must differ"
+            )
+
+
+def _shape(value: Any) -> tuple[int, ...] | None:
+    """Shape of nested lists, None if they are ragged (which NumPy would raise on)."""
+    if not isinstance(value, list):
+        return ()
+    shapes = {_shape(item) for item in value}
+    inner = shapes.pop() if len(shapes) == 1 else None
+    return None if inner is None else (len(value), *inner)

@@ -1,0 +1,227 @@
+"""NeRF's and nerfstudio's transforms.json: poses camera to world in OpenGL's axes, intrinsics for all frames or for each.
+
+Poses are taken as the file has them. Where `dataparser_transforms.json` lies beside it (nerfstudio writes it next to a trained
+model), they are moved into the frame that the training used, which is the frame of an exported PLY.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import posixpath
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.cameras.json_values import Entry, check_names, kind, load_json
+from flexgs_edge.cameras.photos import SUFFIXES, photo_size
+from flexgs_edge.errors import FormatError, InputError
+
+DATAPARSER = "dataparser_transforms.json"
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+"""Values of `camera_model` that have no lens."""
+BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Those that are pinholes when their parameters are zero."""
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""From OpenGL's camera (y up, looking along -z) to COLMAP's."""
+UNDISTORT = (
+    "make a pinhole model of the photos with `ns-process-data images --data PHOTOS --output-dir MODEL` and "
+    "`colmap image_undistorter --image_path PHOTOS --input_path MODEL/colmap/sparse/0 --output_path OUTPUT --output_type COLMAP` "
+    "and use OUTPUT/sparse and OUTPUT/images"
+)
+
+
+def read_transforms(path: str | os.PathLike[str], ignore_distortion: bool = False) -> list[Camera]:
+    """Read a transforms.json, in the file's order.
+
+    Names are the frames' `file_path`, without the folder that all of them share. The principal point has pixel centres at
+    integer + 0.5 in the file: half a pixel is taken off; without one it is the image's middle. A missing size is taken
+    from the frame's photo (with or without extension in `file_path`).
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    ignore_distortion : bool, optional
+        Take the poses of distorted lenses as pinholes; such cameras refuse to be compared with photos.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, a size is nowhere to be found, or a lens is distorted; names commands that undistort.
+    FormatError
+        When the file breaks its format; names file, frame and key.
+    """
+    path = Path(path)
+    return cameras_of_frames(path, load_json(path), ignore_distortion)
+
+
+def cameras_of_frames(path: Path, value: Any, ignore_distortion: bool = False) -> list[Camera]:
+    """`read_transforms` for a file whose JSON is loaded already."""
+    top = Entry(str(path), value)
+    frames = top.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise top.fail("frames", "a list of frames", "an empty one" if frames == [] else kind(frames))
+    entries = [Entry(f"{path}: frame {index}", frame) for index, frame in enumerate(frames)]
+    paths = [_file_path(entry) for entry in entries]
+    names = _without_shared_folder(paths)
+    check_names(path, names, "frames", "file_path")
+    frame_change = _Similarity.beside(path, top)
+    return [
+        _camera(path, top, entry, file_path, name, frame_change, ignore_distortion)
+        for entry, file_path, name in zip(entries, paths, names)
+    ]
+
+
+def _file_path(entry: Entry) -> str:
+    # Files made on Windows have backslashes.
+    return posixpath.normpath(entry.name("file_path").replace("\\", "/"))
+
+
+def _without_shared_folder(paths: list[str]) -> list[str]:
+    folders = [PurePosixPath(path).parent.parts for path in paths]
+    shared = 0
+    while all(len(folder) > shared for folder in folders) and len({folder[shared] for folder in folders}) == 1:
+        shared += 1
+    return [PurePosixPath(*PurePosixPath(path).parts[shared:]).as_posix() for path in paths]
+
+
+@dataclass(frozen=True)
+class _Similarity:
+    """x' = scale * (linear @ x + shift)."""
+
+    linear: np.ndarray
+    shift: np.ndarray
+    scale: float
+
+    @classmethod
+    def beside(cls, path: Path, top: Entry) -> _Similarity:
+        """From the file's frame to the training's: the identity where there is no dataparser_transforms.json."""
+        place = path.with_name(DATAPARSER)
+        if not place.is_file():
+            return cls(np.eye(3), np.zeros(3), 1.0)
+        entry = Entry(str(place), load_json(place))
+        linear, shift = _rigid(entry, "transform")
+        scale = entry.finite("scale", "a factor above 0")
+        if scale <= 0:
+            raise entry.fail("scale", "a factor above 0", f"{scale:g}")
+        # nerfstudio's `transform` and `scale` start at the frame of the original capture, our poses behind `applied_*`.
+        if top.has("applied_transform"):
+            applied, moved = _rigid(top, "applied_transform")
+            linear = linear @ applied.T
+            shift = shift - linear @ moved
+        if top.has("applied_scale"):
+            applied_scale = top.finite("applied_scale", "a factor above 0")
+            if applied_scale <= 0:
+                raise top.fail("applied_scale", "a factor above 0", f"{applied_scale:g}")
+            scale /= applied_scale
+        return cls(linear, shift, scale)
+
+    def moved(self, turn: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A pose, camera to world."""
+        return self.linear @ turn, self.scale * (self.linear @ position + self.shift)
+
+
+def _rigid(entry: Entry, key: str) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and translation of a 3x4 or 4x4 matrix."""
+    value = entry.get(key)
+    rows = len(value) if isinstance(value, list) else 3
+    matrix = entry.array(key, (4 if rows == 4 else 3, 4))
+    if rows == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise entry.fail(key, "0 0 0 1 as the last row", " ".join(f"{v:g}" for v in matrix[3]))
+    entry.check_rotation(key, matrix[:3, :3])
+    return matrix[:3, :3], matrix[:3, 3]
+
+
+def _camera(
+    path: Path, top: Entry, frame: Entry, file_path: str, name: str, frame_change: _Similarity, ignore_distortion: bool
+) -> Camera:
+    distortion = _distortion(top, frame)
+    if distortion is not None and not ignore_distortion:
+        raise InputError(
+            f"{frame.place} ({name}): lens distortion ({distortion}), renders have none; {UNDISTORT}; "
+            "or use --ignore-distortion to take the poses alone, without photos"
+        )
+    turn, position = frame_change.moved(*_rigid(frame, "transform_matrix"))
+    rotation = FLIP @ turn.T
+    width, height = _size(path, top, frame, file_path)
+    fx, fy = _focals(top, frame, width, height)
+    cx, cy = (
+        _holder(top, frame, key).finite(key, "a principal point in pixels") - 0.5
+        if _has(top, frame, key)
+        else (side - 1) / 2
+        for key, side in (("cx", width), ("cy", height))
+    )
+    return Camera(name, width, height, rotation, -rotation @ position, fx, fy, cx, cy, distortion)
+
+
+def _has(top: Entry, frame: Entry, key: str) -> bool:
+    return frame.has(key) or top.has(key)
+
+
+def _holder(top: Entry, frame: Entry, key: str) -> Entry:
+    """Where a key is looked up: the frame comes before the file."""
+    return frame if frame.has(key) else top
+
+
+def _distortion(top: Entry, frame: Entry) -> str | None:
+    """The lens, for messages; None for a pinhole. Raises for models that no pinhole comes close to."""
+    model = "OPENCV"
+    if _has(top, frame, "camera_model"):
+        model = _holder(top, frame, "camera_model").name("camera_model")
+    if _has(top, frame, "is_fisheye") and _holder(top, frame, "is_fisheye").get("is_fisheye"):
+        model = "OPENCV_FISHEYE"
+    if model not in (*PINHOLES, *BENT):
+        if "FISHEYE" not in model:
+            raise InputError(f"{frame.place}: camera_model: expected PINHOLE or OPENCV, found {model!r}")
+        return f"camera_model {model}"
+    found = []
+    for key in DISTORTION:
+        if _has(top, frame, key):
+            value = _holder(top, frame, key).finite(key, "a finite number")
+            if value != 0:
+                found.append(f"{key} = {value:g}")
+    return ", ".join(found) or None
+
+
+def _size(path: Path, top: Entry, frame: Entry, file_path: str) -> tuple[int, int]:
+    if _has(top, frame, "w") and _has(top, frame, "h"):
+        return _holder(top, frame, "w").side("w"), _holder(top, frame, "h").side("h")
+    photo = path.parent / file_path
+    for place in (photo, *(photo.with_name(photo.name + suffix) for suffix in SUFFIXES)):
+        if place.is_file():
+            return photo_size(place)
+    raise FormatError(
+        f"{frame.place}: no size: expected keys 'w' and 'h', or the photo {photo} ({', '.join(SUFFIXES)})"
+    )
+
+
+def _focals(top: Entry, frame: Entry, width: int, height: int) -> tuple[float, float]:
+    """Focal lengths in pixels, from lengths or angles; one stands for both where the other is missing."""
+    found = [_focal(top, frame, axis, side) for axis, side in (("x", width), ("y", height))]
+    across, down = found
+    if across is None and down is None:
+        raise FormatError(
+            f"{frame.place}: no focal length: expected 'fl_x' or 'camera_angle_x', there or for all frames"
+        )
+    first = across if across is not None else down
+    assert first is not None
+    return (first if across is None else across), (first if down is None else down)
+
+
+def _focal(top: Entry, frame: Entry, axis: str, side: int) -> float | None:
+    for holder in (frame, top):
+        if holder.has(f"fl_{axis}"):
+            return holder.focal(f"fl_{axis}")
+    for holder in (frame, top):
+        key = f"camera_angle_{axis}"
+        if holder.has(key):
+            angle = holder.finite(key, "an angle between 0 and pi")
+            if not 0 < angle < math.pi:
+                raise holder.fail(key, "an angle between 0 and pi", f"{angle:g}")
+            return side / 2 / math.tan(angle / 2)
+    return None

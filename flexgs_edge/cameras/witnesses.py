@@ -1,0 +1,218 @@
+"""What a rig needs to know of a scene: its robust middle and extent, where matter is, and a sample of rows to be seen.
+
+World positions are relative to the source's origin throughout.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from flexgs_edge.constants import SH_C1, SH_C2, SH_C3
+from flexgs_edge.errors import InputError
+
+SAMPLE_ROWS = 1 << 16
+"""Rows that middle, extent and grid are made from."""
+WITNESSES = 1500
+"""Rows that judge candidates one by one."""
+GRID = 40
+"""Cells of the density grid along the longest side."""
+BOX = (0.01, 0.99)
+"""Quantiles that the grid spans."""
+BULK = (0.05, 0.95)
+"""Quantiles of middle and extent."""
+MARCH = 24
+"""Steps of a line of sight through the grid."""
+SH_FLOOR = 0.01
+"""Rows whose view-dependent colour is weaker on average do not tell directions."""
+
+
+class Gaussians(Protocol):
+    """What the rig needs of a scene source."""
+
+    name: str
+    count: int
+    sh_degree: int
+    origin: np.ndarray
+
+    def read(self, rows: np.ndarray, fields: Sequence[str]) -> dict[str, np.ndarray]:
+        """{field: [width, n] f32} of some rows."""
+
+
+@dataclass
+class Witnesses:
+    """A scene in small.
+
+    Attributes
+    ----------
+    middle : np.ndarray
+        [3] f64, opacity-weighted median.
+    half : np.ndarray
+        [3] f64, half the sides of the box from the 5 % to the 95 % quantile.
+    corner, cell : np.ndarray, float
+        [3] f64 first corner and side of the grid's cells.
+    depth : np.ndarray
+        [x + 2, y + 2, z + 2] f64, optical depth of a cell along its side; a rim of empty cells.
+    means : np.ndarray
+        [3, M] f64.
+    weights : np.ndarray
+        [M] f64, opacities.
+    sizes : np.ndarray
+        [M] f64, geometric mean of the two largest deviations.
+    sh : np.ndarray
+        [3, K, M] f64, coefficients of degrees 1 to 3 over their root mean square over all directions.
+    tells : np.ndarray
+        [M] bool, rows whose SH tell from where they were trained.
+    """
+
+    middle: np.ndarray
+    half: np.ndarray
+    corner: np.ndarray
+    cell: float
+    depth: np.ndarray
+    means: np.ndarray
+    weights: np.ndarray
+    sizes: np.ndarray
+    sh: np.ndarray
+    tells: np.ndarray
+
+    @property
+    def extent(self) -> float:
+        """Half the diagonal of the box, scene units."""
+        return float(np.linalg.norm(self.half))
+
+    def thinned(self, step: int) -> Witnesses:
+        """The same scene with every `step`-th witness."""
+        part = slice(None, None, step)
+        return replace(
+            self,
+            means=self.means[:, part],
+            weights=self.weights[part],
+            sizes=self.sizes[part],
+            sh=self.sh[:, :, part],
+            tells=self.tells[part],
+        )
+
+    def optical_depth(self, points: np.ndarray) -> np.ndarray:
+        """[n] f64 of the cells at `points` ([3, n]); 0 outside the grid."""
+        return self._cells((points - self.corner[:, None]) / self.cell)
+
+    def transmittance(self, eye: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """[n] f64: what is left of light from `ends` ([3, n]) at `eye` ([3])."""
+        start = ((eye - self.corner) / self.cell)[:, None]
+        lines = (ends - eye[:, None]) / self.cell
+        length = np.linalg.norm(lines, axis=0)
+        # The last cells belong to the surface that is looked at.
+        reach = np.maximum(length - 2, 0.0)
+        lines *= reach / np.maximum(length, 1e-12)
+        total = np.zeros(ends.shape[1])
+        for step in (np.arange(MARCH) + 0.5) / MARCH:
+            total += self._cells(start + lines * step)
+        return np.exp(-total * reach / MARCH)
+
+    def _cells(self, places: np.ndarray) -> np.ndarray:
+        """[n] f64 of the grid at `places` ([3, n], in cells); the rim of empty cells stands for all that is outside."""
+        x, y, z = (np.clip(line + 1, 0, n - 1).astype(np.int64) for line, n in zip(places, self.depth.shape))
+        found: np.ndarray = self.depth[x, y, z]
+        return found
+
+    def agreement(self, eye: np.ndarray) -> np.ndarray:
+        """[M] f64: view-dependent colour towards `eye` over its mean over all directions; 1 for rows that do not tell."""
+        lines = self.means - eye[:, None]
+        lines /= np.maximum(np.linalg.norm(lines, axis=0), 1e-12)
+        basis = sh_basis(lines, self.sh.shape[1])
+        strength = np.sqrt(np.square(np.einsum("ckm,km->cm", self.sh, basis)).sum(axis=0))
+        return np.where(self.tells, np.minimum(strength, 3.0), 1.0)
+
+
+def gather_witnesses(source: Gaussians) -> Witnesses:
+    """Read a sample of a scene (every k-th row, at most 65536).
+
+    Raises
+    ------
+    InputError
+        When the Gaussians have no extent at all.
+    """
+    rows = np.arange(0, source.count, max(1, -(-source.count // SAMPLE_ROWS)))
+    sample = source.read(rows, ["means", "opacity_logits", "log_scales"])
+    means = sample["means"].astype(np.float64)
+    opacity = 1 / (1 + np.exp(-sample["opacity_logits"][0].astype(np.float64)))
+    # Far fewer than a float's exponents: squares and products stay finite.
+    deviations = np.exp(np.sort(np.clip(sample["log_scales"].astype(np.float64), -40, 40), axis=0))
+    sizes = np.sqrt(deviations[1] * deviations[2])
+    low, middle, high = weighted_quantiles(means, opacity, (BULK[0], 0.5, BULK[1]))
+    half = (high - low) / 2
+    floor = max(float(half.max()), float(np.median(sizes)))
+    if not floor > 0:
+        raise InputError(f"{source.name}: automatic cameras: the Gaussians have no extent; give cameras")
+    corner, cell, depth = _grid(means, opacity, deviations, source.count / rows.size)
+    picked = np.arange(0, rows.size, max(1, -(-rows.size // WITNESSES)))
+    sh, tells = _directions(source, rows[picked])
+    return Witnesses(
+        middle, np.maximum(half, 0.05 * floor), corner, cell, depth,
+        means[:, picked], opacity[picked], sizes[picked], sh, tells,
+    )  # fmt: skip
+
+
+def weighted_quantiles(values: np.ndarray, weights: np.ndarray, shares: Sequence[float]) -> np.ndarray:
+    """Quantiles of each row of `values` ([c, n]) with `weights` ([n]): [len(shares), c]."""
+    order = np.argsort(values, axis=1, kind="stable")
+    result = np.empty((len(shares), len(values)))
+    for row, (places, line) in enumerate(zip(order, values)):
+        total = np.cumsum(weights[places])
+        at = np.searchsorted(total, np.asarray(shares) * total[-1])
+        result[:, row] = line[places[np.minimum(at, len(places) - 1)]]
+    return result
+
+
+def _grid(
+    means: np.ndarray, opacity: np.ndarray, deviations: np.ndarray, share: float
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """First corner, cell side, and optical depth of each cell along its side.
+
+    A splat's matter is its opacity times its mean cross-section, all of it put into the cell of its middle; cross-sections
+    are cut at a cell's face, so that a few huge splats do not fill the scene. Each row stands for `share` rows.
+    """
+    low, high = np.quantile(means, BOX, axis=1)
+    cell = max(float((high - low).max()) / GRID, 1e-9 * float(np.abs(means).max()), 1e-30)
+    shape = np.maximum(1, np.ceil((high - low) / cell)).astype(np.int64)
+    index = np.floor((means - low[:, None]) / cell).astype(np.int64)
+    inside = ((index >= 0) & (index < shape[:, None])).all(axis=0)
+    a, b, c = deviations
+    cross_section = np.minimum(2 * math.pi / 3 * (a * b + b * c + a * c), cell * cell)
+    depth = np.zeros(tuple(int(s) for s in shape))
+    np.add.at(depth, tuple(index[:, inside]), (opacity * cross_section)[inside] * share)
+    return low, cell, np.pad(depth / (cell * cell), 1)
+
+
+def _directions(source: Gaussians, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """SH above degree 0 over their root mean square, and which rows are strong enough to tell directions."""
+    used = min(source.sh_degree, 3)
+    kept = (used + 1) ** 2 - 1
+    if not kept:
+        return np.zeros((3, 0, rows.size)), np.zeros(rows.size, bool)
+    coefficients = source.read(rows, ["sh_rest"])["sh_rest"].astype(np.float64).reshape(3, -1, rows.size)[:, :kept]
+    strength = np.sqrt(np.square(coefficients).sum(axis=(0, 1)) / (4 * math.pi))
+    return coefficients / (strength + SH_FLOOR / 10), strength > SH_FLOOR
+
+
+def sh_basis(directions: np.ndarray, count: int) -> np.ndarray:
+    """The first `count` (3, 8 or 15) SH functions above degree 0 of unit `directions` ([3, n]): [count, n]."""
+    x, y, z = directions
+    xx, yy, zz = x * x, y * y, z * z
+    terms = [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
+    if count > 3:
+        terms += [
+            SH_C2[0] * x * y, SH_C2[1] * y * z, SH_C2[2] * (2 * zz - xx - yy), SH_C2[3] * x * z, SH_C2[4] * (xx - yy),
+        ]  # fmt: skip
+    if count > 8:
+        terms += [
+            SH_C3[0] * y * (3 * xx - yy), SH_C3[1] * x * y * z, SH_C3[2] * y * (4 * zz - xx - yy),
+            SH_C3[3] * z * (2 * zz - 3 * xx - 3 * yy), SH_C3[4] * x * (4 * zz - xx - yy), SH_C3[5] * z * (xx - yy),
+            SH_C3[6] * x * (xx - 3 * yy),
+        ]  # fmt: skip
+    return np.array(terms).reshape(count, directions.shape[1])

@@ -1,0 +1,277 @@
+"""Scenes in other projects' formats, in and out, through the converter package gaussforge (extra `[formats]`).
+
+The converter holds whole files and is native code, so it runs in a process of its own: its memory is gone when it ends, what it
+prints stays out of ours, and a file that crashes it is an error like any other. Between the two processes goes an INRIA PLY.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+import tempfile
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flexgs_edge.errors import BudgetError, FlexGSError, FormatError, InputError
+from flexgs_edge.grid import morton
+from flexgs_edge.quantize import normalize_quats
+from flexgs_edge.scene import Planes, PlySource, Rows, SceneSource, check_writable, register_reader, write_ply
+
+CONVERTER = "gaussforge"
+OPACITY_LIMIT = 7.0
+"""Logits of opacity 0 and 1, which 8-bit formats store and no logit reaches: half of a 8-bit step from either end is 6.2."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of the converter.
+
+    Parameters
+    ----------
+    suffix : str
+        Of file names, with its dot.
+    name : str
+        The converter's name of it.
+    reach : float
+        Largest coordinate that it can hold, scene units.
+    max_degree : int
+        Highest SH degree.
+    sorted : bool
+        Rows must come in an order in which neighbours are near each other: each 256 share a range, and the converter does
+        not sort (unsorted, positions of the sample were 7 times worse).
+    """
+
+    suffix: str
+    name: str
+    reach: float = float("inf")
+    max_degree: int = 3
+    sorted: bool = False
+
+
+FORMATS: dict[str, Format] = {
+    format.suffix: format
+    for format in (
+        # Positions are 24-bit numbers with 12 bits behind the point.
+        Format(".spz", "spz", reach=2.0**11 - 2.0**-12),
+        Format(".sog", "sog"),
+        Format(".compressed.ply", "compressed.ply", sorted=True),
+    )
+}
+
+_CHILD = """
+import sys
+import gaussforge
+source, source_format, target, target_format = sys.argv[1:]
+with open(source, "rb") as file:
+    data = file.read()
+try:
+    result = gaussforge.GaussForge().convert(data, source_format, target_format)
+except Exception as error:
+    result = {"error": str(error) or type(error).__name__}
+if "error" in result:
+    sys.stderr.write("\\nconverter: " + str(result["error"]))
+    sys.exit(3)
+with open(target, "wb") as file:
+    file.write(result["data"])
+"""
+_REFUSED = 3
+
+
+def format_of(path: str | os.PathLike[str]) -> Format | None:
+    """The format that a file name asks for, or None."""
+    name = Path(path).name.lower()
+    return next((format for suffix, format in FORMATS.items() if name.endswith(suffix)), None)
+
+
+def check_converter(path: str | os.PathLike[str]) -> None:
+    """Raise `InputError` with what to install where the converter is missing."""
+    if importlib.util.find_spec(CONVERTER) is None:
+        raise InputError(f"{path}: this format needs the package {CONVERTER}: pip install 'flexgs-edge[formats]'")
+
+
+def read_foreign(path: str | os.PathLike[str]) -> SceneSource:
+    """Open a `.spz`, `.sog` or `.compressed.ply` scene.
+
+    It is expanded into a temporary PLY of about 248 bytes a Gaussian (in the folder that TMPDIR names), which lives as long
+    as the source; the converter holds the whole scene for a moment.
+
+    Raises
+    ------
+    InputError
+        When the converter is not installed or the file cannot be read.
+    FormatError
+        When the file breaks its format.
+    """
+    format = _required(path)
+    check_converter(path)
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such scene file")
+    folder = tempfile.TemporaryDirectory(prefix="flexgs-")
+    try:
+        expanded = Path(folder.name) / "scene.ply"
+        _convert(path, Path(path), format.name, expanded, "ply")
+        return _ForeignSource(path, expanded, folder, format)
+    except BaseException:
+        folder.cleanup()
+        raise
+
+
+def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: bool = False) -> tuple[str, ...]:
+    """Write a scene as `.spz`, `.sog` or `.compressed.ply`, with that format's own losses.
+
+    Needs a temporary PLY of about 248 bytes a Gaussian beside the file; `.sog` takes about a minute for 100 000 Gaussians
+    (it clusters the SH).
+
+    Returns
+    -------
+    tuple of str
+        Notes for the summary.
+
+    Raises
+    ------
+    InputError
+        When the converter is not installed, the file exists and `force` is not set, or the format cannot hold the scene.
+    BudgetError
+        When the disk is full.
+    """
+    format = _required(path)
+    check_converter(path)
+    target = check_writable(path, force)
+    if source.count == 0:
+        raise InputError(f"{source.name}: the scene is empty: nothing to write to {path}")
+    if source.sh_degree > format.max_degree:
+        raise InputError(
+            f"{path}: {format.suffix} holds SH up to degree {format.max_degree}, this scene has {source.sh_degree}; write a .ply"
+        )
+    world = _WorldSource(source)
+    _check_reach(path, world, format)
+    # Beside the target: the last step is a rename, and /tmp may be memory.
+    with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=target.parent) as folder:
+        plain, finished = Path(folder) / "scene.ply", Path(folder) / f"scene{format.suffix}"
+        write_ply(plain, world.select(_near_order(world)) if format.sorted else world)
+        _convert(path, plain, "ply", finished, format.name)
+        os.replace(finished, target)
+    far = bool(np.any(source.origin != 0))
+    return ("positions rounded to float32: the scene is far from zero",) if far else ()
+
+
+def _required(path: str | os.PathLike[str]) -> Format:
+    format = format_of(path)
+    if format is None:
+        raise InputError(f"{path}: expected a file ending in {', '.join(FORMATS)}")
+    return format
+
+
+def _check_reach(path: str | os.PathLike[str], source: SceneSource, format: Format, chunk_rows: int = 65536) -> None:
+    if np.isinf(format.reach):
+        return
+    for rows in source.chunks(chunk_rows):
+        means = source.read(rows, ["means"])["means"]
+        far = np.flatnonzero(~(np.abs(means) <= format.reach).all(axis=0))
+        if far.size:
+            raise InputError(
+                f"{path}: {format.suffix} holds coordinates up to {format.reach:.0f}; row {rows.start + far[0]} of {source.name} "
+                f"lies at {', '.join(f'{v:g}' for v in means[:, far[0]])}: write a .ply, or move the scene to zero first"
+            )
+
+
+def _near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
+    """[N] i64: rows along a Morton curve through the scene's box."""
+    means = np.concatenate([source.read(rows, ["means"])["means"] for rows in source.chunks(chunk_rows)], axis=1)
+    # By rank along each axis: a few far rows do not squeeze the rest into one cell.
+    cells = np.empty(means.shape, np.int64)
+    for axis, line in enumerate(means):
+        cells[axis, np.argsort(line, kind="stable")] = np.arange(line.size) * 1024 // line.size
+    return np.argsort(morton(cells), kind="stable")
+
+
+def _convert(path: str | os.PathLike[str], source: Path, source_format: str, target: Path, target_format: str) -> None:
+    """Run the converter; `path` is the user's file, for messages."""
+    # Absolute: a name that starts with a dash is no option. Output is never ours: the converter prints as it goes.
+    command = [sys.executable, "-c", _CHILD, os.path.abspath(source), source_format, str(target), target_format]
+    done = subprocess.run(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False
+    )
+    if done.returncode == 0:
+        return
+    said = done.stderr.decode("utf-8", "replace").strip().splitlines()
+    last = said[-1] if said else ""
+    if done.returncode == _REFUSED:
+        reason = last.removeprefix("converter: ")
+        if target_format == "ply":
+            raise FormatError(f"{path}: not a file that {CONVERTER} can read ({reason}); is it complete?")
+        raise InputError(f"{path}: {CONVERTER} cannot write this scene as {target_format} ({reason})")
+    if done.returncode < 0:
+        raise FormatError(
+            f"{path}: {CONVERTER} crashed (signal {-done.returncode}); is the file damaged, or memory short?"
+        )
+    if "MemoryError" in last:
+        raise BudgetError(f"{path}: memory does not suffice for {CONVERTER}, which holds the whole scene several times")
+    if "OSError" in last and ("28" in last or "122" in last):
+        raise BudgetError(f"{path}: the disk is full ({last})")
+    raise InputError(f"{path}: {CONVERTER} failed: {last or f'exit code {done.returncode}'}")
+
+
+class _WrappedSource(SceneSource):
+    """A source over another one of the same rows."""
+
+    def __init__(self, parent: SceneSource, name: str, origin: np.ndarray) -> None:
+        self.parent, self.name, self.origin, self.notes = parent, name, origin, parent.notes
+        self.count, self.sh_degree, self.sh_count = parent.count, parent.sh_degree, parent.sh_count
+
+
+class _WorldSource(_WrappedSource):
+    """World positions in float32 whatever the origin, since other formats have no more digits, and unit quaternions.
+
+    The converter does not normalise: `.sog` files of quaternions as 3DGS trains them came out up to 51 degrees wrong.
+    """
+
+    def __init__(self, parent: SceneSource) -> None:
+        super().__init__(parent, parent.name, np.zeros(3))
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`."""
+        planes = self.parent.read(rows, fields, out)
+        if "quats" in planes:
+            planes["quats"][...] = normalize_quats(planes["quats"])
+        if "means" in planes and np.any(self.parent.origin != 0):
+            planes["means"][...] = planes["means"].astype(np.float64) + self.parent.origin[:, None]
+        return planes
+
+
+class _ForeignSource(_WrappedSource):
+    """An expanded scene; opacities of exactly 0 and 1 get finite logits."""
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        expanded: Path,
+        folder: tempfile.TemporaryDirectory[str],
+        format: Format,
+    ) -> None:
+        try:
+            parent = PlySource(expanded)
+        except FlexGSError as error:
+            raise FormatError(f"{path}: not a Gaussian scene as {CONVERTER} reads it: {error}") from error
+        super().__init__(parent, os.fspath(path), parent.origin)
+        self.format = format
+        weakref.finalize(self, folder.cleanup)
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`."""
+        planes = self.parent.read(rows, fields, out)
+        if "opacity_logits" in planes:
+            logits = planes["opacity_logits"]
+            logits[logits == np.inf] = OPACITY_LIMIT
+            logits[logits == -np.inf] = -OPACITY_LIMIT
+        return planes
+
+
+for _suffix in FORMATS:
+    register_reader(_suffix, read_foreign)

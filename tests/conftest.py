@@ -1,0 +1,42 @@
+"""Fixtures that all tests share: where the scenes are."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The checkout."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def sample_dir() -> Path:
+    """The bundled scene: `point_cloud.ply`, `cameras.json`, `images/`."""
+    folder = REPOSITORY / "samples" / "still_life"
+    assert (folder / "point_cloud.ply").is_file(), f"the sample scene is part of the repository, but {folder} lacks it"
+    return folder
+
+
+@pytest.fixture(scope="session")
+def scenes_dir() -> Path:
+    """Larger scenes outside the repository: FLEXGS_SCENES, by default `../shared/scenes`."""
+    folder = Path(os.environ.get("FLEXGS_SCENES", REPOSITORY.parent / "shared" / "scenes"))
+    if not folder.is_dir():
+        pytest.skip(f"no scenes at {folder}: set FLEXGS_SCENES to a folder that has them")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def fox_dir(scenes_dir: Path) -> Path:
+    """The fox scene with its golden renders."""
+    folder = scenes_dir / "fox"
+    if not (folder / "point_cloud.ply").is_file():
+        pytest.skip(f"no fox scene at {folder}: set FLEXGS_SCENES to a folder that has it")
+    return folder
