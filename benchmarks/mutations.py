@@ -141,7 +141,7 @@ MUTATIONS = (
         "(uint)((group + 1) * count / groups))",
         "(uint)((group + 1) * count / groups) + 1)",
     ),
-    Mutation("contraction left to the compiler", "common.clh", "#pragma OPENCL FP_CONTRACT OFF\n", "", reference=False),
+    Mutation("contraction left to the compiler", "common.clh", "#pragma OPENCL FP_CONTRACT OFF\n", ""),
     Mutation(
         "sums in another order",
         "blend_cpu.cl",

@@ -16,13 +16,14 @@ __kernel void residual(
 #endif
 }
 
-// Fixed-point words (low, high) of W rows as float.
-inline FW sum_value(__global const uint *low, __global const uint *high, size_t row, float unit) {
+// Fixed-point words (low, high) of W rows as float; 0 in the last `W - count` lanes, whose words belong to other chunks.
+// Planes of sums are W - 1 elements longer than the scene.
+inline FW sum_value(__global const uint *low, __global const uint *high, size_t row, int count, float unit) {
 #if W == 1
   return convert_float((long)((ulong)low[row] | (ulong)high[row] << 32)) * unit;
 #else
   const CAT(ulong, W) words = CAT(convert_ulong, W)(CAT(vload, W)(0, low + row)) | CAT(convert_ulong, W)(CAT(vload, W)(0, high + row)) << 32;
-  return CAT(convert_float, W)(CAT(as_long, W)(words)) * (FW)unit;
+  return pick(MASK(LANE_INDEX < (IW)count), CAT(convert_float, W)(CAT(as_long, W)(words)) * (FW)unit, (FW)0.0f);
 #endif
 }
 
@@ -52,7 +53,7 @@ __kernel void sh_costs(
 {
   const size_t i = get_global_id(0) * W, s = stride;
   if (i >= count) return;
-  const FW w2 = sum_value(sums + 2 * (size_t)rows, sums + 3 * (size_t)rows, base + i, 1.0f / FIXED_ERROR);
+  const FW w2 = sum_value(sums + 2 * (size_t)rows, sums + 3 * (size_t)rows, base + i, (int)min(count - (uint)i, (uint)W), 1.0f / FIXED_ERROR);
   if (!ANY(MASK(w2 > (FW)0.0f))) return;
   FW x, y, z;
   view_direction(camera, LOADF(means, i), LOADF(means, s + i), LOADF(means, 2 * s + i), &x, &y, &z);
@@ -91,7 +92,8 @@ __kernel void sh_residual(
   FW seen[4];
   for (int c = 0; c < 4; ++c)
     seen[(c + 3) & 3] =
-        sum_value(sums + (size_t)(2 * c) * rows, sums + (size_t)(2 * c + 1) * rows, base + i, 1.0f / FIXED_WEIGHT);
+        sum_value(sums + (size_t)(2 * c) * rows, sums + (size_t)(2 * c + 1) * rows, base + i,
+                  (int)min(count - (uint)i, (uint)W), 1.0f / FIXED_WEIGHT);
   if (!ANY(MASK(seen[3] > (FW)0.0f))) return;
   FW x, y, z;
   view_direction(camera, LOADF(means, i), LOADF(means, s + i), LOADF(means, 2 * s + i), &x, &y, &z);

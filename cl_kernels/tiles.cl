@@ -29,8 +29,8 @@ inline void block_spans(__global const float *r, int band, float width, IW *firs
 // The 16-bit block mask of a tile: bit 4 * row + column. `first` and `last` are the spans of the tile's four block rows.
 // Four lanes whatever W is: a tile has four block rows.
 inline uint tile_mask(int4 first, int4 last, int tile_x) {
-  const int4 from = max(first - 4 * tile_x, 0), to = min(last - 4 * tile_x, 3);
-  const uint4 upto = ((uint4)(2u) << as_uint4(max(to, 0))) - 1u, below = ((uint4)(1u) << as_uint4(min(from, 4))) - 1u;
+  const int4 from = max(first - 4 * tile_x, (int4)0), to = min(last - 4 * tile_x, (int4)3);
+  const uint4 upto = ((uint4)(2u) << as_uint4(max(to, (int4)0))) - 1u, below = ((uint4)(1u) << as_uint4(min(from, (int4)4))) - 1u;
   const uint4 rows = select((uint4)(0u), upto & ~below, from <= to) << (uint4)(0u, 4u, 8u, 12u);
   return (rows.s0 | rows.s1) | (rows.s2 | rows.s3);
 }

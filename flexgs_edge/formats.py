@@ -14,6 +14,7 @@ import tempfile
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,18 @@ import numpy as np
 from flexgs_edge.errors import BudgetError, FlexGSError, FormatError, InputError
 from flexgs_edge.grid import morton
 from flexgs_edge.quantize import normalize_quats
-from flexgs_edge.scene import Planes, PlySource, Rows, SceneSource, check_writable, register_reader, write_ply
+from flexgs_edge.scene import (
+    FIELD,
+    FIELDS,
+    MemorySource,
+    Planes,
+    PlySource,
+    Rows,
+    SceneSource,
+    check_writable,
+    register_reader,
+    write_ply,
+)
 
 CONVERTER = "gaussforge"
 OPACITY_LIMIT = 7.0
@@ -45,6 +57,8 @@ class Format:
     sorted : bool
         Rows must come in an order in which neighbours are near each other: each 256 share a range, and the converter does
         not sort (unsorted, positions of the sample were 7 times worse).
+    probed : bool
+        The converter may write SH in another order than it reads them (see `_sh_places`).
     """
 
     suffix: str
@@ -52,6 +66,7 @@ class Format:
     reach: float = float("inf")
     max_degree: int = 3
     sorted: bool = False
+    probed: bool = False
 
 
 FORMATS: dict[str, Format] = {
@@ -60,7 +75,7 @@ FORMATS: dict[str, Format] = {
         # Positions are 24-bit numbers with 12 bits behind the point.
         Format(".spz", "spz", reach=2.0**11 - 2.0**-12),
         Format(".sog", "sog"),
-        Format(".compressed.ply", "compressed.ply", sorted=True),
+        Format(".compressed.ply", "compressed.ply", sorted=True, probed=True),
     )
 }
 
@@ -154,6 +169,8 @@ def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: b
     # Beside the target: the last step is a rename, and /tmp may be memory.
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=target.parent) as folder:
         plain, finished = Path(folder) / "scene.ply", Path(folder) / f"scene{format.suffix}"
+        if format.probed and source.sh_degree:
+            world.sh_places = _sh_places(format, source.sh_degree)
         write_ply(plain, world.select(_near_order(world)) if format.sorted else world)
         _convert(path, plain, "ply", finished, format.name)
         os.replace(finished, target)
@@ -189,6 +206,31 @@ def _near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
     for axis, line in enumerate(means):
         cells[axis, np.argsort(line, kind="stable")] = np.arange(line.size) * 1024 // line.size
     return np.argsort(morton(cells), kind="stable")
+
+
+@cache
+def _sh_places(format: Format, degree: int) -> np.ndarray:
+    """[3 K] i64: where each SH coefficient must be put so that the converter writes it to its place.
+
+    Version 0.6.0 writes the coefficients of `.compressed.ply` red, green, blue by turns, while it and all others read them
+    channel by channel. What this version does is found out by one Gaussian with a ramp of coefficients, there and back.
+    """
+    width = FIELD["sh_rest"].width(degree)
+    planes = {field.name: np.zeros((field.width(degree), 1), np.float32) for field in FIELDS}
+    planes["sh_rest"][:, 0] = np.linspace(-2, 2, width)
+    planes["quats"][0] = 1
+    with tempfile.TemporaryDirectory(prefix="flexgs-") as folder:
+        plain, coded, back = (Path(folder) / name for name in ("scene.ply", f"scene{format.suffix}", "back.ply"))
+        write_ply(plain, MemorySource(planes, degree))
+        _convert(coded, plain, "ply", coded, format.name)
+        _convert(coded, coded, format.name, back, "ply")
+        found = PlySource(back).read(slice(0, 1), ["sh_rest"])["sh_rest"][:, 0]
+    places = np.rint((found + 2) / 4 * (width - 1)).astype(np.int64)
+    if sorted(places.tolist()) != list(range(width)):
+        raise InputError(
+            f"this version of {CONVERTER} does not keep SH in {format.suffix}; update it or write another format"
+        )
+    return places
 
 
 def _convert(path: str | os.PathLike[str], source: Path, source_format: str, target: Path, target_format: str) -> None:
@@ -234,10 +276,13 @@ class _WorldSource(_WrappedSource):
 
     def __init__(self, parent: SceneSource) -> None:
         super().__init__(parent, parent.name, np.zeros(3))
+        self.sh_places: np.ndarray | None = None
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`."""
         planes = self.parent.read(rows, fields, out)
+        if "sh_rest" in planes and self.sh_places is not None:
+            planes["sh_rest"][self.sh_places] = planes["sh_rest"].copy()
         if "quats" in planes:
             planes["quats"][...] = normalize_quats(planes["quats"])
         if "means" in planes and np.any(self.parent.origin != 0):

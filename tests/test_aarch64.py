@@ -11,7 +11,13 @@ from typing import Any
 
 import pytest
 
-NO_INDEX = ("No matching distribution found for", "Could not fetch URL", "Connection", "Temporary failure", "Network is")
+NO_INDEX = (
+    "No matching distribution found for",
+    "Could not fetch URL",
+    "Connection",
+    "Temporary failure",
+    "Network is",
+)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +31,17 @@ def script(repository: Path) -> ModuleType:
 
 def has_index() -> bool:
     """Whether pip can fetch anything here (a wheel that every index has, for this machine)."""
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--no-deps", "click"]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--dry-run",
+        "--ignore-installed",
+        "--no-deps",
+        "click",
+    ]
     return subprocess.run(command, capture_output=True, check=False, timeout=120).returncode == 0
 
 
@@ -64,7 +80,12 @@ def test_files_that_would_not_install(script: ModuleType, item: dict[str, Any], 
 
 
 def test_markers_are_read_for_the_target(script: ModuleType) -> None:
-    requires = ('old; python_version < "3.11"', 'new>=2; python_version >= "3.11"', 'x86; platform_machine == "x86_64"', "there")
+    requires = (
+        'old; python_version < "3.11"',
+        'new>=2; python_version >= "3.11"',
+        'x86; platform_machine == "x86_64"',
+        "there",
+    )
     items = [chosen("a-1-py3-none-any.whl", requires=requires), chosen("There-1-py3-none-any.whl")]
     assert script.missing(items, "3.10") == ["old"]
     assert script.missing(items, "3.12") == ["new>=2"]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic import look_from, make_camera
 
 from flexgs_edge.cameras import Camera, limit_width, read_cameras, split_views
 from flexgs_edge.errors import InputError
+from synthetic import look_from, make_camera
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "still_life"
 

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import click
 import pytest
-from tiny_project import COUNT, make_project
 
 from flexgs_edge import cli
 from flexgs_edge.adapt import REFINE_STEPS
@@ -22,6 +21,7 @@ from flexgs_edge.cli import words
 from flexgs_edge.errors import BudgetError, DeviceError, InputError, TargetError
 from flexgs_edge.pipeline.options import METHODS, SELECTS, CompressOptions, ViewOptions
 from flexgs_edge.score import SCORES
+from tiny_project import COUNT, make_project
 
 COMMANDS = list(cli.COMMANDS)
 NUMPY = ["--method", "paper", "--device", "numpy", "--effort", "fast", "--holdout", "4"]

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grid_scenes import make_grid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,6 +14,7 @@ from flexgs_edge.codec.octree import TooManyNodes
 from flexgs_edge.codec.rans import StreamError
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import GridScene
+from grid_scenes import make_grid
 
 
 def check_trip(grid: GridScene, chunk_rows: int = 65536) -> int:

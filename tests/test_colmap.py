@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from camera_files import (
     Image,
     Lens,
@@ -17,10 +18,9 @@ from camera_files import (
     lenses_text,
     write_colmap,
 )
-from synthetic import look_from, make_camera
-
 from flexgs_edge.cameras import Camera, Photos, read_cameras, read_colmap
 from flexgs_edge.errors import FormatError, InputError
+from synthetic import look_from, make_camera
 
 HALF = 0.7071067811865476
 LENS: Lens = (1, "PINHOLE", 64, 48, (50.0, 55.0, 32.0, 24.5))
@@ -31,7 +31,9 @@ def cameras() -> list[Camera]:
     made = []
     for index, name in enumerate(("b.jpg", "deep/er/a 1.png", "a.jpg")):
         rotation, translation = look_from(index)
-        made.append(make_camera(40 + index, 30, rotation=rotation, translation=translation, name=name, centre=(19.25, 14.0)))
+        made.append(
+            make_camera(40 + index, 30, rotation=rotation, translation=translation, name=name, centre=(19.25, 14.0))
+        )
     return made
 
 
@@ -76,7 +78,9 @@ def test_binary_comes_before_text(tmp_path: Path) -> None:
 def test_a_model_without_its_other_half(tmp_path: Path) -> None:
     write_colmap(tmp_path, [LENS], [IMAGE])
     (tmp_path / "images.bin").unlink()
-    with pytest.raises(InputError, match=r"expected cameras and images, both .bin or both .txt; found cameras.bin only"):
+    with pytest.raises(
+        InputError, match=r"expected cameras and images, both .bin or both .txt; found cameras.bin only"
+    ):
         read_cameras(tmp_path)
     (tmp_path / "cameras.bin").unlink()
     with pytest.raises(InputError, match="no COLMAP model here"):
@@ -112,7 +116,9 @@ def test_lenses_that_do_not_distort(
 )
 def test_lenses_that_distort(tmp_path: Path, text: bool, model: str, parameters: tuple[float, ...]) -> None:
     folder = write_colmap(tmp_path, [(1, model, 64, 48, parameters)], [IMAGE], text)
-    with pytest.raises(InputError, match=f"lens distortion .model {model}.*colmap image_undistorter --image_path") as caught:
+    with pytest.raises(
+        InputError, match=f"lens distortion .model {model}.*colmap image_undistorter --image_path"
+    ) as caught:
         read_cameras(folder)
     assert "--ignore-distortion" in str(caught.value) and str(folder) in str(caught.value)
     (camera,) = read_cameras(folder, ignore_distortion=True)
@@ -162,10 +168,22 @@ NAN = float("nan")
         ([LENS], [IMAGE, IMAGE], "images 0 and 1: name 'left/a.jpg' appears twice"),
         ([(1, "PINHOLE", 0, 48, LENS[4])], [IMAGE], "size: expected 1 to 65535 pixels a side, found 0x48"),
         ([(1, "PINHOLE", 64, 70000, LENS[4])], [IMAGE], "size: .* found 64x70000"),
-        ([(1, "PINHOLE", 64, 48, (50.0, NAN, 1.0, 1.0))], [IMAGE], "parameters: expected finite numbers, found 50, nan"),
-        ([(1, "PINHOLE", 64, 48, (50.0, 0.0, 1.0, 1.0))], [IMAGE], "focal length: expected above 0 pixels, found 50, 0"),
+        (
+            [(1, "PINHOLE", 64, 48, (50.0, NAN, 1.0, 1.0))],
+            [IMAGE],
+            "parameters: expected finite numbers, found 50, nan",
+        ),
+        (
+            [(1, "PINHOLE", 64, 48, (50.0, 0.0, 1.0, 1.0))],
+            [IMAGE],
+            "focal length: expected above 0 pixels, found 50, 0",
+        ),
         ([(1, "EQUIRECTANGULAR", 64, 48, (1.0, 1.0, 1.0))], [IMAGE], "unknown camera model .*image_undistorter"),
-        ([LENS], [(3, (0.5, 0.0, 0.0, 0.0), *IMAGE[2:])], "rotation: expected a unit quaternion, found one of norm 0.5"),
+        (
+            [LENS],
+            [(3, (0.5, 0.0, 0.0, 0.0), *IMAGE[2:])],
+            "rotation: expected a unit quaternion, found one of norm 0.5",
+        ),
         ([LENS], [(3, (0.0, 0.0, 0.0, 0.0), *IMAGE[2:])], "found one of norm 0"),
         ([LENS], [(3, (NAN, 0.0, 0.0, 0.0), *IMAGE[2:])], "pose: expected finite numbers"),
         ([LENS], [(3, IMAGE[1], (1.0, float("inf"), 0.0), *IMAGE[3:])], "pose: expected finite numbers"),
@@ -188,7 +206,11 @@ def test_bad_models(tmp_path: Path, text: bool, lenses: list[Lens], images: list
         ("cameras.txt", "\xff\xfe", "expected text in UTF-8|CAMERA_ID"),
         ("cameras.txt", "", "camera 1 is not in cameras.txt"),
         ("images.txt", "3 1 0 0 0 1 2 3 1\n\n", "expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"),
-        ("images.txt", "3 1 0 0 0 1 2 3 1 a\n4 1 0 0 0 1 2 3 1 b\n", "the next line has 10 words, expected X Y POINT3D_ID"),
+        (
+            "images.txt",
+            "3 1 0 0 0 1 2 3 1 a\n4 1 0 0 0 1 2 3 1 b\n",
+            "the next line has 10 words, expected X Y POINT3D_ID",
+        ),
         ("images.txt", "3 1 0 0 0 1 2 3 one a\n\n", "expected a whole number, found 'one'"),
         ("images.txt", "# nothing\n\n", "the model has no images"),
     ],

@@ -7,12 +7,12 @@ import json
 from pathlib import Path
 from types import ModuleType
 
-import educational_decoder
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import educational_decoder
 import flexgs_edge.codec.layout as layout
 from flexgs_edge.bitspec import PAPER, BitSpec
 from flexgs_edge.codec.container import ChunkEntry, container_size, read_header, verify, write_container

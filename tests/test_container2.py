@@ -8,10 +8,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from grid_scenes import assert_same_grid, make_grid
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from quantized_scenes import make_scene, quantize_all
 
 from flexgs_edge.codec import (
     GridSource,
@@ -30,6 +28,8 @@ from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.grid import from_grid
 from flexgs_edge.scene import open_scene
 from flexgs_edge.scene.fields import FIELDS
+from grid_scenes import assert_same_grid, make_grid
+from quantized_scenes import make_scene, quantize_all
 
 NAMES = [field.name for field in FIELDS]
 GOLDEN = Path(__file__).parent / "golden"

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from grid_scenes import make_grid
 
 from flexgs_edge.codec import GridSource, channel_bytes, read_header, trim_container, verify, write_grid
 from flexgs_edge.errors import FormatError
 from flexgs_edge.scene.fields import FIELDS
+from grid_scenes import make_grid
 
 NAMES = [field.name for field in FIELDS]
 

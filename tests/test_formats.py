@@ -73,9 +73,23 @@ def degrees_apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 # Half a step of each format, with room for float32: 8-bit opacities, 1/16 (spz), a 256-entry codebook (sog) or 11 bits of a
 # chunk's range (compressed.ply) for scales, and so on. SH of .sog are vectors of a codebook: bound by the spread of the scene.
 BOUNDS = {
-    ".spz": {"means": 2.0**-13, "opacity": 0.6 / 255, "log_scales": 0.032, "sh_dc": 0.014, "sh_rest": 0.07, "degrees": 0.3},
+    ".spz": {
+        "means": 2.0**-13,
+        "opacity": 0.6 / 255,
+        "log_scales": 0.032,
+        "sh_dc": 0.014,
+        "sh_rest": 0.07,
+        "degrees": 0.3,
+    },
     ".sog": {"means": 5e-4, "opacity": 0.6 / 255, "log_scales": 0.04, "sh_dc": 0.02, "sh_rest": 0.41, "degrees": 1.0},
-    ".compressed.ply": {"means": 4e-3, "opacity": 0.6 / 255, "log_scales": 4e-3, "sh_dc": 0.008, "sh_rest": 0.035, "degrees": 0.3},
+    ".compressed.ply": {
+        "means": 4e-3,
+        "opacity": 0.6 / 255,
+        "log_scales": 4e-3,
+        "sh_dc": 0.008,
+        "sh_rest": 0.035,
+        "degrees": 0.3,
+    },
 }
 
 
@@ -113,7 +127,9 @@ def test_another_reader_sees_the_same_scene(tmp_path: Path, suffix: str) -> None
     np.testing.assert_allclose(np.asarray(found.scales).T, ours["log_scales"], atol=1e-5)
     np.testing.assert_allclose(np.asarray(found.sh0).T, ours["sh_dc"], atol=1e-5)
     np.testing.assert_allclose(np.asarray(found.shN).transpose(2, 1, 0).reshape(45, -1), ours["sh_rest"], atol=1e-5)
-    np.testing.assert_allclose(sigmoid(np.asarray(found.opacities).reshape(1, -1)), sigmoid(ours["opacity_logits"]), atol=1e-4)
+    np.testing.assert_allclose(
+        sigmoid(np.asarray(found.opacities).reshape(1, -1)), sigmoid(ours["opacity_logits"]), atol=1e-4
+    )
     assert degrees_apart(np.asarray(found.quats).T, ours["quats"]).max() < 0.1
 
 
@@ -155,7 +171,7 @@ def test_opacities_of_zero_and_one_stay_finite(tmp_path: Path) -> None:
 
 
 def test_scenes_far_from_zero(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"a.spz: .spz holds coordinates up to 2048; row 0 of memory lies at 5000"):
+    with pytest.raises(InputError, match=r"a.spz: .spz holds coordinates up to 2048; row 0 of memory lies at 500"):
         write_foreign(tmp_path / "a.spz", scene(50, far=5000.0))
     notes = write_foreign(tmp_path / "a.compressed.ply", scene(50, far=5000.0))
     assert notes == ("positions rounded to float32: the scene is far from zero",)
@@ -214,7 +230,9 @@ def test_the_expanded_scene_goes_with_the_source(tmp_path: Path) -> None:
 def test_nothing_is_printed(tmp_path: Path) -> None:
     write_foreign(tmp_path / "a.spz", scene(5))
     code = "import sys; from flexgs_edge.formats import read_foreign; print(read_foreign(sys.argv[1]).count)"
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.spz")], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "a.spz")], capture_output=True, text=True, check=True
+    )
     assert (done.stdout, done.stderr) == ("5\n", "")
 
 

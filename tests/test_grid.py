@@ -6,11 +6,11 @@ import json
 
 import numpy as np
 import pytest
-from grid_scenes import STEPS, make_grid, make_planes
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import GridScene, Steps, from_grid, morton, to_grid
 from flexgs_edge.rotations import canonical_axes
+from grid_scenes import STEPS, make_grid, make_planes
 
 
 def rotations(quats: np.ndarray) -> np.ndarray:

@@ -58,7 +58,9 @@ def test_info_of_version_2_shares_every_byte_out(tmp_path: Path) -> None:
     assert channels["position"]["step"] == grid.steps.position and channels["sh degree"]["step"] is None
     assert found["cut_from"] is None and found["chroma"] == grid.steps.chroma
     assert [layer["rows"] for layer in found["layers"]] == np.bincount(grid.layer).tolist()
-    chunks = sum(section.length for section in verify(path) if section.name.startswith("chunk ") and "table" not in section.name)
+    chunks = sum(
+        section.length for section in verify(path) if section.name.startswith("chunk ") and "table" not in section.name
+    )
     assert sum(layer["bytes"] for layer in found["layers"]) == chunks
     assert found["ratio"] == pytest.approx(4000 * 4 * (3 + 3 + 3 + 24 + 1 + 3 + 4) / found["size"], rel=1e-3)
 
@@ -164,7 +166,9 @@ def test_trim_refuses(tmp_path: Path) -> None:
 
 def test_trim_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, _ = written(tmp_path)
-    least = trim(path, tmp_path / "least.fgs", info(path)["layers"][0]["bytes"] + info(path)["overhead_bytes"] + 64)["size"]
+    least = trim(path, tmp_path / "least.fgs", info(path)["layers"][0]["bytes"] + info(path)["overhead_bytes"] + 64)[
+        "size"
+    ]
     assert run("trim", path, "-o", tmp_path / "b.fgs", "--max-size", least, "--json", "-", "-q") == 0
     out = capsys.readouterr()
     record = json.loads(out.out)

@@ -149,7 +149,6 @@ def simulate(call: str, folder: Path) -> str:
     return reported
 
 
-@pytest.mark.xfail(reason="tiles.cl: Oclgrind's max(int4, int) is wrong; score.cl at W=4 reads past the sums")
 @pytest.mark.parametrize(("width", "form"), [(4, "cpu"), (1, "cpu"), (1, "gpu")])
 def test_kernels_break_no_rule(width: int, form: str, tmp_path: Path) -> None:
     assert simulate(f"lane({width}, '{form}')", tmp_path) == ""

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from synthetic import make_camera
 
 from flexgs_edge.cameras import Camera, Photos, read_cameras
 from flexgs_edge.errors import InputError
+from synthetic import make_camera
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "still_life"
 

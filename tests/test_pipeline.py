@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from tiny_project import COUNT, HEIGHT, VIEWS, WIDTH, make_project, write_cameras
 
 import flexgs_edge
 from flexgs_edge.budget import MemoryBudget
@@ -30,6 +29,7 @@ from flexgs_edge.report.result import CompressResult
 from flexgs_edge.report.summary import compress_text
 from flexgs_edge.scene import MemorySource, PlySource, open_scene, write_ply
 from flexgs_edge.scene.fields import FIELD
+from tiny_project import COUNT, HEIGHT, VIEWS, WIDTH, make_project, write_cameras
 
 FAST: dict[str, Any] = {"method": "paper", "device": "numpy", "effort": "fast", "holdout": 4}
 

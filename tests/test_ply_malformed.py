@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scene_files import edit, header, property_names, random_rows, write_rows
 
 from flexgs_edge.errors import FlexGSError, FormatError, InputError
 from flexgs_edge.scene import PlySource
+from scene_files import edit, header, property_names, random_rows, write_rows
 
 GOOD = random_rows(5, 1)
 TEXT = header(GOOD)

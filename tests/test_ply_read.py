@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scene_files import header, planes_of, property_names, random_rows, write_rows
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.scene import FIELDS, PlySource, choose_origin
 from flexgs_edge.scene import ply as ply_module
+from scene_files import header, planes_of, property_names, random_rows, write_rows
 
 ALL = [field.name for field in FIELDS]
 SAMPLE = Path(__file__).parents[1] / "samples" / "still_life" / "point_cloud.ply"

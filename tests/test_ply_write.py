@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scene_files import header, property_names, random_rows, write_rows
 
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.scene import FIELDS, MemorySource, PlySource, inria_dtype, write_ply
+from scene_files import header, property_names, random_rows, write_rows
 
 ALL = [field.name for field in FIELDS]
 SAMPLE = Path(__file__).parents[1] / "samples" / "still_life" / "point_cloud.ply"

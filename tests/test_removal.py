@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import shutil
+import sys
 from collections.abc import Callable, Iterator
-from functools import partial
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.removal_exactness import Exactness, compare_with_renders, kernels_without_ending, spread_over_range
+from benchmarks.removal_exactness import compare_in_float64, kernels_without_ending, spread_over_range
 from flexgs_edge.cameras import Camera, read_cameras, split_views
-from flexgs_edge.constants import FIXED_ERROR, SH_C0
+from flexgs_edge.constants import FIXED_ERROR, SH_C0, TRANSMITTANCE_MIN
 from flexgs_edge.kernels.backend import Backend, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.kernels.twins.project import sh_basis
-from flexgs_edge.render import Renderer
+from flexgs_edge.render import DeviceScene, Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.ply import PlySource
 from flexgs_edge.scene.source import MemorySource, SceneSource
@@ -42,7 +43,7 @@ def no_ending(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Calla
 
     def open_one(form: str) -> Backend:
         if form == "numpy":
-            monkeypatch.setattr("flexgs_edge.kernels.twins.blend.TRANSMITTANCE_MIN", 0.0)
+            monkeypatch.setattr(sys.modules["flexgs_edge.kernels.twins.blend"], "TRANSMITTANCE_MIN", 0.0)
             backend: Backend = TwinBackend(large_budget())
         else:
             backend = OpenCLBackend(default_device(), large_budget())
@@ -54,12 +55,53 @@ def no_ending(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Calla
         backend.close()
 
 
-def exactness(backend: Backend, source: SceneSource, cameras: list[Camera], rows: np.ndarray, near: float = 0.2) -> Exactness:
-    renderer = Renderer(backend, large_budget(), near, background=(0.3, 0.1, 0.6))
+PIXEL_NOISE = 2e-7
+"""Rounding of a float32 render: its difference from the image without one Gaussian is off by about so much in every value."""
+
+
+@dataclass
+class Removed:
+    """Errors of removing single rows: from one scoring pass, from renders with and without, and what rounding explains."""
+
+    measured: np.ndarray
+    rendered: np.ndarray
+    noise: np.ndarray
+
+    @property
+    def beyond_noise(self) -> np.ndarray:
+        """Relative difference that rounding of the renders does not explain."""
+        difference = np.maximum(abs(self.measured - self.rendered) - self.noise, 0)
+        return difference / np.maximum(self.rendered, 1e-30)
+
+
+@contextmanager
+def without(scene: DeviceScene, row: int) -> Iterator[None]:
+    """The scene without one row: its opacity is below what any view shows."""
+    (chunk,) = scene.chunks()
+    before = scene.backend.read(chunk.log2_opacity, np.empty(1, np.float32), row)
+    scene.backend.write(chunk.log2_opacity, np.full(1, -1e3, np.float32), row)
+    yield
+    scene.backend.write(chunk.log2_opacity, before, row)
+
+
+def exactness(backend: Backend, source: SceneSource, cameras: list[Camera], rows: np.ndarray) -> Removed:
+    """Remove each of `rows` alone and render again."""
+    renderer = Renderer(backend, large_budget(), background=(0.3, 0.1, 0.6))
+    measured, rendered, noise = (np.zeros(len(rows)) for _ in range(3))
     with renderer.load(source) as scene:
-        found = compare_with_renders(renderer, scene, cameras, rows)
+        for camera in cameras:
+            sums = renderer.read_sums(renderer.removal_sums(scene, camera), 2, scene.count)
+            measured += sums[0][rows] / FIXED_ERROR
+            whole = renderer.render(scene, camera).astype(np.float64)
+            for place, row in enumerate(rows):
+                with without(scene, int(row)):
+                    difference = abs(renderer.render(scene, camera) - whole)
+                rendered[place] += np.vdot(difference, difference)
+                # The square of difference plus rounding, with every rounding of one sign: a bound.
+                touched = difference[difference > 0]
+                noise[place] += 2 * PIXEL_NOISE * touched.sum() + touched.size * PIXEL_NOISE**2
     renderer.release()
-    return found
+    return Removed(measured, rendered, noise)
 
 
 @pytest.mark.parametrize("form", ["w16", "numpy"])
@@ -71,7 +113,8 @@ def test_removal_is_exact_where_pixels_do_not_end(no_ending, form: str, count: i
         rows = rows[::8]
     found = exactness(no_ending(form), source, poses(2), rows)
     assert (found.rendered > 0).sum() >= 0.6 * len(rows)
-    assert (found.rendered[found.measured == 0] == 0).all()
+    unseen = found.measured == 0
+    assert (found.rendered[unseen] <= found.noise[unseen]).all()
     assert (found.beyond_noise <= 1e-4).all(), found.beyond_noise.max()
 
 
@@ -102,20 +145,24 @@ def test_ending_pixels_change_what_little_they_may(no_ending) -> None:  # type: 
 def test_sample_removals_against_renders(no_ending, sample_dir: Path) -> None:  # type: ignore[no-untyped-def]
     """20 Gaussians across the whole range of costs, on two poses of a trained scene."""
     source, cameras = PlySource(sample_dir / "point_cloud.ply"), read_cameras(sample_dir / "cameras.json")[3:60:30]
-    backend = no_ending("w16")
-    renderer = Renderer(backend, large_budget())
-    with renderer.load(source) as scene:
-        costs = measure_costs(renderer, scene, cameras, sh_costs=False).removal
-        rows = spread_over_range(costs, 20, seed=5)
-        found = compare_with_renders(renderer, scene, cameras, rows)
-    renderer.release()
-    np.testing.assert_allclose(found.measured, costs[rows], rtol=1e-9)
-    assert found.measured.max() > 1e6 * found.measured.min() > 0
-    # Beyond 2e-7 a pixel: what rounding to float32 leaves of the difference of two images.
-    assert (found.beyond_noise <= 1e-4).all(), found
-    ended = exactness(open_form("w16"), source, cameras, rows)
-    print(f"with ending on {(ended.beyond_noise > 0.01).sum()} of 20 are off by more than 1 %")
-    assert (ended.beyond_noise > 0.01).mean() <= 0.35
+    rows = np.zeros(0, np.int64)
+    for backend, least in ((open_form("w16"), TRANSMITTANCE_MIN), (no_ending("w16"), 0.0)):
+        renderer = Renderer(backend, large_budget())
+        with renderer.load(source) as scene:
+            if least:
+                costs = measure_costs(renderer, scene, cameras, sh_costs=False).removal
+                rows = spread_over_range(np.where(costs > 1e-8, costs, 0), 20, seed=5)
+            found = compare_in_float64(renderer, scene, cameras, rows, least)
+        renderer.release()
+        assert found.measured.max() > 1e8 * found.measured.min() > 0
+        off = int((found.relative > 0.01).sum())
+        if least:
+            np.testing.assert_allclose(found.measured, costs[rows], rtol=1e-9)
+            print(f"with ending on {off} of 20 are off by more than 1 %")
+            assert off <= 7
+        else:
+            # Below 1e-5 over two poses, rounding of the image behind to float32 shows.
+            assert (found.relative[found.rendered > 1e-5] <= 1e-4).all() and off <= 1, found
 
 
 def costs_of(backend: Backend, source: SceneSource, cameras: list[Camera], sh_costs: bool = True) -> RemovalCosts:
@@ -162,12 +209,13 @@ def test_sh_costs_are_the_weighted_variance_of_the_colour(degree: int) -> None:
     expected, mean = sh_costs_by_formula(source, moved, by_view)
     seen = costs.weight2 > 0
     assert costs.sh.shape == (degree, 70) and seen.sum() > 40
-    largest = (by_view.sum(axis=0) * np.ones((degree, 1)))[:, seen] * 0.1
-    assert (abs(costs.sh - expected)[:, seen] <= 1e-5 * (expected[:, seen] + largest)).all()
+    # Relative to the squares that the mean's is taken from; and 2^-32 for each of the sums' roundings.
+    squares = expected + costs.weight2 * (mean**2).sum(axis=1)
+    assert (abs(costs.sh - expected) <= 1e-5 * squares + 40 * 2.0**-32)[:, seen].all()
     np.testing.assert_allclose(costs.sh_mean[:, :, seen], mean[:, :, seen], atol=2e-5)
     assert (costs.sh[:, ~seen] == 0).all() and (costs.sh_mean[:, :, ~seen] == 0).all()
     # More bands dropped, and no less lost.
-    assert (np.diff(costs.sh, axis=0) <= 1e-6 * costs.sh[:1]).mean() > 0.5
+    assert (costs.sh[1:] <= costs.sh[:-1]).sum() >= 0.5 * costs.sh[1:].size
 
 
 def test_sh_cost_is_what_a_render_loses_where_one_splat_is_alone() -> None:
@@ -196,7 +244,7 @@ def test_nothing_is_measured_of_nothing() -> None:
     for count in (0, 1):
         costs = costs_of(open_form("w16"), random_scene(count, 36, 1), [])
         assert costs.removal.shape == costs.weight2.shape == (count,) and not costs.weight2.any()
-        assert costs.sh.shape == (1, count) and costs.sh_mean.shape == (1, 3, count)
+        assert costs.sh.shape[1:] == (count,) and costs.sh_mean.shape[1:] == (3, count) and not costs.sh.any()
     behind = make_camera(33, 20, translation=(0.0, 0.0, -50.0))
     costs = costs_of(open_form("w16"), random_scene(7, 36, 2), [behind])
     assert not costs.removal.any() and not costs.sh.any() and not costs.sh_mean.any()

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from scene_files import random_rows, write_rows
 
 from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.scene import PlySource, SceneSource, find_companions, open_scene, register_reader
 from flexgs_edge.scene import model as model_module
+from scene_files import random_rows, write_rows
 
 
 @pytest.fixture

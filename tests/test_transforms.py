@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import colmap_records, transforms_of, write_colmap, write_inria, write_transforms
-from kernel_fixtures import draw, open_form
 from PIL import Image
-from synthetic import look_from, make_camera, random_scene
 
+from camera_files import colmap_records, transforms_of, write_colmap, write_inria, write_transforms
 from flexgs_edge.cameras import Camera, Photos, read_cameras, read_transforms
 from flexgs_edge.errors import FormatError, InputError
+from kernel_fixtures import draw, open_form
+from synthetic import look_from, make_camera, random_scene
 
 # A camera at (1, 2, 3) that looks along the world's x, its image's top towards z (OpenGL: columns right, up, backwards).
 MATRIX = [[0.0, 0.0, -1.0, 1.0], [-1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
@@ -145,7 +145,10 @@ def test_focal_lengths_from_wherever_they_are(tmp_path: Path) -> None:
         ({"fl_x": None, "fl_y": None, "camera_angle_x": angle}, (40.0, 40.0)),
         ({"fl_y": None}, (50.0, 50.0)),
         ({"fl_x": None}, (55.0, 55.0)),
-        ({"fl_x": None, "fl_y": None, "camera_angle_x": angle, "camera_angle_y": 2 * math.atan(24 / 70.0)}, (40.0, 70.0)),
+        (
+            {"fl_x": None, "fl_y": None, "camera_angle_x": angle, "camera_angle_y": 2 * math.atan(24 / 70.0)},
+            (40.0, 70.0),
+        ),
         ({"camera_angle_x": 0.1}, (50.0, 55.0)),
     ):
         (camera,) = read_transforms(write(tmp_path, document(**changes)))
@@ -254,7 +257,10 @@ def test_a_bad_value_is_named_with_its_place(tmp_path: Path, changes: dict[str, 
         ({"frames": 3}, "frames: expected a list of frames, found a number"),
         ({"frames": [3]}, "frame 0: expected an object, found a number"),
         (document(fl_x=None, fl_y=None), "frame 0: no focal length"),
-        (document(fl_x=None, fl_y=None, camera_angle_x=4.0), "camera_angle_x: expected an angle between 0 and pi, found 4"),
+        (
+            document(fl_x=None, fl_y=None, camera_angle_x=4.0),
+            "camera_angle_x: expected an angle between 0 and pi, found 4",
+        ),
         (document(w=None), "frame 0: no size"),
     ],
 )

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from synthetic import look_from, make_camera, random_scene
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera, read_cameras
 from flexgs_edge.kernels import open_backend
 from flexgs_edge.render import Renderer
 from flexgs_edge.scene import open_scene, write_ply
+from synthetic import look_from, make_camera, random_scene
 
 COUNT, VIEWS, WIDTH, HEIGHT = 400, 9, 40, 30
 

@@ -36,7 +36,9 @@ class BitModel:
         return self.base + sum(self.bands[:degree])
 
 
-def choose(costs: RemovalCosts, bits: BitModel, multiplier: float, keep_unseen: bool = True) -> tuple[np.ndarray, np.ndarray]:
+def choose(
+    costs: RemovalCosts, bits: BitModel, multiplier: float, keep_unseen: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
     """The cheapest of {removed, SH 0, ..., SH D} under cost + multiplier * bits, each Gaussian for itself.
 
     Parameters
@@ -65,7 +67,9 @@ def choose(costs: RemovalCosts, bits: BitModel, multiplier: float, keep_unseen: 
     return keep, degrees
 
 
-def drop_bands(planes: dict[str, np.ndarray], degrees: np.ndarray, sh_mean: np.ndarray, y0: float) -> dict[str, np.ndarray]:
+def drop_bands(
+    planes: dict[str, np.ndarray], degrees: np.ndarray, sh_mean: np.ndarray, y0: float
+) -> dict[str, np.ndarray]:
     """Clear SH above `degrees` ([n]) and add the cleared bands' mean colour (`sh_mean`, [D, 3, n]) to the constant."""
     top = len(sh_mean)
     if top == 0:

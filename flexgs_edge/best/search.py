@@ -239,9 +239,19 @@ class RateSearch:
         moved = from_grid(grid)
         if self.refit:
             shared = (path.origin, path.cameras, path.targets)
-            moved = refit_colours(path.renderer, moved, degrees, *shared, rounds=self.effort.refit_rounds, progress=path.progress)
-            coarse = from_grid(recolour(replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree])), moved["sh_dc"], moved["sh_rest"]))
-            moved = refit_colours(path.renderer, coarse, degrees, *shared, rounds=1, bands=False, progress=path.progress)
+            moved = refit_colours(
+                path.renderer, moved, degrees, *shared, rounds=self.effort.refit_rounds, progress=path.progress
+            )
+            coarse = from_grid(
+                recolour(
+                    replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree])),
+                    moved["sh_dc"],
+                    moved["sh_rest"],
+                )
+            )
+            moved = refit_colours(
+                path.renderer, coarse, degrees, *shared, rounds=1, bands=False, progress=path.progress
+            )
         final = replace(grid.steps, dc=steps.dc, sh=steps.sh[: grid.sh_degree])
         return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"])
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.witnesses import Gaussians, Witnesses, gather_witnesses
+from flexgs_edge.cameras.witnesses import SKIN, Gaussians, Witnesses, gather_witnesses
 from flexgs_edge.errors import InputError
 
 DEFAULT_VIEWS = 48
@@ -37,8 +37,10 @@ NEAR_SHARE = 0.15
 """Nothing much may be in a view nearer than this share of the extent."""
 NEAR_CLEAR = 0.7
 """Light that must get through that near part, in the mean over the view."""
-SHARP_PIXELS = 5.0
-"""Deviation of a splat in pixels as cameras usually saw it; a factor of 3 either way is one standard deviation."""
+SHARP = 0.008
+"""Deviation of a splat over its distance as cameras usually saw it (5 pixels of a view 640 wide)."""
+SHARP_SPREAD = math.log(8.0)
+"""One standard deviation of its logarithm: wide, since scenes of few large splats are seen from no farther."""
 AGREEMENT_POWER = 3.0
 SEEN_POWER = 1.0
 """A witness that n views show as well as any place can counts (1 + n)^-SEEN_POWER."""
@@ -79,8 +81,8 @@ def automatic_rig(
     scene = gather_witnesses(source)
     focal = width / 2 / math.tan(FIELD_OF_VIEW / 2)
     places = open_places(scene)
-    for part, kept in ((scene.thinned(QUICK), 4 * POSITIONS), (scene, POSITIONS)):
-        merit = _merit(part, places, focal)
+    for part, kept in ((scene.thinned(QUICK), 2 * POSITIONS), (scene, POSITIONS)):
+        merit = _merit(part, places)
         best = np.argsort(-merit.sum(axis=1), kind="stable")[:kept]
         places, merit = places[best], merit[best]
     # A circle of the frame's area: what is in its corners and beside it evens out.
@@ -110,13 +112,13 @@ def open_places(scene: Witnesses) -> np.ndarray:
     return np.ascontiguousarray(lattice[:, worst <= limit].T)
 
 
-def _merit(scene: Witnesses, places: np.ndarray, focal: float) -> np.ndarray:
+def _merit(scene: Witnesses, places: np.ndarray) -> np.ndarray:
     """[n, M] f64: how well each place shows each witness."""
     merit = np.empty((len(places), scene.weights.size))
     for row, place in enumerate(places):
         distance = np.linalg.norm(scene.means - place[:, None], axis=0)
-        pixels = focal * scene.sizes / np.maximum(distance, 1e-6 * scene.extent)
-        sharp = np.exp(-0.5 * (np.log(np.maximum(pixels, 1e-30) / SHARP_PIXELS) / math.log(3)) ** 2)
+        angles = scene.sizes / np.maximum(distance, 1e-6 * scene.extent)
+        sharp = np.exp(-0.5 * (np.log(np.maximum(angles, 1e-30) / SHARP) / SHARP_SPREAD) ** 2)
         agreement = scene.agreement(place) ** AGREEMENT_POWER
         merit[row] = scene.weights * scene.transmittance(place, scene.means) * sharp * agreement
     return merit
@@ -138,7 +140,7 @@ class _Frame:
 
     def clear(self, scene: Witnesses, place: np.ndarray) -> np.ndarray:
         """[D] bool: directions in which nothing much is near."""
-        ahead = self.directions.T * (NEAR_SHARE * scene.extent + 2 * scene.cell)
+        ahead = self.directions.T * (NEAR_SHARE * scene.extent + SKIN * scene.cell)
         through = scene.transmittance(place, place[:, None] + ahead)
         around = self.directions @ self.directions.T > math.cos(self.cone)
         clear: np.ndarray = around @ through >= NEAR_CLEAR * around.sum(axis=1)

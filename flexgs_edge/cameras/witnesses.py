@@ -27,6 +27,10 @@ BULK = (0.05, 0.95)
 """Quantiles of middle and extent."""
 MARCH = 24
 """Steps of a line of sight through the grid."""
+SPREAD_POINTS = 16
+"""Points that the matter of a splat wider than a cell is spread over."""
+SKIN = 3.0
+"""Cells at a line's end that belong to the surface that is looked at."""
 SH_FLOOR = 0.01
 """Rows whose view-dependent colour is weaker on average do not tell directions."""
 
@@ -57,6 +61,8 @@ class Witnesses:
         [3] f64 first corner and side of the grid's cells.
     depth : np.ndarray
         [x + 2, y + 2, z + 2] f64, optical depth of a cell along its side; a rim of empty cells.
+    smooth : np.ndarray
+        [-1] f64, `depth` averaged over 3 cells each way: lines of sight in steps of some cells do not miss thin walls.
     means : np.ndarray
         [3, M] f64.
     weights : np.ndarray
@@ -74,6 +80,7 @@ class Witnesses:
     corner: np.ndarray
     cell: float
     depth: np.ndarray
+    smooth: np.ndarray
     means: np.ndarray
     weights: np.ndarray
     sizes: np.ndarray
@@ -99,26 +106,28 @@ class Witnesses:
 
     def optical_depth(self, points: np.ndarray) -> np.ndarray:
         """[n] f64 of the cells at `points` ([3, n]); 0 outside the grid."""
-        return self._cells((points - self.corner[:, None]) / self.cell)
+        places = (points - self.corner[:, None]) / self.cell + 1
+        x, y, z = (np.clip(line, 0, n - 1).astype(np.int64) for line, n in zip(places, self.depth.shape))
+        found: np.ndarray = self.depth[x, y, z]
+        return found
 
     def transmittance(self, eye: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """[n] f64: what is left of light from `ends` ([3, n]) at `eye` ([3])."""
-        start = ((eye - self.corner) / self.cell)[:, None]
+        shape = np.array(self.depth.shape)
+        start = (eye - self.corner) / self.cell + 1
         lines = (ends - eye[:, None]) / self.cell
         length = np.linalg.norm(lines, axis=0)
-        # The last cells belong to the surface that is looked at.
-        reach = np.maximum(length - 2, 0.0)
-        lines *= reach / np.maximum(length, 1e-12)
-        total = np.zeros(ends.shape[1])
-        for step in (np.arange(MARCH) + 0.5) / MARCH:
-            total += self._cells(start + lines * step)
-        return np.exp(-total * reach / MARCH)
-
-    def _cells(self, places: np.ndarray) -> np.ndarray:
-        """[n] f64 of the grid at `places` ([3, n], in cells); the rim of empty cells stands for all that is outside."""
-        x, y, z = (np.clip(line + 1, 0, n - 1).astype(np.int64) for line, n in zip(places, self.depth.shape))
-        found: np.ndarray = self.depth[x, y, z]
-        return found
+        # From where the line enters the grid to where it leaves it, or to the surface that is looked at.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sides = np.stack([-start[:, None] / lines, (shape - start)[:, None] / lines])
+        sides = np.where(np.isnan(sides), 0.0, sides)
+        first = np.clip(sides.min(axis=0).max(axis=0), 0.0, 1.0)
+        last = np.minimum(sides.max(axis=0).min(axis=0), 1 - SKIN / np.maximum(length, SKIN))
+        inside = np.maximum(last - first, 0.0)
+        steps = first + inside * ((np.arange(MARCH) + 0.5) / MARCH)[:, None]
+        x, y, z = (np.floor(begin + line * steps).astype(np.int64) for begin, line in zip(start, lines))
+        cells = np.take(self.smooth, (x * shape[1] + y) * shape[2] + z, mode="clip")
+        return np.exp(-cells.mean(axis=0) * inside * length)
 
     def agreement(self, eye: np.ndarray) -> np.ndarray:
         """[M] f64: view-dependent colour towards `eye` over its mean over all directions; 1 for rows that do not tell."""
@@ -138,7 +147,7 @@ def gather_witnesses(source: Gaussians) -> Witnesses:
         When the Gaussians have no extent at all.
     """
     rows = np.arange(0, source.count, max(1, -(-source.count // SAMPLE_ROWS)))
-    sample = source.read(rows, ["means", "opacity_logits", "log_scales"])
+    sample = source.read(rows, ["means", "opacity_logits", "log_scales", "quats"])
     means = sample["means"].astype(np.float64)
     opacity = 1 / (1 + np.exp(-sample["opacity_logits"][0].astype(np.float64)))
     # Far fewer than a float's exponents: squares and products stay finite.
@@ -149,11 +158,11 @@ def gather_witnesses(source: Gaussians) -> Witnesses:
     floor = max(float(half.max()), float(np.median(sizes)))
     if not floor > 0:
         raise InputError(f"{source.name}: automatic cameras: the Gaussians have no extent; give cameras")
-    corner, cell, depth = _grid(means, opacity, deviations, source.count / rows.size)
+    corner, cell, depth = _grid(sample, opacity, deviations, source.count / rows.size)
     picked = np.arange(0, rows.size, max(1, -(-rows.size // WITNESSES)))
     sh, tells = _directions(source, rows[picked])
     return Witnesses(
-        middle, np.maximum(half, 0.05 * floor), corner, cell, depth,
+        middle, np.maximum(half, 0.05 * floor), corner, cell, depth, _smooth(depth),
         means[:, picked], opacity[picked], sizes[picked], sh, tells,
     )  # fmt: skip
 
@@ -170,23 +179,55 @@ def weighted_quantiles(values: np.ndarray, weights: np.ndarray, shares: Sequence
 
 
 def _grid(
-    means: np.ndarray, opacity: np.ndarray, deviations: np.ndarray, share: float
+    sample: dict[str, np.ndarray], opacity: np.ndarray, deviations: np.ndarray, share: float
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """First corner, cell side, and optical depth of each cell along its side.
+    """First corner, cell side, and optical depth of each cell along its side, in a rim of empty cells.
 
-    A splat's matter is its opacity times its mean cross-section, all of it put into the cell of its middle; cross-sections
-    are cut at a cell's face, so that a few huge splats do not fill the scene. Each row stands for `share` rows.
+    A splat's matter is its opacity times its mean cross-section. That of splats wider than a cell is spread over points
+    drawn from the splat, and cut where even these would fill more than a cell each. Each row stands for `share` rows.
     """
+    means = sample["means"].astype(np.float64)
     low, high = np.quantile(means, BOX, axis=1)
     cell = max(float((high - low).max()) / GRID, 1e-9 * float(np.abs(means).max()), 1e-30)
-    shape = np.maximum(1, np.ceil((high - low) / cell)).astype(np.int64)
-    index = np.floor((means - low[:, None]) / cell).astype(np.int64)
-    inside = ((index >= 0) & (index < shape[:, None])).all(axis=0)
+    shape = np.floor((high - low) / cell).astype(np.int64) + 2
+    low = low - cell / 2
     a, b, c = deviations
-    cross_section = np.minimum(2 * math.pi / 3 * (a * b + b * c + a * c), cell * cell)
-    depth = np.zeros(tuple(int(s) for s in shape))
-    np.add.at(depth, tuple(index[:, inside]), (opacity * cross_section)[inside] * share)
-    return low, cell, np.pad(depth / (cell * cell), 1)
+    matter = opacity * 2 * math.pi / 3 * (a * b + b * c + a * c) * share / (cell * cell)
+    wide = c > cell
+    depth = np.zeros(tuple(int(n) for n in shape))
+
+    def add(points: np.ndarray, amounts: np.ndarray) -> None:
+        index = np.floor((points - low[:, None]) / cell).astype(np.int64)
+        inside = ((index >= 0) & (index < shape[:, None])).all(axis=0)
+        np.add.at(depth, tuple(index[:, inside]), amounts[inside])
+
+    add(means[:, ~wide], matter[~wide])
+    axes = rotations(sample["quats"][:, wide]) * np.exp(
+        np.clip(sample["log_scales"][:, wide].astype(np.float64), -40, 40)
+    )
+    part = np.minimum(matter[wide] / SPREAD_POINTS, opacity[wide] * share)
+    for offset in np.random.default_rng(0).normal(size=(SPREAD_POINTS, 3)):
+        add(means[:, wide] + np.einsum("xyn,y->xn", axes, offset), part)
+    return low, cell, np.pad(depth, 1)
+
+
+def rotations(quats: np.ndarray) -> np.ndarray:
+    """[3, 3, n] f64 of quaternions w x y z ([4, n]) of any norm but zero; columns are the splat's axes."""
+    w, x, y, z = quats / np.linalg.norm(quats.astype(np.float64), axis=0)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _smooth(depth: np.ndarray) -> np.ndarray:
+    """[-1] f64: the mean over 3 cells along each axis (the rim is empty, so nothing wraps around)."""
+    for axis in range(3):
+        depth = (np.roll(depth, 1, axis) + depth + np.roll(depth, -1, axis)) / 3
+    return depth.reshape(-1)
 
 
 def _directions(source: Gaussians, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -202,6 +243,8 @@ def _directions(source: Gaussians, rows: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def sh_basis(directions: np.ndarray, count: int) -> np.ndarray:
     """The first `count` (3, 8 or 15) SH functions above degree 0 of unit `directions` ([3, n]): [count, n]."""
+    if not count:
+        return np.zeros((0, directions.shape[1]))
     x, y, z = directions
     xx, yy, zz = x * x, y * y, z * z
     terms = [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
@@ -215,4 +258,4 @@ def sh_basis(directions: np.ndarray, count: int) -> np.ndarray:
             SH_C3[3] * z * (2 * zz - 3 * xx - 3 * yy), SH_C3[4] * x * (4 * zz - xx - yy), SH_C3[5] * z * (xx - yy),
             SH_C3[6] * x * (xx - 3 * yy),
         ]  # fmt: skip
-    return np.array(terms).reshape(count, directions.shape[1])
+    return np.array(terms)

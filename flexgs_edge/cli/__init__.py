@@ -52,7 +52,7 @@ class _LazyGroup(click.Group):
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, "-V", "--version", message="flexgs-edge %(version)s")
 def command() -> None:
-    r"""Make trained 3D Gaussian splatting scenes more than ten times smaller, without training.
+    """Make trained 3D Gaussian splatting scenes more than ten times smaller, without training.
 
     The usual way through, for a scene with its cameras.json and images/ beside it:
 

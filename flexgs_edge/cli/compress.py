@@ -75,7 +75,9 @@ from flexgs_edge.cli import words
     show_default=True,
     help="Gaussians that no training pose sees (best only): kept without SH, or dropped.",
 )
-@words.option("Method", "--refit/--no-refit", default=True, help="Refit colours to what was pruned and quantized (best only).")
+@words.option(
+    "Method", "--refit/--no-refit", default=True, help="Refit colours to what was pruned and quantized (best only)."
+)
 @words.option(
     "Method",
     "--score",
@@ -134,7 +136,7 @@ from flexgs_edge.cli import words
 @words.json_option
 @words.talk_options
 def command(input: str, output: str | None, json_path: str | None, quiet: bool, **options: Any) -> None:
-    r"""Compress a scene: the fewest bytes that hold a quality, or the best quality in a size.
+    """Compress a scene: the fewest bytes that hold a quality, or the best quality in a size.
 
     INPUT is a .ply in INRIA's layout, a .fgs, or a model folder of the 3DGS training program. A cameras.json and an images/
     folder beside it are used and named in the summary. Gaussians are scored over the training poses; then a search

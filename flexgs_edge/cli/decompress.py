@@ -15,7 +15,7 @@ from flexgs_edge.cli import words
 @words.json_option
 @words.talk_options
 def command(input: str, output: str, memory_limit: int | None, force: bool, json_path: str | None, quiet: bool) -> None:
-    r"""Decode a .fgs file to a PLY that every viewer opens.
+    """Decode a .fgs file to a PLY that every viewer opens.
 
     The PLY has INRIA's layout: x y z, normals (zero), colours, opacity, scales and rotations as 32-bit floats, little endian.
     Gaussians that lost their SH above degree 0 get zeros there. Decoding is exact: the same bits on every machine.

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @words.json_option
 @words.talk_options
 def command(device: str | None, force: bool, json_path: str | None, quiet: bool) -> None:
-    r"""List the OpenCL devices, their limits, whether they pass the self-test, and which one is used and why.
+    """List the OpenCL devices, their limits, whether they pass the self-test, and which one is used and why.
 
     The self-test builds and runs a small kernel and compares its result: a runtime that is installed need not work.
 

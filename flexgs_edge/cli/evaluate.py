@@ -28,7 +28,7 @@ from flexgs_edge.cli import words
 def command(
     input: str, against: str, base_psnr: float, force: bool, json_path: str | None, quiet: bool, **options: Any
 ) -> None:
-    r"""Measure what a scene lost against another one, view by view, mean and worst.
+    """Measure what a scene lost against another one, view by view, mean and worst.
 
     Fidelity is the PSNR (and SSIM) between the two scenes' renders. With photos, drop is the PSNR against the photos
     that was lost on the way from REF to INPUT, in dB. Cameras and photos beside REF are used unless given, else those

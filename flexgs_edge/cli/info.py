@@ -13,7 +13,7 @@ from flexgs_edge.cli import words
 @words.json_option
 @words.talk_options
 def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
-    r"""Show what a scene file holds.
+    """Show what a scene file holds.
 
     For a .fgs: Gaussians, SH degree, bits and bytes of every channel and SH degree, layers, the settings it was made with
     and the target it reached (files of --method best are decoded for this; use verify to check every byte). For a .ply or a

@@ -31,7 +31,7 @@ from flexgs_edge.cli import words
 def command(
     input: str, output: str, views: list[int] | None, force: bool, json_path: str | None, quiet: bool, **options: Any
 ) -> None:
-    r"""Draw views of a scene as PNG files, named after the cameras.
+    """Draw views of a scene as PNG files, named after the cameras.
 
     Near plane, background and extent are those that a .fgs was made with, unless given. The time of a view is
     the median over all that were drawn; opening the device, compiling kernels and writing files are not in it.

@@ -33,7 +33,7 @@ from flexgs_edge.cli import words
 def command(
     input: str, output: str, score: str, force: bool, json_path: str | None, quiet: bool, **options: Any
 ) -> None:
-    r"""Score every Gaussian over the training poses, and save the scores.
+    """Score every Gaussian over the training poses, and save the scores.
 
     The file holds one float64 a Gaussian, in the scene's order: the logarithm of the score, -inf for those that no
     training pose sees. `compress --score FILE` then takes only a search. Photos are not compared, but scale the

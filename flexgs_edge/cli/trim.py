@@ -21,7 +21,7 @@ from flexgs_edge.cli import words
 @words.json_option
 @words.talk_options
 def command(input: str, output: str, max_size: int, force: bool, json_path: str | None, quiet: bool) -> None:
-    r"""Cut a layered .fgs file to a size, at the speed of copying.
+    """Cut a layered .fgs file to a size, at the speed of copying.
 
     Needs neither the original nor cameras: the file's layers run from coarse to fine, and any number of the first ones is a
     valid scene. The new file says in info what it was cut from.

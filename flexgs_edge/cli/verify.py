@@ -14,7 +14,7 @@ from flexgs_edge.errors import FormatError
 @words.json_option
 @words.talk_options
 def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
-    r"""Check every byte of a .fgs file against its checksums.
+    """Check every byte of a .fgs file against its checksums.
 
     Names every part with its place, and those that are damaged. Reads the file in pieces, so any size will do.
 

@@ -173,8 +173,12 @@ def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceIn
         usable = [d for d in devices if d.usable]
         if not usable:
             raise DeviceError(f"no OpenCL device passed the self-test: {listing}. To go on, {HINT}")
-        ranked = sorted(usable, key=lambda d: (d.type != "gpu", "portable computing" not in d.platform.lower(), d.index))
-        return ranked[0], "first GPU that works" if ranked[0].type == "gpu" else "no GPU works; first CPU device, PoCL before others"
+        ranked = sorted(
+            usable, key=lambda d: (d.type != "gpu", "portable computing" not in d.platform.lower(), d.index)
+        )
+        return ranked[0], "first GPU that works" if ranked[
+            0
+        ].type == "gpu" else "no GPU works; first CPU device, PoCL before others"
     if spec.isdigit():
         matches = [d for d in devices if d.index == int(spec)]
     elif spec in ("cpu", "gpu"):

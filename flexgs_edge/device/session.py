@@ -89,7 +89,9 @@ class Session:
         kernel.set_scalar_arg_dtypes([SCALARS[kind] for kind in signature])
         return kernel
 
-    def launch(self, label: str, kernel: cl.Kernel, size: tuple[int, ...], local: tuple[int, ...], args: tuple[Any, ...]) -> None:
+    def launch(
+        self, label: str, kernel: cl.Kernel, size: tuple[int, ...], local: tuple[int, ...], args: tuple[Any, ...]
+    ) -> None:
         """Enqueue `kernel`; with `profile` set, wait and add its wall seconds under `label`."""
         start = time.perf_counter() if self.profile is not None else 0.0
         kernel(self.queue, size, local, *(a.buffer if isinstance(a, DeviceArray) else a for a in args))
@@ -105,7 +107,9 @@ class Session:
         """Copy C-contiguous `values` to the flat element `offset` of `array`."""
         values = np.ascontiguousarray(values, array.dtype)
         if values.size:
-            cl.enqueue_copy(self.queue, array.buffer, values, dst_offset=offset * array.dtype.itemsize, is_blocking=True)
+            cl.enqueue_copy(
+                self.queue, array.buffer, values, dst_offset=offset * array.dtype.itemsize, is_blocking=True
+            )
 
     def read(self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
         """Copy `array` (from the flat element `offset` on, as much as `out` holds) to the host, waiting for the queue."""
@@ -116,7 +120,9 @@ class Session:
 
     def fill(self, array: DeviceArray, value: int) -> None:
         """Set every element of `array` to `value`."""
-        cl.enqueue_fill_buffer(self.queue, array.buffer, np.array(value, array.dtype), 0, max(array.nbytes, array.dtype.itemsize))
+        cl.enqueue_fill_buffer(
+            self.queue, array.buffer, np.array(value, array.dtype), 0, max(array.nbytes, array.dtype.itemsize)
+        )
 
     def finish(self) -> None:
         """Wait for everything enqueued."""

@@ -37,7 +37,9 @@ class OpenCLBackend:
 
     is_numpy = False
 
-    def __init__(self, info: DeviceInfo, budget: MemoryBudget, width: int | None = None, form: str | None = None) -> None:
+    def __init__(
+        self, info: DeviceInfo, budget: MemoryBudget, width: int | None = None, form: str | None = None
+    ) -> None:
         start = time.perf_counter()
         self.session = Session(info, budget)
         self.form = form or ("gpu" if info.type == "gpu" else "cpu")

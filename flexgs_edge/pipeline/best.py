@@ -101,16 +101,21 @@ def alive(logits: np.ndarray) -> np.ndarray:
 
 def size_and_bits(grid: GridScene) -> tuple[int, BitModel]:
     """Exact bytes of a grid's file, and what its Gaussians cost: the base from a second coding without SH, the rest shared
-    among the SH coefficients."""
+    among the SH coefficients.
+    """
     size = coded_size(grid, {}) + SETTINGS_MOST
     if grid.sh_degree == 0:
         return size, BitModel(8 * size / max(grid.count, 1), ())
-    bare = replace(grid, sh_degree=0, steps=replace(grid.steps, sh=()), sh_degrees=np.zeros_like(grid.sh_degrees), sh=())
+    bare = replace(
+        grid, sh_degree=0, steps=replace(grid.steps, sh=()), sh_degrees=np.zeros_like(grid.sh_degrees), sh=()
+    )
     base = coded_size(bare, {}) + SETTINGS_MOST
     rows = [int(np.count_nonzero(grid.sh_degrees >= level)) for level in range(1, grid.sh_degree + 1)]
     values = sum((2 * level + 1) * count for level, count in enumerate(rows, start=1))
     each = 8 * (size - base) / max(values, 1)
-    return size, BitModel(8 * base / max(grid.count, 1), tuple((2 * level + 1) * each for level in range(1, grid.sh_degree + 1)))
+    return size, BitModel(
+        8 * base / max(grid.count, 1), tuple((2 * level + 1) * each for level in range(1, grid.sh_degree + 1))
+    )
 
 
 def as_step(step: RateStep, count: int) -> Step:

@@ -90,7 +90,7 @@ def compress(
             None if plan.computes_scores or not plan.needs_scores else load_scores(options.score, scene.source.count)
         )
     with ExitStack() as stack:
-        workspace = stack.enter_context(Workspace(options, budget, clock, views.cameras)) if views is not None else None
+        workspace = stack.enter_context(Workspace(options, budget, clock)) if views is not None else None
         job = _Job(options, scene, views, plan, budget, clock, workspace, progress)
         return job.run(target_path, scores)
 
@@ -180,7 +180,10 @@ class _Job:
             decide.close()
         settings = make_settings(options, plan, self.scene, self.views, search, None)
         if output is None:
-            size, quality = coded_size(grid, settings), self._measure_source(MemorySource(from_grid(grid), origin=grid.origin), report)
+            size, quality = (
+                coded_size(grid, settings),
+                self._measure_source(MemorySource(from_grid(grid), origin=grid.origin), report),
+            )
         else:
             with temporary_name(output, options.force) as place:
                 with self.clock.stage("write"):

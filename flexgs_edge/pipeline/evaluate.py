@@ -65,7 +65,7 @@ def evaluate(
             raise InputError(f"{against}: {NO_CAMERAS}")
         indices = views.held_out or views.train
     with ExitStack() as stack:
-        workspace = stack.enter_context(Workspace(options, budget, clock, views.cameras))
+        workspace = stack.enter_context(Workspace(options, budget, clock))
         renderer = workspace.renderer
         judge = Judge(renderer, reference.source, views, indices, budget, True, base_psnr)
         stack.callback(judge.close)

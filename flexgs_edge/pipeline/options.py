@@ -151,7 +151,9 @@ class CompressOptions(ViewOptions):
             raise InputError(f"--groups {self.groups}: expected 1 or more")
         for name, default in PAPER_ONLY.items():
             if self.method != "paper" and getattr(self, name) != default:
-                raise InputError(f"--{name.replace('_', '-')} belongs to --method paper: leave it out, or ask for that method")
+                raise InputError(
+                    f"--{name.replace('_', '-')} belongs to --method paper: leave it out, or ask for that method"
+                )
         self._check_targets()
         self.bit_spec()
 

@@ -65,7 +65,7 @@ def render_views(
         chosen = _choose(views, len(found.cameras))
         places = _places(Path(output), [found.cameras[i].name for i in chosen], force)
     seconds = []
-    with Workspace(options, budget, clock, found.cameras) as workspace:
+    with Workspace(options, budget, clock) as workspace:
         renderer = workspace.renderer
         with clock.stage("load"):
             device_scene = renderer.load(scene.source)

@@ -65,7 +65,7 @@ def score_gaussians(
             raise InputError(f"{input}: {NO_CAMERAS}")
         if not views.train:
             raise InputError(f"{views.cameras_path}: every view is held out: give more views, or --holdout 0")
-    with Workspace(options, budget, clock, views.cameras) as workspace:
+    with Workspace(options, budget, clock) as workspace:
         renderer = workspace.renderer
         with clock.stage("load"):
             device_scene = renderer.load(scene.source)

@@ -48,7 +48,9 @@ def trim(input: str | Path, output: str | Path, max_size: int, force: bool = Fal
         raise InputError(f"{input}: expected a .fgs file: only these have layers to cut at")
     header = read_header(input)
     if file_version(input) != 2:
-        raise InputError(f"{input}: a .fgs of version 1 has no layers to cut at; compress the original with --method best")
+        raise InputError(
+            f"{input}: a .fgs of version 1 has no layers to cut at; compress the original with --method best"
+        )
     size = trim_container(input, output, max_size, force)
     kept = read_header(output)
     return {

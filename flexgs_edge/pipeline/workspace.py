@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from types import TracebackType
 
 from flexgs_edge.budget import MemoryBudget, current_rss, peak_rss
-from flexgs_edge.cameras import Camera
 from flexgs_edge.kernels import open_backend
 from flexgs_edge.pipeline.options import ViewOptions
 from flexgs_edge.render import Renderer
@@ -51,13 +50,9 @@ class Workspace:
         Everything is taken from it.
     clock : Stopwatch
         Gets the stage `device`.
-    cameras : sequence of Camera
-        Views to come: the largest decides how much memory scenes must leave free.
     """
 
-    def __init__(
-        self, options: ViewOptions, budget: MemoryBudget, clock: Stopwatch, cameras: Sequence[Camera] = ()
-    ) -> None:
+    def __init__(self, options: ViewOptions, budget: MemoryBudget, clock: Stopwatch) -> None:
         assert options.near is not None and options.background is not None and options.extent is not None
         self.budget = budget
         self.clock = clock
@@ -68,7 +63,6 @@ class Workspace:
             # The runtime and its compiler stay loaded: 80 MiB for PoCL with its kernels cached, 210 MiB without.
             budget.take("the OpenCL runtime", max(current_rss() - before, 0) + BUILD_BYTES)
         self.renderer = Renderer(self.backend, budget, options.near, options.background, options.extent)
-        self.renderer.expect(cameras)
 
     def __enter__(self) -> Workspace:
         return self

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -64,27 +65,28 @@ def refit_colours(
     return planes
 
 
-def _normal_sums(
-    renderer: Renderer, scene: DeviceScene, cameras: Sequence[Camera], targets: TargetViews
-) -> np.ndarray:
+def _normal_sums(renderer: Renderer, scene: DeviceScene, cameras: Sequence[Camera], targets: TargetViews) -> np.ndarray:
     """[K + 1, 4, n] f32: for every basis function the back-projected residual of three channels and the weight."""
     backend = renderer.backend
-    arrays = [(chunk, backend.array(((chunk.degree + 1) ** 2, 4, chunk.stride), np.float32)) for chunk in scene.chunks()]
+    arrays: dict[int, tuple[int, Any]] = {}
     try:
-        for _, array in arrays:
-            backend.fill(array, 0)
         for view, camera in enumerate(cameras):
             sums = renderer.residual_sums(scene, camera, targets[view])
-            for chunk, array in arrays:
+            for chunk in scene.chunks():
+                if chunk.base not in arrays:
+                    array = backend.array(((chunk.degree + 1) ** 2, 4, chunk.stride), np.float32)
+                    backend.fill(array, 0)
+                    arrays[chunk.base] = (chunk.count, array)
                 backend.launch(
                     "sh_residual", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, sums.shape[2],
-                    renderer.camera_array, chunk.means, sums, array,
+                    renderer.camera_array, chunk.means, sums, arrays[chunk.base][1],
                 )  # fmt: skip
         normal = np.zeros(((scene.sh_degree + 1) ** 2, 4, scene.count), np.float32)
-        for chunk, array in arrays:
-            normal[: (chunk.degree + 1) ** 2, :, chunk.base : chunk.base + chunk.count] = backend.read(array)[:, :, : chunk.count]
+        for base, (count, array) in arrays.items():
+            sums_of_chunk = backend.read(array)[:, :, :count]
+            normal[: len(sums_of_chunk), :, base : base + count] = sums_of_chunk
     finally:
-        for _, array in arrays:
+        for _, array in arrays.values():
             array.release()
     return normal
 

@@ -18,8 +18,8 @@ from flexgs_edge.scene.source import SceneSource
 CHUNK_ROWS = 1 << 18
 """Most rows of a chunk: 60 MB of planes at SH degree 3, large enough that launches cost nothing."""
 MIN_CHUNK_ROWS = 1 << 10
-VIEW_BYTES = 64 + 4 + 4 + 4 * 4 + 12
-"""Bytes a row that a view needs beside the scene: record, key, bound, the sort's two pairs of buffers, and sums."""
+SUM_BYTES = 12
+"""Bytes a row of a scoring pass's hits and sums."""
 
 
 def plane_bytes(sh_degree: int) -> int:
@@ -63,7 +63,14 @@ def activate_chunk(backend: Backend, base: int, count: int, degree: int, planes:
     cov = backend.array((6, stride), np.float32)
     log2_opacity = backend.array((stride,), np.float32)
     backend.launch(
-        "activate", (stride,), stride, planes["log_scales"], planes["quats"], planes["opacity_logits"], cov, log2_opacity
+        "activate",
+        (stride,),
+        stride,
+        planes["log_scales"],
+        planes["quats"],
+        planes["opacity_logits"],
+        cov,
+        log2_opacity,
     )
     for name in ("log_scales", "quats", "opacity_logits"):
         planes[name].release()
@@ -143,38 +150,58 @@ class QuantizedPlanes:
 class DeviceScene:
     """A scene on a backend. Iterate over `chunks()` for every view; close when done.
 
+    Whether it stays in the backend's memory or is streamed view by view is decided when the first view asks for it, from what
+    that view leaves free; the result is the same.
+
     Parameters
     ----------
     backend : Backend
     planes : SourcePlanes or QuantizedPlanes
         Asked for each chunk once when the scene fits into the budget, once a view when it does not.
     budget : MemoryBudget
-    reserve : int
-        Bytes that the views' own buffers will need.
     """
 
-    def __init__(
-        self, backend: Backend, planes: SourcePlanes | QuantizedPlanes, budget: MemoryBudget, reserve: int = 0
-    ) -> None:
+    def __init__(self, backend: Backend, planes: SourcePlanes | QuantizedPlanes, budget: MemoryBudget) -> None:
         self.backend = backend
         self.count = planes.count
         self.sh_degree = planes.sh_degree if planes.sh_count else 0
         self.origin = planes.origin
         self.statistics: list[Any] = []
+        self.resident = False
         self._planes = planes
+        self._budget = budget
         self._resident: list[Chunk] = []
-        activated, on_top = plane_bytes(planes.sh_degree), planes.upload_bytes
-        sh_less = plane_bytes(0)
-        view = VIEW_BYTES * self.count + reserve
-        whole = planes.sh_count * activated + (self.count - planes.sh_count) * sh_less + view
+        self._rows = 0
+        self._chunk_row_bytes = plane_bytes(planes.sh_degree) + planes.upload_bytes
+        self._least_rows = min(MIN_CHUNK_ROWS, max(self.count, 1))
+
+    @property
+    def least_bytes(self) -> int:
+        """Bytes that drawing must leave to the scene: none once it is loaded, else its smallest chunk."""
+        return 0 if self._resident else padded(self._least_rows) * self._chunk_row_bytes
+
+    def _decide(self) -> None:
+        """Load the scene if it fits, else find the rows of a streamed chunk (fixed from then on)."""
+        planes, budget = self._planes, self._budget
+        later = 0 if self.statistics else SUM_BYTES * padded(self.count + LANES)
+        whole = planes.sh_count * plane_bytes(planes.sh_degree) + (self.count - planes.sh_count) * plane_bytes(0)
         most = min(CHUNK_ROWS, max(self.count, 1))
-        least = min(MIN_CHUNK_ROWS, most)
-        self.resident = budget.free >= whole + most * on_top
-        if self.resident:
-            self._rows = most
+        # Two chunks may be padded at most: the last with SH and the last without.
+        whole += 2 * LANES * self._chunk_row_bytes + later
+        fits = budget.free >= whole + padded(self._rows or self._least_rows) * planes.upload_bytes
+        if not self._rows:
+            spare = budget.free - whole if fits else budget.free - later
+            per_row = planes.upload_bytes if fits else self._chunk_row_bytes
+            self._rows = max(min(most, spare // per_row - LANES), self._least_rows)
+        if fits:
             self._resident = [self._load(*span) for span in self._spans()]
-        else:
-            self._rows = budget.rows("a chunk of the scene", activated + on_top, view, minimum=least, most=most)
+        self.resident = fits
+
+    def evict(self) -> None:
+        """Give the memory of a loaded scene back; the next view decides again."""
+        for chunk in self._resident:
+            chunk.release()
+        self._resident, self.resident = [], False
 
     def _spans(self) -> Iterator[tuple[int, int, int]]:
         """(start, stop, degree): rows with SH first, then the block without."""
@@ -189,6 +216,8 @@ class DeviceScene:
 
     def chunks(self) -> Iterator[Chunk]:
         """The scene's chunks in row order; a streamed chunk lives until the next one is asked for."""
+        if not self.resident:
+            self._decide()
         if self.resident:
             yield from self._resident
             return
@@ -212,9 +241,10 @@ class DeviceScene:
 
     def close(self) -> None:
         """Free everything."""
-        for held in (*self._resident, *self.statistics):
-            held.release()
-        self._resident, self.statistics = [], []
+        self.evict()
+        for array in self.statistics:
+            array.release()
+        self.statistics = []
         self._planes.close()
 
     def __enter__(self) -> DeviceScene:

@@ -10,8 +10,8 @@ import numpy as np
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
-from flexgs_edge.constants import DEFAULT_NEAR, FIXED_WEIGHT, JACOBIAN_MARGIN, TILE
-from flexgs_edge.errors import InputError
+from flexgs_edge.constants import DEFAULT_NEAR, FIXED_WEIGHT, JACOBIAN_MARGIN, LANES, TILE
+from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels import Backend
 from flexgs_edge.quantize import QuantizedScene
 from flexgs_edge.render.device_scene import DeviceScene, QuantizedPlanes, SourcePlanes, padded
@@ -22,6 +22,8 @@ SORT_DIGITS = 1 << SORT_DIGIT_BITS
 PAIR_BYTES = 8
 DEFAULT_PAIRS = 1 << 22
 """Pairs of a batch when memory allows: 32 MiB, one batch for most views."""
+PAIR_SHARE = 8
+"""The tile lists take at most this part (one in eight) of what is free beyond the least: the scene comes next."""
 SUM_BYTES = 12
 """Bytes a row of hits and one fixed-point sum."""
 EXTENTS = ("exact", "inria")
@@ -74,49 +76,65 @@ def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray
     return record.astype(np.float32)
 
 
+def view_key(scene: DeviceScene, camera: Camera) -> tuple[int, int, int]:
+    """What the sizes of a view's buffers depend on."""
+    return scene.count, camera.width, camera.height
+
+
 class _ViewBuffers:
     """Buffers that live as long as the views have one size and one number of rows."""
 
-    def __init__(self, backend: Backend, count: int, width: int, height: int, budget: MemoryBudget) -> None:
-        self.key = (count, width, height)
+    def __init__(self, backend: Backend, scene: DeviceScene, camera: Camera, budget: MemoryBudget) -> None:
+        count, width, height = self.key = view_key(scene, camera)
         self.tiles_x, self.tiles_y = -(-width // TILE), -(-height // TILE)
         self.tiles = self.tiles_x * self.tiles_y
+        self.padded_height, self.padded_width = self.tiles_y * TILE, self.tiles_x * TILE
         self.arrays: list[Any] = []
         self._backend = backend
         self._targets: tuple[Any, Any] | None = None
-        self.padded_height, self.padded_width = self.tiles_y * TILE, self.tiles_x * TILE
-
-        def array(shape: tuple[int, ...], dtype: Any) -> Any:
-            made = backend.array(shape, dtype)
-            self.arrays.append(made)
-            return made
-
+        shapes = {
+            "camera": ((32,), np.float32),
+            "records": ((count, 16), np.float32),
+            "keys": ((count,), np.uint32),
+            "bounds": ((count,), np.uint32),
+            "keys_a": ((count,), np.uint32),
+            "ids_a": ((count,), np.uint32),
+            "keys_b": ((count,), np.uint32),
+            "ids_b": ((count,), np.uint32),
+            "digits": ((SORT_DIGITS * backend.sort_blocks + 1,), np.uint32),
+            "block_pairs": ((backend.sort_blocks,), np.uint64),
+            "ends": ((self.tiles * backend.tile_blocks + 1,), np.uint32),
+            "state": ((self.tiles, 4, TILE * TILE), np.float32),
+            "image": ((3, self.padded_height, self.padded_width), np.float32),
+        }
+        size = sum(int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
+        # One splat may touch every tile, so no batch can be smaller than that. What the scene and the sums of a scoring pass
+        # need at the least is checked with the view, so that one message names a limit that does.
+        later = PAIR_BYTES * self.tiles + SUM_BYTES * padded(count + LANES) + scene.least_bytes
+        budget.require(f"a view of {count} Gaussians at {width}x{height}", size + later)
         try:
-            self.camera = array((32,), np.float32)
-            self.records = array((count, 16), np.float32)
-            self.keys = array((count,), np.uint32)
-            self.bounds = array((count,), np.uint32)
-            self.sorted = [(array((count,), np.uint32), array((count,), np.uint32)) for _ in range(2)]
-            self.digits = array((SORT_DIGITS * backend.sort_blocks + 1,), np.uint32)
-            self.block_pairs = array((backend.sort_blocks,), np.uint64)
-            self.ends = array((self.tiles * backend.tile_blocks + 1,), np.uint32)
-            self.state = array((self.tiles, 4, TILE * TILE), np.float32)
-            self.image = array((3, self.padded_height, self.padded_width), np.float32)
-            # One splat may touch every tile, so no batch can be smaller than that.
-            # The sums of a scoring pass come after this buffer, so their room is kept free.
-            most = max(DEFAULT_PAIRS, self.tiles)
-            self.capacity = budget.rows("the tile lists", PAIR_BYTES, SUM_BYTES * count, minimum=self.tiles, most=most)
-            self.pairs = array((self.capacity, 2), np.uint32)
+            made = {name: self._array(shape, dtype) for name, (shape, dtype) in shapes.items()}
+            spare = max(budget.free - later, 0) // (PAIR_SHARE * PAIR_BYTES)
+            self.capacity = min(self.tiles + spare, max(DEFAULT_PAIRS, self.tiles))
+            self.pairs = self._array((self.capacity, 2), np.uint32)
         except BaseException:
             self.release()
             raise
+        self.camera, self.records, self.keys, self.bounds = (made[n] for n in ("camera", "records", "keys", "bounds"))
+        self.sorted = [(made["keys_a"], made["ids_a"]), (made["keys_b"], made["ids_b"])]
+        self.digits, self.block_pairs, self.ends = made["digits"], made["block_pairs"], made["ends"]
+        self.state, self.image = made["state"], made["image"]
+
+    def _array(self, shape: tuple[int, ...], dtype: Any) -> Any:
+        made = self._backend.array(shape, dtype)
+        self.arrays.append(made)
+        return made
 
     def target_arrays(self) -> tuple[Any, Any]:
         """A target image in half precision and the residual against it, made when first asked for."""
         if self._targets is None:
             pixels = 3 * self.padded_height * self.padded_width
-            self._targets = (self._backend.array((pixels,), np.float16), self._backend.array((pixels,), np.float32))
-            self.arrays += self._targets
+            self._targets = (self._array((pixels,), np.float16), self._array((pixels,), np.float32))
         return self._targets
 
     def release(self) -> None:
@@ -168,7 +186,6 @@ class Renderer:
         self.inria_extent = int(extent == "inria")
         self.splats_shown = 0
         self._buffers: _ViewBuffers | None = None
-        self._reserve = 0
 
     @property
     def camera_array(self) -> Any:
@@ -176,21 +193,15 @@ class Renderer:
         assert self._buffers is not None
         return self._buffers.camera
 
-    def expect(self, cameras: Sequence[Camera]) -> None:
-        """Tell the largest view that is to come: scenes loaded from now on leave its buffers room."""
-        tiles = max((-(-c.width // TILE) * -(-c.height // TILE) for c in cameras), default=0)
-        blocks = self.backend.tile_blocks
-        self._reserve = tiles * (TILE * TILE * (4 + 3) * 4 + 4 * blocks + PAIR_BYTES) + 4 * SORT_DIGITS * self.backend.sort_blocks
-
     def load(self, source: SceneSource) -> DeviceScene:
         """Bring a scene to the backend (all of it, or chunk by chunk for each view when it does not fit)."""
         self.release()
-        return DeviceScene(self.backend, SourcePlanes(self.backend, source), self.budget, self._reserve)
+        return DeviceScene(self.backend, SourcePlanes(self.backend, source), self.budget)
 
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
         """Bring a quantized scene to the backend, dequantized there."""
         self.release()
-        return DeviceScene(self.backend, QuantizedPlanes(self.backend, quantized), self.budget, self._reserve)
+        return DeviceScene(self.backend, QuantizedPlanes(self.backend, quantized), self.budget)
 
     def render(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
         """The image of `scene` from `camera` (world coordinates).
@@ -212,7 +223,7 @@ class Renderer:
         """Add one view to `statistics` (hits and weights of every row)."""
         view = self._prepare(scene, camera)
         hits, sums = self._sum_arrays(scene, 1)
-        self._blend(view, "blend_stats", (hits, sums, padded(scene.count), view.buffers.image))
+        self._blend(view, "blend_stats", (hits, sums, sums.shape[2], view.buffers.image))
         statistics.hits += self.backend.read(hits)
         statistics.weights += self.read_sums(sums, 1, scene.count)[0].view(np.uint64)
 
@@ -227,7 +238,7 @@ class Renderer:
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, 2)
-        self._blend(view, "blend_removal", (hits, sums, padded(scene.count), view.buffers.image), again=True)
+        self._blend(view, "blend_removal", (hits, sums, sums.shape[2], view.buffers.image), again=True)
         return sums
 
     def residual_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
@@ -250,7 +261,7 @@ class Renderer:
         half, residual = view.buffers.target_arrays()
         self.backend.write(half, target.reshape(-1))
         self.backend.launch("residual", (residual.shape[0],), residual.shape[0], half, view.buffers.image, residual)
-        self._blend(view, "blend_residual", (hits, sums, padded(scene.count), residual), again=True)
+        self._blend(view, "blend_residual", (hits, sums, sums.shape[2], residual), again=True)
         return sums
 
     def read_sums(self, sums: Any, channels: int, count: int) -> np.ndarray:
@@ -265,7 +276,7 @@ class Renderer:
                 array.release()
             held = scene.statistics = []
         if not held:
-            shapes = (((scene.count,), np.uint32), ((channels, 2, padded(scene.count)), np.uint32))
+            shapes = (((scene.count,), np.uint32), ((channels, 2, padded(scene.count + LANES)), np.uint32))
             held = scene.statistics = [self.backend.array(shape, dtype) for shape, dtype in shapes]
         for array in held:
             self.backend.fill(array, 0)
@@ -300,10 +311,14 @@ class Renderer:
             )  # fmt: skip
 
     def _view_buffers(self, scene: DeviceScene, camera: Camera) -> _ViewBuffers:
-        key = (scene.count, camera.width, camera.height)
-        if self._buffers is None or self._buffers.key != key:
+        if self._buffers is None or self._buffers.key != view_key(scene, camera):
             self.release()
-            self._buffers = _ViewBuffers(self.backend, *key, self.budget)
+            try:
+                self._buffers = _ViewBuffers(self.backend, scene, camera, self.budget)
+            except BudgetError:
+                # A larger view than before: the scene gives up its place and is streamed from now on if need be.
+                scene.evict()
+                self._buffers = _ViewBuffers(self.backend, scene, camera, self.budget)
         return self._buffers
 
     def _sort(self, count: int, buffers: _ViewBuffers) -> tuple[int, int]:
@@ -311,7 +326,9 @@ class Renderer:
         backend, blocks = self.backend, self.backend.sort_blocks
         (keys_a, ids_a), (keys_b, ids_b) = buffers.sorted
         cells = SORT_DIGITS * blocks
-        backend.launch("sort_count_first", (blocks,), count, buffers.keys, buffers.bounds, buffers.digits, buffers.block_pairs)
+        backend.launch(
+            "sort_count_first", (blocks,), count, buffers.keys, buffers.bounds, buffers.digits, buffers.block_pairs
+        )
         backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
         backend.launch("sort_scatter_first", (blocks,), count, buffers.keys, buffers.digits, keys_a, ids_a)
         shown = int(backend.read(buffers.digits, np.empty(1, np.uint32), cells)[0])

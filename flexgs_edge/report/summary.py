@@ -43,9 +43,7 @@ def compress_text(result: CompressResult) -> str:
     lines += _decision_lines(result)
     if result.quality is not None:
         decoded = "decoded file" if result.output else "as it would decode"
-        lines += _quality_lines(
-            result.quality, f"{decoded}, {len(result.quality.views)} {result.quality_views} views"
-        )
+        lines += _quality_lines(result.quality, f"{decoded}, {len(result.quality.views)} {result.quality_views} views")
     if result.scores_saved:
         lines.append(_line("scores", f"saved to {result.scores_saved}"))
     return _text([*lines, *_run_lines(result.run)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -27,16 +28,19 @@ def load_scores(path: str | Path, count: int) -> np.ndarray:
     """
     path = Path(path)
     try:
-        loaded = np.load(path, allow_pickle=False)
+        # Opened here: np.load would leave a broken archive open.
+        with open(path, "rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            if isinstance(loaded, np.lib.npyio.NpzFile):
+                with loaded as archive:
+                    if len(archive.files) != 1:
+                        names = ", ".join(archive.files)
+                        raise InputError(f"{path}: expected one array, found {len(archive.files)}: {names}")
+                    loaded = archive[archive.files[0]]
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such score file (.npy or .npz)") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: not a NumPy file of scores: {error}") from error
-    if isinstance(loaded, np.lib.npyio.NpzFile):
-        with loaded as archive:
-            if len(archive.files) != 1:
-                raise InputError(f"{path}: expected one array, found {len(archive.files)}: {', '.join(archive.files)}")
-            loaded = archive[archive.files[0]]
     if loaded.shape != (count,) or loaded.dtype.kind not in "fiu":
         raise InputError(
             f"{path}: expected {count} numbers, one a Gaussian of the scene; found shape {loaded.shape}, dtype {loaded.dtype}"
@@ -44,7 +48,9 @@ def load_scores(path: str | Path, count: int) -> np.ndarray:
     scores = loaded.astype(np.float64)
     bad = np.flatnonzero(np.isnan(scores) | (scores == np.inf))
     if len(bad):
-        raise InputError(f"{path}: {len(bad)} scores are NaN or +inf, the first at row {bad[0]}: expected numbers to rank by")
+        raise InputError(
+            f"{path}: {len(bad)} scores are NaN or +inf, the first at row {bad[0]}: expected numbers to rank by"
+        )
     return scores
 
 

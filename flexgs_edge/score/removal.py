@@ -16,7 +16,6 @@ from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import FIXED_ERROR, FIXED_WEIGHT
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import DeviceScene, Renderer
-from flexgs_edge.render.device_scene import Chunk
 
 
 @dataclass
@@ -95,30 +94,31 @@ class _Moments:
 
     def __init__(self, renderer: Renderer, scene: DeviceScene, degree: int) -> None:
         self.renderer, self.scene, self.degree = renderer, scene, degree
-        self.arrays: list[tuple[Chunk, Any]] = []
-        if degree:
-            backend = renderer.backend
-            for chunk in scene.chunks():
-                if chunk.degree:
-                    array = backend.array((degree, 4, chunk.stride), np.int64)
-                    backend.fill(array, 0)
-                    self.arrays.append((chunk, array))
+        self.arrays: dict[int, tuple[int, Any]] = {}
 
     def add_view(self, sums: Any) -> None:
+        if not self.degree:
+            return
         backend, camera = self.renderer.backend, self.renderer.camera_array
-        for chunk, array in self.arrays:
+        for chunk in self.scene.chunks():
+            if not chunk.degree:
+                continue
+            if chunk.base not in self.arrays:
+                array = backend.array((self.degree, 4, chunk.stride), np.int64)
+                backend.fill(array, 0)
+                self.arrays[chunk.base] = (chunk.count, array)
             backend.launch(
                 "sh_costs", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, sums.shape[2],
-                camera, chunk.means, chunk.sh_rest, sums, array,
+                camera, chunk.means, chunk.sh_rest, sums, self.arrays[chunk.base][1],
             )  # fmt: skip
 
     def finish(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Costs ([D, N]) and mean colours ([D, 3, N]) from the moments and the sum of weights ([N])."""
         count = self.scene.count
         costs, means = np.zeros((self.degree, count)), np.zeros((self.degree, 3, count), np.float32)
-        for chunk, array in self.arrays:
-            rows = slice(chunk.base, chunk.base + chunk.count)
-            moments = self.renderer.backend.read(array)[:, :, : chunk.count] / FIXED_WEIGHT
+        for base, (chunk_count, array) in self.arrays.items():
+            rows = slice(base, base + chunk_count)
+            moments = self.renderer.backend.read(array)[:, :, :chunk_count] / FIXED_WEIGHT
             divisor = np.where(weight[rows] > 0, weight[rows], 1.0)
             # Rounding may leave a variance of nothing slightly below zero.
             costs[:, rows] = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
@@ -126,6 +126,6 @@ class _Moments:
         return costs, means
 
     def release(self) -> None:
-        for _, array in self.arrays:
+        for _, array in self.arrays.values():
             array.release()
-        self.arrays = []
+        self.arrays = {}

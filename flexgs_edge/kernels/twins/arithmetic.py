@@ -59,8 +59,6 @@ def flog2(x: np.ndarray) -> np.ndarray:
     return fma(p, f, e.astype(f32))
 
 
-def dot3(
-    ax: np.ndarray, ay: np.ndarray, az: np.ndarray, bx: np.ndarray, by: np.ndarray, bz: np.ndarray
-) -> np.ndarray:
+def dot3(ax: np.ndarray, ay: np.ndarray, az: np.ndarray, bx: np.ndarray, by: np.ndarray, bz: np.ndarray) -> np.ndarray:
     """Dot product with two fused steps, as `dot3` in common.clh."""
     return fma(az, bz, fma(ay, by, ax * bx))

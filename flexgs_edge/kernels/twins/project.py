@@ -65,7 +65,12 @@ def sh_basis(degree: int, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[n
 
 
 def _bounds(
-    inria_extent: int, mx: np.ndarray, my: np.ndarray, half: tuple[np.ndarray, np.ndarray], radius: np.ndarray, cam: np.ndarray
+    inria_extent: int,
+    mx: np.ndarray,
+    my: np.ndarray,
+    half: tuple[np.ndarray, np.ndarray],
+    radius: np.ndarray,
+    cam: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Tiles of the bounding box, and whether there are any."""
     per_tile, spans = f32(1.0 / TILE), []
