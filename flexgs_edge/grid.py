@@ -274,7 +274,8 @@ def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray) -> GridSce
     """The same rows with other colours ([3, n] and [3 * K, n] f32, in the grid's row order) put on the same steps."""
     rows = np.arange(grid.count)
     dc = _colour_codes("sh_dc", sh_dc[:, None], grid.steps.colour(grid.steps.dc), rows)[:, 0]
-    bands = tuple(_band_codes(sh_rest, l, rows[grid.sh_degrees >= l], grid.steps) for l in range(1, grid.sh_degree + 1))
+    degrees = range(1, grid.sh_degree + 1)
+    bands = tuple(_band_codes(sh_rest, d, rows[grid.sh_degrees >= d], grid.steps) for d in degrees)
     return replace(grid, dc=dc, sh=bands)
 
 

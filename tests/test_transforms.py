@@ -1,4 +1,4 @@
-"""NeRF's and nerfstudio's transforms.json: axes, frames of training, sizes and focal lengths from wherever they are, malformations."""
+"""NeRF's and nerfstudio's transforms.json: axes, frames of training, sizes and focal lengths, malformations."""
 
 from __future__ import annotations
 

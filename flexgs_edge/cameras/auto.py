@@ -28,6 +28,9 @@ MARGIN = 1.2
 """The lattice reaches this many half sides beyond the middle box on each side."""
 POSITIONS = 200
 """Best candidates that views are made from."""
+SHOWN_SHARE = 0.65
+"""Places that show less than this share of what the best one shows, in all directions together, are left out: whoever is
+inside a room sees all walls, from outside it is half of them."""
 QUICK = 5
 """Every 5th witness judges all candidates, all of them judge the better ones: a third of the time, the same views."""
 DIRECTIONS = 192
@@ -82,8 +85,9 @@ def automatic_rig(
     focal = width / 2 / math.tan(FIELD_OF_VIEW / 2)
     places = open_places(scene)
     for part, kept in ((scene.thinned(QUICK), 2 * POSITIONS), (scene, POSITIONS)):
-        merit = _merit(part, places)
-        best = np.argsort(-merit.sum(axis=1), kind="stable")[:kept]
+        merit, shown = _merit(part, places)
+        rank = np.where(shown >= SHOWN_SHARE * shown.max(), merit.sum(axis=1), 0.0)
+        best = np.argsort(-rank, kind="stable")[: min(kept, int((rank > 0).sum()) or 1)]
         places, merit = places[best], merit[best]
     # A circle of the frame's area: what is in its corners and beside it evens out.
     frame = _Frame(fibonacci(DIRECTIONS), math.atan(math.sqrt(width * height / math.pi) / focal))
@@ -112,16 +116,18 @@ def open_places(scene: Witnesses) -> np.ndarray:
     return np.ascontiguousarray(lattice[:, worst <= limit].T)
 
 
-def _merit(scene: Witnesses, places: np.ndarray) -> np.ndarray:
-    """[n, M] f64: how well each place shows each witness."""
+def _merit(scene: Witnesses, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How well each place shows each witness ([n, M] f64), and how much of the scene each place is meant to show ([n] f64)."""
     merit = np.empty((len(places), scene.weights.size))
+    shown = np.empty(len(places))
     for row, place in enumerate(places):
         distance = np.linalg.norm(scene.means - place[:, None], axis=0)
         angles = scene.sizes / np.maximum(distance, 1e-6 * scene.extent)
         sharp = np.exp(-0.5 * (np.log(np.maximum(angles, 1e-30) / SHARP) / SHARP_SPREAD) ** 2)
         agreement = scene.agreement(place) ** AGREEMENT_POWER
-        merit[row] = scene.weights * scene.transmittance(place, scene.means) * sharp * agreement
-    return merit
+        visible = scene.weights * scene.transmittance(place, scene.means) * agreement
+        merit[row], shown[row] = visible * sharp, visible.sum()
+    return merit, shown
 
 
 @dataclass(frozen=True)

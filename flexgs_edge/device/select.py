@@ -125,7 +125,7 @@ def run_self_test(device: Any) -> str:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             context = cl.Context([device])
-            program = cl.Program(context, _SELF_TEST).build(options=["-cl-std=CL1.2"], cache_dir=False)
+            program = cl.Program(context, _SELF_TEST).build(options=["-cl-std=CL1.2"], cache_dir=False)  # type: ignore[arg-type]
         queue = cl.CommandQueue(context)
         inputs = [cl.Buffer(context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=x) for x in (a, b)]
         output = cl.Buffer(context, flags.WRITE_ONLY, got.nbytes)

@@ -58,6 +58,7 @@ class Session:
     def __init__(self, info: DeviceInfo, budget: MemoryBudget) -> None:
         self.info = info
         self.budget = budget
+        assert info.handle is not None
         self.context = cl.Context([info.handle])
         self.queue = cl.CommandQueue(self.context)
         self.compile_seconds = 0.0
@@ -78,10 +79,11 @@ class Session:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # CompilerWarning on any build log, such as PoCL's remarks
                 try:
-                    built = cl.Program(self.context, source).build(options=["-cl-std=CL1.2", *options], cache_dir=False)
+                    built = cl.Program(self.context, source).build(options=["-cl-std=CL1.2", *options], cache_dir=False)  # type: ignore[arg-type]
                 except cl.Error as error:
+                    device = f"{self.info.name} ({self.info.platform})"
                     raise DeviceError(
-                        f"kernel {name} does not build on {self.info.name} ({self.info.platform}) with {' '.join(options)}:\n{error}"
+                        f"kernel {name} does not build on {device} with {' '.join(options)}:\n{error}"
                     ) from error
             self._programs[key] = built
             self.compile_seconds += time.perf_counter() - start

@@ -100,8 +100,9 @@ def alive(logits: np.ndarray) -> np.ndarray:
 
 
 def size_and_bits(grid: GridScene) -> tuple[int, BitModel]:
-    """Exact bytes of a grid's file, and what its Gaussians cost: the base from a second coding without SH, the rest shared
-    among the SH coefficients.
+    """Exact bytes of a grid's file, and what its Gaussians cost.
+
+    The base is known from a second coding without SH; the rest is shared among the SH coefficients.
     """
     size = coded_size(grid, {}) + SETTINGS_MOST
     if grid.sh_degree == 0:

@@ -37,7 +37,7 @@ class TargetViews:
         scratch: str | Path | None = None,
         progress: Progress = SILENT,
     ) -> None:
-        self._file = tempfile.TemporaryFile(dir=scratch)
+        self._file = tempfile.TemporaryFile(dir=scratch)  # noqa: SIM115 (closed with the object)
         self._places: list[tuple[int, tuple[int, ...]]] = []
         offset = 0
         try:

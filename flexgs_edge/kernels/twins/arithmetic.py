@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any, Union
+
 import numpy as np
 
 from flexgs_edge.constants import EXP2_HIGH, EXP2_LOW, EXP2_MAGIC, EXP2_POLY, LOG2_PIVOT, LOG2_POLY
 
 f32 = np.float32
+Values = Union[np.ndarray, "np.floating[Any]"]
+"""An array of float32, or one float32."""
 
 _TIE_BITS = np.int64(0x1FFFFFFF)
 _TIE = np.int64(0x10000000)
 
 
-def fma(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+def fma(a: Values, b: Values, c: Values) -> np.ndarray:
     """`a * b + c` rounded once to float32.
 
     The product of two float32 is exact in float64; the sum is rounded to float64 and then to float32. Rounding twice goes wrong
@@ -59,6 +63,7 @@ def flog2(x: np.ndarray) -> np.ndarray:
     return fma(p, f, e.astype(f32))
 
 
-def dot3(ax: np.ndarray, ay: np.ndarray, az: np.ndarray, bx: np.ndarray, by: np.ndarray, bz: np.ndarray) -> np.ndarray:
-    """Dot product with two fused steps, as `dot3` in common.clh."""
+def dot3(*parts: np.ndarray) -> np.ndarray:
+    """Dot product of (ax, ay, az) and (bx, by, bz), given in this order, with two fused steps, as `dot3` in common.clh."""
+    ax, ay, az, bx, by, bz = parts
     return fma(az, bz, fma(ay, by, ax * bx))

@@ -151,8 +151,8 @@ def blend(
         if finish:
             image[:, ys, xs] = fma(np.abs(trans), background[:, None, None], colour)
         else:
-            own = np.concatenate([colour, trans[None]]).reshape(4, last - first, 16, 16)
-            state[first:last] = own.transpose(1, 0, 2, 3).reshape(last - first, 4, 256)
+            out = np.concatenate([colour, trans[None]]).reshape(4, last - first, 16, 16)
+            state[first:last] = out.transpose(1, 0, 2, 3).reshape(last - first, 4, 256)
 
 
 def _blend_blocks(

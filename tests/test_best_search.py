@@ -1,0 +1,239 @@
+"""The search over one multiplier, on a world whose size and loss are known functions of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flexgs_edge.adapt import MaxDrop, Measurement, MinFidelity, Target
+from flexgs_edge.adapt.targets import MaxSize
+from flexgs_edge.best.choice import BitModel
+from flexgs_edge.best.path import Snapshot, take_rows
+from flexgs_edge.best.search import CLOSE, EFFORTS, EXTRA_STEPS, Effort, RateResult, RateSearch, RateStep
+from flexgs_edge.best.steps import GEOMETRY, Slopes, choose_steps
+from flexgs_edge.errors import TargetError
+from flexgs_edge.grid import GridScene
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.score.removal import RemovalCosts
+from synthetic import random_scene
+
+SLOPES = Slopes(dict.fromkeys(GEOMETRY, 100.0))
+UNIT = choose_steps(SLOPES, np.ones(1), np.zeros(1), 0, 1.0).opacity
+EFFORT = Effort(keep=0.8, refit_rounds=1, steps=4, views=8)
+AT = 1e-4
+BYTES = 4000
+"""The multiplier at which the worlds lose 1 dB, and the bytes that they take there (53 bits for each of 600 Gaussians)."""
+
+
+class FakePath:
+    """A path whose costs are known: descending removes the cheapest and changes no cost."""
+
+    renderer = origin = cameras = targets = None
+
+    def __init__(self, count: int = 600, degree: int = 1, unseen: int = 0, scale: float = 1.0) -> None:
+        rng = np.random.default_rng(81)
+        planes = random_scene(count, 82, degree).read(slice(0, count), list(FIELD))
+        weight2 = np.where(np.arange(count) < unseen, 0.0, 1.0)
+        removal = rng.lognormal(math.log(scale * AT * 50), 3, count) * (weight2 > 0)
+        sh = rng.lognormal(math.log(scale * AT * 10), 2, (degree, count)) * (weight2 > 0)
+        costs = RemovalCosts(removal, weight2, sh, np.zeros((degree, 3, count), np.float32))
+        self.origin = np.zeros(3)
+        self.snapshots = [Snapshot(np.arange(count), planes, costs)]
+        self.shares: list[float] = []
+
+    def descend(self, share: float) -> Snapshot:
+        self.shares.append(share)
+        last = self.snapshots[-1]
+        keep = np.flatnonzero(last.cheapest(last.count - round(last.count * share)))
+        c = last.costs
+        costs = RemovalCosts(c.removal[keep], c.weight2[keep], c.sh[:, keep], c.sh_mean[:, :, keep])
+        self.snapshots.append(Snapshot(last.rows[keep], take_rows(last.planes, keep), costs))
+        return self.snapshots[-1]
+
+
+class World:
+    """Size and loss as functions of the multiplier, which is read back from the grid's steps."""
+
+    def __init__(self, loss: Callable[[float], float], size: Callable[[float], float], floor: float = 0.0) -> None:
+        self.loss, self.size, self.floor = loss, size, floor
+        self.grids: list[GridScene] = []
+        self.multiplier: float | None = None
+        self.path = FakePath()
+        self.bits = BitModel(40.0, (12.0,))
+
+    def size_of(self, grid: GridScene) -> tuple[int, BitModel]:
+        self.grids.append(grid)
+        self.multiplier = (grid.steps.opacity / UNIT) ** 2
+        return round(self.size(self.multiplier)), self.bits
+
+    def measure(self, planes: dict[str, np.ndarray]) -> Measurement:
+        if self.multiplier is None:  # the walk down, before anything was coded: pruning alone
+            costs = self.path.snapshots[-1].costs
+            least = costs.removal[costs.weight2 > 0].min(initial=1e9)
+            drop = 0.45 * max(self.loss(max(least / 50, 1e-30)), self.floor)
+        else:
+            drop = max(self.loss(self.multiplier), self.floor)
+        return Measurement(drop, 42 - 10 * math.log10(max(drop, 1e-9)), drop)
+
+
+def powers(loss: float = 0.6, size: float = -0.45) -> World:
+    return World(lambda m: (m / AT) ** loss, lambda m: BYTES * (m / AT) ** size)
+
+
+@pytest.fixture(autouse=True)
+def _known_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flexgs_edge.best.search.probe_slopes", lambda *_: SLOPES)
+
+
+def search(
+    world: World, target: Target, path: FakePath | None = None, best_effort: bool = False, **words: Any
+) -> RateResult:
+    words = {"effort": EFFORT, "refit": False, **words}
+    world.path = path or FakePath()
+    found = RateSearch(world.path, world.size_of, world.measure, **words)  # type: ignore[arg-type]
+    return found.run(target, best_effort)
+
+
+def best_of(steps: tuple[RateStep, ...]) -> RateStep:
+    """The smallest step that holds."""
+    return min((step for step in steps if step.holds), key=lambda step: step.size)
+
+
+@pytest.mark.parametrize("target", [MaxDrop(1.0), MaxDrop(0.1), MaxDrop(3.0), MinFidelity(42.0), MinFidelity(48.0)])
+@pytest.mark.parametrize("loss", [0.5, 0.6, 0.8, 1.2])
+def test_smooth_worlds_are_met_closely_with_few_steps(loss: float, target: Target) -> None:
+    found = search(powers(loss), target)
+    assert found.reached and found.chosen.holds and found.chosen == best_of(found.steps)
+    assert -0.15 < found.chosen.excess <= 0, [step.excess for step in found.steps]
+    assert EFFORT.steps <= len(found.steps) <= EFFORT.steps + EXTRA_STEPS
+    assert found.chosen.excess > -CLOSE or len(found.steps) == EFFORT.steps + EXTRA_STEPS
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_the_unit_of_errors_does_not_matter(scale: float) -> None:
+    world = World(lambda m: (m / (scale * AT)) ** 0.6, lambda m: BYTES * (m / (scale * AT)) ** -0.45)
+    found = search(world, MaxDrop(1.0), FakePath(scale=scale))
+    assert found.reached and found.chosen.excess > -CLOSE
+    assert found.chosen.multiplier == pytest.approx(scale * AT, rel=0.1)
+
+
+@pytest.mark.parametrize("wiggle", [0.1, 0.3])
+@pytest.mark.parametrize("pace", [3.0, 11.0])
+def test_a_rough_world_gives_the_best_point_that_was_seen(pace: float, wiggle: float) -> None:
+    """The loss falls again in places, as it does where another snapshot is taken."""
+    world = World(
+        lambda m: (m / AT) ** 0.6 * (1 + wiggle * math.sin(pace * math.log(m))), lambda m: BYTES * (m / AT) ** -0.45
+    )
+    found = search(world, MaxDrop(1.0))
+    assert found.reached and found.chosen == best_of(found.steps)
+    assert found.chosen.size < 1.3 * BYTES
+    assert len(found.steps) <= EFFORT.steps + EXTRA_STEPS
+
+
+def test_steps_are_not_asked_twice() -> None:
+    world = World(lambda m: 0.5 if m < AT else 2.0, lambda m: BYTES * (m / AT) ** -0.45)  # a cliff: nothing is close
+    found = search(world, MaxDrop(1.0))
+    multipliers = [step.multiplier for step in found.steps]
+    assert found.reached and len(set(multipliers)) == len(multipliers) == EFFORT.steps + EXTRA_STEPS
+    assert found.chosen.multiplier == pytest.approx(AT, rel=0.5)
+
+
+def test_out_of_reach_names_the_closest_point() -> None:
+    world = powers()
+    world.floor = 2.0
+    with pytest.raises(TargetError, match=r"drop <= 1 dB is out of reach.*drop 2\.000 dB at .*--best-effort"):
+        search(world, MaxDrop(1.0))
+    found = search(powers_with_floor(2.0), MaxDrop(1.0), best_effort=True)
+    assert not found.reached and not found.chosen.holds and len(found.steps) == EFFORT.steps + EXTRA_STEPS
+    assert found.chosen.excess == min(step.excess for step in found.steps)
+    assert found.grid.count > 0
+
+
+def powers_with_floor(floor: float) -> World:
+    world = powers()
+    world.floor = floor
+    return world
+
+
+@pytest.mark.parametrize("limit", [1000, 2000, 4000, 8000])
+def test_size_targets_give_the_best_quality_that_fits(limit: int) -> None:
+    found = search(powers(), MaxSize(limit, "drop"))
+    assert found.reached and found.chosen.size <= limit
+    assert found.chosen.size > 0.85 * limit, [step.size for step in found.steps]
+    fitting = [step for step in found.steps if step.size <= limit]
+    assert found.chosen.measurement.drop == min(step.measurement.drop for step in fitting)  # type: ignore[type-var]
+
+
+def test_a_size_that_nothing_fits_into() -> None:
+    world = World(lambda m: (m / AT) ** 0.6, lambda m: 2000 + 10 * (m / AT) ** -0.45)
+    with pytest.raises(TargetError, match=r"size <= 900 B is out of reach"):
+        search(world, MaxSize(900, "drop"))
+    assert search(world, MaxSize(900, "drop"), best_effort=True).chosen.size == pytest.approx(2000, rel=0.05)
+
+
+def test_the_file_is_the_chosen_step_s() -> None:
+    world, seen = powers(), []
+    found = search(world, MaxDrop(1.0), on_step=seen.append)
+    assert tuple(seen) == found.steps
+    assert any(found.grid is grid for grid in world.grids)
+    assert (found.grid.count, found.grid.sh_count) == (found.chosen.count, found.chosen.sh_count)
+    assert found.grid.steps.opacity == pytest.approx(UNIT * math.sqrt(found.chosen.multiplier), rel=1e-5)
+
+
+def test_the_same_search_every_time() -> None:
+    one, two = (search(powers(), MaxDrop(1.0)) for _ in range(2))
+    assert [replace(s, seconds=0.0) for s in one.steps] == [replace(s, seconds=0.0) for s in two.steps]
+    for name in ("position", "scale", "rotation", "opacity", "dc", "sh_degrees"):
+        np.testing.assert_array_equal(getattr(one.grid, name), getattr(two.grid, name))
+
+
+def test_the_path_is_walked_down_by_the_effort_s_share() -> None:
+    path = FakePath()
+    found = search(powers(), MaxDrop(1.0), path, effort=replace(EFFORT, keep=0.7))
+    assert set(path.shares) == {0.7} and found.chosen.count <= path.snapshots[0].count
+    counts = [snapshot.count for snapshot in path.snapshots]
+    assert counts == sorted(counts, reverse=True)
+
+
+def test_larger_multipliers_keep_fewer() -> None:
+    found = search(powers(), MaxDrop(1.0))
+    steps = sorted(found.steps, key=lambda step: step.multiplier)
+    assert all(a.count >= b.count for a, b in zip(steps, steps[1:]))
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_unseen_gaussians(keep: bool) -> None:
+    path = FakePath(unseen=60)
+    found = search(powers(), MaxDrop(1.0), path, keep_unseen=keep)
+    positions = np.rint(path.snapshots[0].planes["means"][:, :60] / found.grid.steps.position).astype(int)
+    kept = {tuple(p) for p in found.grid.position.T.tolist()}
+    share = np.mean([tuple(p) in kept for p in positions.T.tolist()])
+    if keep and len(path.snapshots) == 1:
+        assert share == 1.0
+    if not keep:
+        assert share < 0.2  # a few cells are shared with Gaussians that are seen
+    assert found.reached
+
+
+@pytest.mark.parametrize("count", [1, 2, 15, 17])
+@pytest.mark.parametrize("target", [MaxDrop(1.0), MaxSize(3000, "drop")])
+def test_few_gaussians(count: int, target: Target) -> None:
+    found = search(powers(), target, FakePath(count))
+    assert found.reached and found.grid.count <= count
+
+
+def test_nothing_that_any_pose_sees() -> None:
+    found = search(powers(), MaxDrop(1.0), FakePath(40, unseen=40), best_effort=True)
+    assert found.grid.count == 40 and found.grid.sh_count == 0
+
+
+def test_efforts_grow() -> None:
+    fast, balanced, thorough = (EFFORTS[name] for name in ("fast", "balanced", "thorough"))
+    for name in ("keep", "refit_rounds", "steps", "views"):
+        assert getattr(fast, name) <= getattr(balanced, name) <= getattr(thorough, name)
+        assert getattr(fast, name) < getattr(thorough, name)
