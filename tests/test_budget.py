@@ -138,7 +138,8 @@ def test_arrays_of_the_twins_are_counted() -> None:
 def test_default_limit() -> None:
     """Without a limit: three quarters of what the machine can still give."""
     budget = MemoryBudget.from_limit(None)
-    assert 0 < current_rss() <= peak_rss()
+    # The kernel keeps the two counters apart and updates them in batches of pages.
+    assert 0 < current_rss() <= peak_rss() + 2**22
     assert budget.used >= 2**20
     assert 0.5 * available_memory() <= budget.free <= available_memory()
     assert MemoryBudget.from_limit(10**9).limit == 10**9

@@ -20,6 +20,7 @@ from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.quantize import QuantizedScene
 from flexgs_edge.render import Renderer, Statistics
 from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.score.removal import measure_costs
 from kernel_fixtures import ALL_FORMS, FORMS, default_device, large_budget, open_form
 from quantized_scenes import quantize_all
 from synthetic import look_from, make_camera, random_scene
@@ -158,6 +159,23 @@ def test_the_smallest_limit_is_named(numpy: bool) -> None:
     if limit > 1 << 20:
         with pytest.raises(BudgetError):
             run_within(limit - (1 << 20), numpy)
+
+
+def test_costs_of_a_streamed_scene() -> None:
+    """Measured costs hold sums for every chunk: the same bits resident, streamed, and in chunks of any size."""
+    found = {}
+    for limit in (1 << 32, *range(1_600_000, 3_200_000, 400_000)):
+        budget = MemoryBudget(limit)
+        renderer = Renderer(OpenCLBackend(default_device(), budget, width=8), budget)
+        try:
+            with renderer.load(SCENE) as scene:
+                costs = measure_costs(renderer, scene, cameras())
+                found[limit] = scene.resident, (costs.removal.tobytes(), costs.sh.tobytes(), costs.sh_mean.tobytes())
+        except BudgetError:
+            assert limit < 1 << 32
+        renderer.release()
+    assert {resident for resident, _ in found.values()} == {False, True}
+    assert len({values for _, values in found.values()}) == 1
 
 
 def test_views_of_other_sizes(expected: str) -> None:

@@ -28,9 +28,9 @@ MARGIN = 1.2
 """The lattice reaches this many half sides beyond the middle box on each side."""
 POSITIONS = 200
 """Best candidates that views are made from."""
-SHOWN_SHARE = 0.65
-"""Places that show less than this share of what the best one shows, in all directions together, are left out: whoever is
-inside a room sees all walls, from outside it is half of them."""
+SHOWN_SHARE = {True: 0.5, False: 0.65}
+"""Places that show less than this share of what the best one shows, in all directions together, are left out: who is inside a
+room sees all walls, from outside it is half of them. Where SH tell directions (True), they tell this too."""
 QUICK = 5
 """Every 5th witness judges all candidates, all of them judge the better ones: a third of the time, the same views."""
 DIRECTIONS = 192
@@ -86,7 +86,8 @@ def automatic_rig(
     places = open_places(scene)
     for part, kept in ((scene.thinned(QUICK), 2 * POSITIONS), (scene, POSITIONS)):
         merit, shown = _merit(part, places)
-        rank = np.where(shown >= SHOWN_SHARE * shown.max(), merit.sum(axis=1), 0.0)
+        least = SHOWN_SHARE[bool(scene.tells.any())] * shown.max()
+        rank = np.where(shown >= least, merit.sum(axis=1), 0.0)
         best = np.argsort(-rank, kind="stable")[: min(kept, int((rank > 0).sum()) or 1)]
         places, merit = places[best], merit[best]
     # A circle of the frame's area: what is in its corners and beside it evens out.
