@@ -10,7 +10,8 @@ from __future__ import annotations
 import re
 import resource
 import sys
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 from flexgs_edge.errors import BudgetError, InputError
 
@@ -97,6 +98,8 @@ class MemoryBudget:
 
     limit: int
     used: int = 0
+    reclaimers: list[Callable[[int], None]] = field(default_factory=list)
+    """Called with the bytes that are short before a stage is refused: caches give back what they can spare."""
 
     @classmethod
     def from_limit(cls, limit: int | None) -> MemoryBudget:
@@ -120,10 +123,14 @@ class MemoryBudget:
         rows = min(most, (self.free - fixed) // max(per_row, 1))
         if rows < minimum:
             self.require(stage, fixed + minimum * per_row)
+            rows = minimum
         return rows
 
     def require(self, stage: str, size: int) -> None:
         """Check that `size` more bytes fit (raises `BudgetError` naming the smallest limit that would)."""
+        for reclaim in self.reclaimers:
+            if size > self.free:
+                reclaim(size - self.free)
         if size > self.free:
             raise BudgetError(
                 f"{stage} needs {format_mib(size)} beside the {format_mib(self.used)} already held, "

@@ -147,7 +147,7 @@ def test_claims_are_checked_before_memory_is_taken(tmp_path: Path, count: int) -
     write_colmap(tmp_path, [LENS], [IMAGE])
     good = (tmp_path / "images.bin").read_bytes()
     (tmp_path / "images.bin").write_bytes(struct.pack("<Q", count) + good[8:])
-    with pytest.raises(FormatError, match="images.bin"):
+    with pytest.raises(FormatError, match=r"images\.bin"):
         read_colmap(tmp_path)
     at = len(good) - 2 * 24 - 8
     (tmp_path / "images.bin").write_bytes(good[:at] + struct.pack("<Q", max(count, 3)) + good[at + 8 :])

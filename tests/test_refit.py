@@ -12,7 +12,7 @@ import pytest
 from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import FIXED_ERROR
 from flexgs_edge.refit import refit_colours
-from flexgs_edge.render import Renderer, Statistics
+from flexgs_edge.render import DeviceScene, Renderer, Statistics
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import MemorySource
@@ -188,6 +188,18 @@ def test_chunks_and_batches_change_nothing(rows: int, monkeypatch: pytest.Monkey
     expected = Bench(planes, 2).refit(perturbed(planes), 1, 2)
     monkeypatch.setattr("flexgs_edge.render.device_scene.CHUNK_ROWS", rows)
     monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", 1)
+    found = Bench(planes, 2).refit(perturbed(planes), 1, 2)
+    assert same_bits(found["sh_dc"], expected["sh_dc"]) and same_bits(found["sh_rest"], expected["sh_rest"])
+
+
+def test_a_scene_that_is_streamed_is_refitted_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    planes = bright_planes(1, 300)
+    expected = Bench(planes, 2).refit(perturbed(planes), 1, 2)
+
+    def stream(scene: DeviceScene) -> None:
+        scene._rows, scene.resident = 128, False
+
+    monkeypatch.setattr(DeviceScene, "_decide", stream)
     found = Bench(planes, 2).refit(perturbed(planes), 1, 2)
     assert same_bits(found["sh_dc"], expected["sh_dc"]) and same_bits(found["sh_rest"], expected["sh_rest"])
 

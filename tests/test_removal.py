@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 
 from benchmarks.removal_exactness import compare_in_float64, kernels_without_ending, spread_over_range
-from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera, read_cameras, split_views
 from flexgs_edge.constants import FIXED_ERROR, SH_C0, TRANSMITTANCE_MIN
-from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import Backend, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.kernels.twins.project import sh_basis
@@ -163,8 +161,9 @@ def test_sample_removals_against_renders(no_ending, sample_dir: Path) -> None:  
             print(f"with ending on {off} of 20 are off by more than 1 %")
             assert off <= 7
         else:
-            # Below 1e-5 over two poses, rounding of the image behind to float32 shows.
-            assert (found.relative[found.rendered > 1e-5] <= 1e-4).all() and off <= 1, found
+            # Below, rounding of the image behind to float32 shows.
+            assert (found.relative[found.rendered > 1e-5] <= 1e-3).all() and off <= 1, found
+            assert (found.relative[found.rendered > 1e-3] <= 1e-4).all(), found
 
 
 def costs_of(backend: Backend, source: SceneSource, cameras: list[Camera], sh_costs: bool = True) -> RemovalCosts:
@@ -280,25 +279,14 @@ def test_chunks_change_nothing(form: str, rows: int, monkeypatch: pytest.MonkeyP
 
 def test_a_scene_that_is_streamed_costs_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks that are loaded again for every view: the moments stay with their rows."""
-    monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", 1 << 10)
-    monkeypatch.setattr("flexgs_edge.render.device_scene.MIN_CHUNK_ROWS", 64)
-    source, cameras = random_scene(1500, 40, 3, size=-3), poses(3, 33, 17)
-    whole = costs_of(TwinBackend(large_budget()), source, cameras)
-    streamed = False
-    for limit in (900_000, 800_000, 700_000, 600_000):
-        budget = MemoryBudget(limit)
-        renderer = Renderer(TwinBackend(budget), budget)
-        try:
-            with renderer.load(source) as scene:
-                costs = measure_costs(renderer, scene, cameras)
-                streamed |= not scene.resident
-        except BudgetError:
-            renderer.release()
-            break
-        renderer.release()
-        assert budget.used == 0
-        assert_same(costs, whole)
-    assert streamed
+    source, cameras = random_scene(300, 40, 3, size=-2), poses(3, 33, 17)
+    whole = costs_of(open_form("w16"), source, cameras)
+
+    def stream(scene: DeviceScene) -> None:
+        scene._rows, scene.resident = 128, False
+
+    monkeypatch.setattr(DeviceScene, "_decide", stream)
+    assert_same(costs_of(open_form("w16"), source, cameras), whole)
 
 
 def test_order_of_the_poses_changes_nothing() -> None:

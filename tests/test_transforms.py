@@ -1,4 +1,4 @@
-"""NeRF's and nerfstudio's transforms.json: axes, frames of training, sizes and focal lengths, malformations."""
+"""NeRF's and nerfstudio's transforms.json: axes, frames of training, sizes and focal lengths, lenses, malformations."""
 
 from __future__ import annotations
 
@@ -284,7 +284,7 @@ def test_a_real_file_with_distortion(scenes_dir: Path) -> None:
     path = scenes_dir / "cameras" / "fox_transforms.json"
     if not path.is_file():
         pytest.skip(f"no {path}")
-    with pytest.raises(InputError, match="k1 = 0.0578421.*colmap image_undistorter"):
+    with pytest.raises(InputError, match=r"k1 = 0\.0578421.*colmap image_undistorter"):
         read_cameras(path)
     read = read_cameras(path, ignore_distortion=True)
     assert len(read) == 67 and read[0].name == "0001.jpg" and (read[0].width, read[0].height) == (1080, 1920)

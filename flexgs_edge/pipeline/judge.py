@@ -71,6 +71,7 @@ class Judge:
         self._room = min(wanted, budget.free // SHARE)
         budget.take("reference images", self._room)
         self._left = self._room
+        budget.reclaimers.append(self._give_back)
 
     def prepare(self, scene: DeviceScene, progress: Progress = SILENT) -> None:
         """Draw the references from `scene` (the original, loaded), and measure them against the photos."""
@@ -88,7 +89,18 @@ class Judge:
         """Give the memory of the kept images back."""
         self._kept = {}
         self._budget.give(self._room + self._work)
-        self._room = self._work = 0
+        self._room = self._work = self._left = 0
+        if self._give_back in self._budget.reclaimers:
+            self._budget.reclaimers.remove(self._give_back)
+
+    def _give_back(self, short: int) -> None:
+        """Give up room and then kept images until `short` bytes are free: they can be drawn and read again."""
+        freed = min(self._left, short)
+        self._left -= freed
+        while freed < short and self._kept:
+            freed += self._kept.popitem()[1].nbytes
+        self._room -= freed
+        self._budget.give(freed)
 
     @property
     def kept(self) -> int:
