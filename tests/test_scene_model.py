@@ -35,7 +35,10 @@ def test_a_ply_by_any_case_of_its_suffix(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("none.ply", "no such file or folder; supported: .*ply"), ("a.splat", "unknown kind of scene '.splat'; supported")],
+    [
+        ("none.ply", "no such file or folder; supported: .*ply"),
+        ("a.splat", "unknown kind of scene '.splat'; supported"),
+    ],
 )
 def test_paths_that_are_no_scene(tmp_path: Path, name: str, words: str) -> None:
     (tmp_path / "a.splat").touch()
