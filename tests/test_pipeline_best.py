@@ -131,9 +131,6 @@ def test_size_targets_are_respected(project: Path, tmp_path: Path) -> None:
         compress(project / "point_cloud.ply", tmp_path / "c.fgs", max_size=300, **TINY)
 
 
-@pytest.mark.xfail(
-    reason="writing the closest point trips over the check that sizes were kept to", raises=AssertionError
-)
 def test_the_closest_point_is_written_when_asked(project: Path, tmp_path: Path) -> None:
     closest = compress(project / "point_cloud.ply", tmp_path / "c.fgs", max_size=300, best_effort=True, **TINY)
     assert closest.reached is False and closest.size > 300 and info(tmp_path / "c.fgs")["settings"]["reached"] is False
@@ -163,9 +160,7 @@ def test_the_refit_pays(project: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("unseen", "kept"),
     [
-        pytest.param(
-            "keep", 40, marks=pytest.mark.xfail(reason="the path prunes unseen rows first: they cost nothing")
-        ),
+        ("keep", 40),
         ("drop", 0),
     ],
 )

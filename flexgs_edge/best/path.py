@@ -40,9 +40,10 @@ class Snapshot:
         return len(self.rows)
 
     def cheapest(self, count: int) -> np.ndarray:
-        """[n] bool: all but the `count` cheapest to remove (ties by row)."""
+        """[n] bool: all but the `count` cheapest to remove of those that some pose sees (ties by row)."""
         keep = np.ones(self.count, bool)
-        keep[np.argsort(self.costs.removal, kind="stable")[:count]] = False
+        seen = np.flatnonzero(self.costs.weight2 > 0)
+        keep[seen[np.argsort(self.costs.removal[seen], kind="stable")[:count]]] = False
         return keep
 
 

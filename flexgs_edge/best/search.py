@@ -16,7 +16,7 @@ import numpy as np
 from flexgs_edge.adapt import Measurement, Target
 from flexgs_edge.best.choice import BitModel, choose, drop_bands
 from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
-from flexgs_edge.best.steps import Slopes, choose_steps, probe_slopes
+from flexgs_edge.best.steps import Slopes, choose_steps, holdable, probe_slopes
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps, from_grid, recolour, to_grid
@@ -217,7 +217,8 @@ class RateSearch:
         planes = drop_bands(take_rows(snapshot.planes, rows), degrees, snapshot.costs.sh_mean[:, :, rows], SH_C0)
         if index not in self._slopes:
             self._slopes[index] = probe_slopes(self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras)
-        return planes, degrees, choose_steps(self._slopes[index], weight2, degrees, len(snapshot.costs.sh), multiplier)
+        steps = choose_steps(self._slopes[index], weight2, degrees, len(snapshot.costs.sh), multiplier)
+        return planes, degrees, holdable(steps, planes)
 
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
         started = time.perf_counter()
@@ -234,6 +235,7 @@ class RateSearch:
         """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
         path = self.path
         fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
+        fine = holdable(fine, planes)
         grid, order = to_grid(planes, degrees, fine, path.origin)
         degrees = degrees[order]
         moved = from_grid(grid)
@@ -280,5 +282,11 @@ def _next_multiplier(steps: Sequence[RateStep], target: Target) -> float:
         part = (AIM - below) / (above - below)
         return math.exp(low + (high - low) * min(max(part, NEAREST), 1 - NEAREST))
     edge, excess = points[-1] if first_miss else points[0]
-    stride = (AIM - excess) / slope
-    return math.exp(edge + max(-LARGEST_STRIDE, min(LARGEST_STRIDE, stride)))
+    most = LARGEST_STRIDE
+    if len(points) > 1:
+        # The slope between the two points nearest to the target, kept within reason.
+        (low, below), (high, above) = points[-2:] if first_miss else points[:2]
+        measured = (above - below) / (high - low) if high != low else slope
+        slope *= min(max(measured / slope, 0.2), 3.0)
+        most = 2 * LARGEST_STRIDE
+    return math.exp(edge + max(-most, min(most, (AIM - excess) / slope)))

@@ -15,7 +15,7 @@ import numpy as np
 
 from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import SH_C0
-from flexgs_edge.grid import Steps
+from flexgs_edge.grid import CODE_LIMIT, POSITION_BITS, Steps
 from flexgs_edge.render import Renderer
 from flexgs_edge.rotations import canonical_axes
 from flexgs_edge.scene.source import MemorySource
@@ -99,3 +99,23 @@ def choose_steps(slopes: Slopes, weight2: np.ndarray, degrees: np.ndarray, sh_de
     bands = tuple(colour(weight2[degrees >= max(level, 1)]) for level in range(1, sh_degree + 1))
     geometry = {kind: slopes.step(kind, multiplier) for kind in GEOMETRY}
     return Steps(**geometry, dc=colour(weight2), sh=bands, chroma=CHROMA)
+
+
+def holdable(steps: Steps, planes: dict[str, np.ndarray]) -> Steps:
+    """`steps`, made coarser where the grid could not hold the planes' values: far outliers, or a multiplier near zero."""
+
+    def finest(name: str, codes: int = CODE_LIMIT - 2) -> float:
+        return float(np.abs(planes[name]).max(initial=0.0)) / codes
+
+    width = float(np.ptp(planes["means"], axis=1).max(initial=0.0)) if planes["means"].size else 0.0
+    least = 2.0**-70
+    colours = CODE_LIMIT // 4  # Co reaches twice the coefficients, and refits move them
+    return Steps(
+        position=max(steps.position, width / (2**POSITION_BITS - 2), finest("means"), least),
+        scale=max(steps.scale, finest("log_scales"), least),
+        rotation=max(steps.rotation, 2 / CODE_LIMIT),
+        opacity=max(steps.opacity, finest("opacity_logits"), least),
+        dc=max(steps.dc, finest("sh_dc", colours), least),
+        sh=tuple(max(step, finest("sh_rest", colours), least) for step in steps.sh),
+        chroma=steps.chroma,
+    )

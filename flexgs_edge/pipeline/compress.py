@@ -188,7 +188,7 @@ class _Job:
             with temporary_name(output, options.force) as place:
                 with self.clock.stage("write"):
                     size = write_grid(place, grid, settings)
-                if plan.target.limit_bytes is not None and size > plan.target.limit_bytes:
+                if search.reached and plan.target.limit_bytes is not None and size > plan.target.limit_bytes:
                     raise AssertionError(f"the file has {size} bytes, more than the search allowed for")
                 quality = self._measure_source(open_fgs(place), report)
             LOG.info("wrote %s, %s", output, format_size(size))
