@@ -143,7 +143,8 @@ cameras_option = option(
     "Views",
     "--cameras",
     metavar="PATH",
-    help="Camera poses: INRIA's cameras.json, or a folder that holds one. Default: the cameras.json beside the scene.",
+    help="Camera poses: INRIA's cameras.json, a COLMAP model's folder, a transforms.json, or a folder that holds one of them. "
+    "Default: the cameras.json beside the scene.",
 )
 images_option = option(
     "Views",
