@@ -127,7 +127,8 @@ from flexgs_edge.cli import words
     type=click.Choice(["fast", "balanced", "thorough"]),
     default="balanced",
     show_default=True,
-    help="Steps of the search after the paper's list: 4, 10 or 32. Counted, never timed: same command, same bytes.",
+    help="Steps of the search: paper 4, 10 or 32 after its list; best 3, 4 or 6 whole results, with more rounds and poses each. "
+    "Counted, never timed: same command, same bytes.",
 )
 @words.drop_invalid_option
 @words.device_option
