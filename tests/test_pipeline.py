@@ -222,21 +222,59 @@ def test_bits(project: Path, tmp_path: Path, bits: str, expected: dict[str, int]
     assert set(result.groups.values()) == {1}
 
 
+def test_views_of_a_lone_scene_are_made_from_it(tmp_path: Path, project: Path) -> None:
+    lonely = tmp_path / "scene.ply"
+    lonely.write_bytes((project / "point_cloud.ply").read_bytes())
+    words: dict[str, Any] = {"device": "numpy", "resolution": 32, "method": "paper", "prune_rate": 0.2, "sh_rate": 0.2}
+    alone = compress(lonely, tmp_path / "a.fgs", **words)
+    asked = compress(project / "point_cloud.ply", tmp_path / "b.fgs", cameras="auto", **words)
+    assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
+    for result in (alone, asked):
+        assert result.views is not None and result.views.cameras == "auto" and result.views.images is None
+        assert (result.views.total, result.views.held_out, result.views.width) == (48, 6, 32)
+        assert any("automatic views" in note for note in result.views.notes)
+        assert result.quality is not None and result.quality.drop is None
+    text = compress_text(alone)
+    assert "cameras from auto" in text and "automatic views" in text
+
+
+def test_cameras_of_other_programs_beside_the_scene(tmp_path: Path, project: Path) -> None:
+    scene = tmp_path / "scene.ply"
+    scene.write_bytes((project / "point_cloud.ply").read_bytes())
+    (tmp_path / "images").symlink_to(project / "images")
+    lens = {"w": WIDTH, "h": HEIGHT, "fl_x": 40.0, "fl_y": 40.0, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+    pose = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, -5], [0, 0, 0, 1]]
+    frames = [{"file_path": f"images/v{i:02}.png", "transform_matrix": pose} for i in range(VIEWS)]
+    rates: dict[str, Any] = {"device": "numpy", "method": "paper", "prune_rate": 0, "sh_rate": 0, "dry_run": True}
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    found = compress(scene, None, **rates).views
+    assert found is not None and found.cameras == str(tmp_path / "transforms.json") and found.images is not None
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "k1": 0.05, "frames": frames}))
+    with pytest.raises(InputError, match="--ignore-distortion"):
+        compress(scene, None, **rates)
+    found = compress(scene, None, ignore_distortion=True, **rates).views
+    assert found is not None and found.images is None and found.total == VIEWS
+    assert any("lens distortion of 9 cameras ignored" in note for note in found.notes)
+    with pytest.raises(InputError, match="photos cannot be compared"):
+        compress(scene, None, ignore_distortion=True, images=str(tmp_path / "images"), **rates)
+
+
 def test_no_cameras_at_all(tmp_path: Path, done: tuple[Path, CompressResult], project: Path) -> None:
     lonely = tmp_path / "scene.ply"
     lonely.write_bytes((project / "point_cloud.ply").read_bytes())
-    with pytest.raises(InputError, match=r"no cameras: give --cameras PATH.*only fixed rates work"):
-        compress(lonely, tmp_path / "a.fgs", **FAST)
-    with pytest.raises(InputError, match="no cameras"):
-        compress(lonely, tmp_path / "a.fgs", prune_rate=0.2, sh_rate=0.2, **FAST)
-    with pytest.raises(InputError, match="no cameras"):
-        compress(lonely, tmp_path / "a.fgs", prune_rate=0, sh_rate=0, bits="auto", **FAST)
-    with pytest.raises(InputError, match="photos need cameras"):
+    none: dict[str, Any] = {**FAST, "cameras": "none"}
+    with pytest.raises(InputError, match=r"--cameras none leaves no views.*only fixed rates work"):
+        compress(lonely, tmp_path / "a.fgs", **none)
+    with pytest.raises(InputError, match="no views"):
+        compress(lonely, tmp_path / "a.fgs", prune_rate=0.2, sh_rate=0.2, **none)
+    with pytest.raises(InputError, match="no views"):
+        compress(lonely, tmp_path / "a.fgs", prune_rate=0, sh_rate=0, bits="auto", **none)
+    with pytest.raises(InputError, match="photos need the cameras"):
         compress(lonely, tmp_path / "a.fgs", images=str(project / "images"), **FAST)
-    whole = compress(lonely, tmp_path / "a.fgs", prune_rate=0, sh_rate=0, method="paper")
+    whole = compress(lonely, tmp_path / "a.fgs", prune_rate=0, sh_rate=0, method="paper", cameras="none")
     assert whole.count == COUNT and whole.quality is None and whole.run.device is None
     assert whole.size == os.stat(tmp_path / "a.fgs").st_size and "none" in compress_text(whole)
-    rates: dict[str, Any] = {"method": "paper", "prune_rate": 0.5, "sh_rate": 0.2}
+    rates: dict[str, Any] = {"method": "paper", "prune_rate": 0.5, "sh_rate": 0.2, "cameras": "none"}
     scored = compress(lonely, tmp_path / "b.fgs", score=str(done[0] / "s.npy"), **rates)
     assert scored.count == COUNT // 2
     again = compress(lonely, tmp_path / "b.fgs", score=str(done[0] / "s.npy"), force=True, **rates)
@@ -390,7 +428,7 @@ def test_references_that_do_not_fit_are_drawn_again(project: Path) -> None:
 
     companions, scene = companions_of(project / "point_cloud.ply"), load_scene(project / "point_cloud.ply")
     options = resolve_drawing(ViewOptions(device="numpy"), scene, companions)
-    views = find_views(options, companions)
+    views = find_views(options, companions, scene.source)
     assert views is not None
     found = []
     for share in (4, 10**9):

@@ -109,7 +109,7 @@ class MinFidelity:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.limit) and 0.0 < self.limit < IDENTICAL_DB):
             raise InputError(
-                f"--min-fidelity {self.limit:g}: expected decibels between 0 and {IDENTICAL_DB:g} (42 is about 1 dB of drop)"
+                f"--min-fidelity {self.limit:g}: expected decibels between 0 and {IDENTICAL_DB:g} (40 is about 1 dB of drop)"
             )
 
     def excess(self, size: int, measurement: Measurement | None) -> float:

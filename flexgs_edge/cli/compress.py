@@ -25,7 +25,7 @@ from flexgs_edge.cli import words
     "--min-fidelity",
     metavar="DB",
     type=float,
-    help="Fewest bytes whose renders keep a PSNR of at least so many dB against the original's renders (42 is very good).",
+    help="Fewest bytes whose renders keep a PSNR of at least so many dB against the original's renders (40: about 1 dB of drop).",
 )
 @words.option(
     "Target (one of them; default --max-drop 1.0)",

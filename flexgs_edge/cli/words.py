@@ -139,12 +139,20 @@ def _set_debug(ctx: click.Context, param: click.Parameter, value: bool) -> None:
 
 
 scene_argument = click.argument("input", metavar="INPUT", type=click.Path())
-cameras_option = option(
-    "Views",
-    "--cameras",
-    metavar="PATH",
-    help="Camera poses: INRIA's cameras.json, a COLMAP model's folder, a transforms.json, or a folder that holds one of them. "
-    "Default: the cameras.json beside the scene.",
+cameras_option = stack(
+    option(
+        "Views",
+        "--cameras",
+        metavar="PATH",
+        help="Camera poses: INRIA's cameras.json, a COLMAP model's folder, a transforms.json, or a folder with one of them; "
+        "auto makes views from the scene itself, none uses none. Default: what lies beside the scene, else auto.",
+    ),
+    option(
+        "Views",
+        "--ignore-distortion",
+        is_flag=True,
+        help="Take the poses of distorted lenses as if they had none; photos of such lenses are not compared.",
+    ),
 )
 images_option = option(
     "Views",

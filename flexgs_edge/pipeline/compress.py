@@ -83,7 +83,7 @@ def compress(
         companions = companions_of(input)
         scene = load_scene(input, options.drop_invalid)
         options = resolve_drawing(options, scene, companions)
-        views = find_views(options, companions)
+        views = find_views(options, companions, scene.source)
         # Before any work: the words of the scores file and of the views must fit together.
         plan = Plan.make(options, scene, views)
         scores = (

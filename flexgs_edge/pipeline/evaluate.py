@@ -11,7 +11,7 @@ from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
 from flexgs_edge.pipeline.inputs import (
-    NO_CAMERAS,
+    WITHOUT_VIEWS,
     companions_of,
     find_views,
     load_scene,
@@ -60,9 +60,9 @@ def evaluate(
         scene = load_scene(input, options.drop_invalid)
         # Both are drawn alike; a compressed scene knows how its original was.
         options = resolve_drawing(options, scene if scene.settings else reference, companions)
-        views = find_views(options, companions)
+        views = find_views(options, companions, reference.source)
         if views is None:
-            raise InputError(f"{against}: {NO_CAMERAS}")
+            raise InputError(WITHOUT_VIEWS)
         indices = views.held_out or views.train
     with ExitStack() as stack:
         workspace = stack.enter_context(Workspace(options, budget, clock))

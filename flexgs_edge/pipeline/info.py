@@ -17,8 +17,9 @@ from flexgs_edge.codec.container2 import GridContainer
 from flexgs_edge.codec.layout import Header, Section
 from flexgs_edge.codec.layout2 import GridHeader
 from flexgs_edge.errors import InputError
+from flexgs_edge.pipeline.inputs import companions_of
 from flexgs_edge.quantize import array_bytes
-from flexgs_edge.scene import FIELDS, SceneSource, find_companions, inria_dtype, open_scene
+from flexgs_edge.scene import FIELDS, SceneSource, inria_dtype, open_scene
 
 
 def info(path: str | Path) -> dict[str, Any]:
@@ -128,7 +129,7 @@ def _fgs_record(
 
 
 def _scene_info(path: Path, source: SceneSource) -> dict[str, Any]:
-    beside = find_companions(path)
+    beside = companions_of(path)
     place = Path(source.name)
     ply = source.count * inria_dtype(source.sh_degree).itemsize
     return {

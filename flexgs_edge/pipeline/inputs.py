@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import flexgs_edge.codec  # noqa: F401  (registers the reader of .fgs)
-from flexgs_edge.cameras import Camera, Photos, limit_width, read_cameras, split_views
+from flexgs_edge.cameras import Camera, Photos, find_cameras, limit_width, read_cameras, split_views
+from flexgs_edge.cameras.auto import automatic_rig
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import InputError
-from flexgs_edge.pipeline.options import NO_PHOTOS, ViewOptions
+from flexgs_edge.pipeline.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOptions
 from flexgs_edge.scene import Companions, SceneSource, check_scene, find_companions, inria_dtype, open_scene
 
 Options = TypeVar("Options", bound=ViewOptions)
 
 LOG = logging.getLogger("flexgs_edge")
 
-NO_CAMERAS = (
-    "no cameras: give --cameras PATH (INRIA's cameras.json, or a folder that holds one), "
-    "or put cameras.json beside the scene"
-)
+WITHOUT_VIEWS = f"--cameras {NO_CAMERAS} leaves no views: leave it out for automatic ones, or give --cameras PATH"
 
 
 @dataclass(frozen=True)
@@ -69,17 +68,19 @@ class Views:
         One a camera.
     train, held_out : list of int
         Indices into `cameras`.
-    cameras_path, images_path : Path or None
-        Where they came from.
+    cameras_from : str
+        Path of their file, or `auto`.
+    images_path : Path or None
+        Where the photos came from.
     notes : tuple of str
-        What was scaled.
+        How an automatic rig was made; what was scaled.
     """
 
     cameras: list[Camera]
     photos: Photos | None
     train: list[int]
     held_out: list[int]
-    cameras_path: Path
+    cameras_from: str
     images_path: Path | None
     notes: tuple[str, ...] = ()
 
@@ -120,28 +121,46 @@ def _background(value: object, default: tuple[float, float, float]) -> tuple[flo
     return default
 
 
-def find_views(options: ViewOptions, companions: Companions, with_photos: bool = True) -> Views | None:
-    """The views that the options or the files beside the scene give; `None` when there are no cameras at all.
+def find_views(
+    options: ViewOptions, companions: Companions, source: SceneSource, with_photos: bool = True
+) -> Views | None:
+    """The views that the options or the files beside the scene give, else an automatic rig; `None` for `--cameras none`.
 
     `options` must have its background filled in (photos with an alpha channel are put on it).
     """
-    place = options.cameras or companions.cameras
-    if place is None:
+    place = options.cameras or companions.cameras or AUTO_CAMERAS
+    if place in (NO_CAMERAS, AUTO_CAMERAS):
         if options.images not in (None, NO_PHOTOS):
-            raise InputError(f"--images {options.images}: photos need cameras; {NO_CAMERAS}")
-        return None
-    cameras = read_cameras(place)
+            raise InputError(
+                f"--images {options.images}: photos need the cameras that took them: give --cameras PATH "
+                "(INRIA's cameras.json, a transforms.json or a COLMAP model)"
+            )
+        return None if place == NO_CAMERAS else _automatic_views(options, source)
+    cameras = read_cameras(place, options.ignore_distortion)
     images = _images(options, companions) if with_photos else None
+    bent = sum(camera.distortion is not None for camera in cameras)
+    notes: tuple[str, ...] = ()
+    if bent:
+        notes = (f"lens distortion of {bent} cameras ignored: only their poses are used",)
+        if options.images is None:
+            images = None
     photos: Photos | None = None
-    notes: tuple[str, ...]
     if images is None:
         cameras, note = limit_width(cameras, options.resolution)
-        notes = () if note is None else (note,)
+        notes += () if note is None else (note,)
     else:
         photos = Photos.open(images, cameras, options.background or (0.0, 0.0, 0.0), options.resolution)
-        cameras, notes = photos.cameras, photos.notes
+        cameras, notes = photos.cameras, notes + photos.notes
     train, held_out = split_views(len(cameras), options.holdout)
-    return Views(cameras, photos, train, held_out, Path(place), images, notes)
+    return Views(cameras, photos, train, held_out, os.fspath(place), images, notes)
+
+
+def _automatic_views(options: ViewOptions, source: SceneSource) -> Views:
+    LOG.info("no cameras are used: making views from the scene itself")
+    cameras, how = automatic_rig(source)
+    cameras, note = limit_width(cameras, options.resolution)
+    train, held_out = split_views(len(cameras), options.holdout)
+    return Views(cameras, None, train, held_out, AUTO_CAMERAS, None, (how,) if note is None else (how, note))
 
 
 def _images(options: ViewOptions, companions: Companions) -> Path | None:
@@ -166,6 +185,9 @@ def merge_companions(first: Companions, second: Companions) -> Companions:
 def companions_of(path: str | Path) -> Companions:
     """What lies beside the scene at `path`; logged, so that nobody wonders where cameras came from."""
     found = find_companions(path)
+    if found.cameras is None:
+        folder = Path(path) if Path(path).is_dir() else Path(path).parent
+        found = replace(found, cameras=find_cameras(folder))
     for what, place in (("cameras", found.cameras), ("photos", found.images)):
         if place is not None:
             LOG.info("found %s beside the scene: %s", what, place)

@@ -14,6 +14,10 @@ from flexgs_edge.prune import Choice
 
 NO_PHOTOS = "none"
 """`--images none`: leave photos that lie beside the scene alone."""
+AUTO_CAMERAS = "auto"
+"""`--cameras auto`: views made from the scene itself."""
+NO_CAMERAS = "none"
+"""`--cameras none`: no views at all; only fixed rates work then."""
 METHODS = ("best", "paper")
 SELECTS = ("test", "train")
 UNSEEN = ("keep", "drop")
@@ -29,7 +33,9 @@ class ViewOptions:
     Parameters
     ----------
     cameras : str, optional
-        INRIA's cameras.json or a folder with one. Default: the one beside the scene.
+        A camera file or a folder with one, `auto`, or `none`. Default: what lies beside the scene, else `auto`.
+    ignore_distortion : bool
+        Take the poses of distorted lenses, without photos.
     images : str, optional
         Folder of photos; `none` for no photos. Default: `images/` beside the scene.
     holdout : int
@@ -51,6 +57,7 @@ class ViewOptions:
     """
 
     cameras: str | None = None
+    ignore_distortion: bool = False
     images: str | None = None
     holdout: int = DEFAULT_HOLDOUT
     resolution: int = MAX_VIEW_WIDTH

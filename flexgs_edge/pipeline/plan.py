@@ -9,7 +9,7 @@ from flexgs_edge._version import __version__
 from flexgs_edge.adapt import Judge, SearchResult, Target
 from flexgs_edge.bitspec import BitSpec
 from flexgs_edge.errors import InputError
-from flexgs_edge.pipeline.inputs import NO_CAMERAS, Scene, Views
+from flexgs_edge.pipeline.inputs import WITHOUT_VIEWS, Scene, Views
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.prune import Choice
 
@@ -39,7 +39,7 @@ class Plan:
         bits, _ = options.bit_spec()
         if views is None:
             if options.method != "paper":
-                raise InputError(f"{scene.path}: {NO_CAMERAS}. Views are needed to measure what each Gaussian is worth")
+                raise InputError(f"{WITHOUT_VIEWS}. Views are needed to measure what each Gaussian is worth")
             if fixed is None or computes or bits is None:
                 why = (
                     "to score Gaussians and to judge the result"
@@ -47,7 +47,7 @@ class Plan:
                     else "to score Gaussians"
                 )
                 raise InputError(
-                    f"{scene.path}: {NO_CAMERAS}. Views are needed {why}; without them only fixed rates work: "
+                    f"{WITHOUT_VIEWS}. Views are needed {why}; without them only fixed rates work: "
                     "--prune-rate and --sh-rate with --score FILE, or both rates 0"
                 )
             return cls([], [], "modelled drop", None, needs_scores, False)
@@ -57,7 +57,7 @@ class Plan:
             )
         if not views.train and (options.method != "paper" or computes or bits is None or options.select == "train"):
             raise InputError(
-                f"{views.cameras_path}: {len(views.cameras)} views, all of them held out (every {options.holdout}th by name): "
+                f"{views.cameras_from}: {len(views.cameras)} views, all of them held out (every {options.holdout}th by name): "
                 "give more views, or --holdout 0 --select train"
             )
         on_train = options.select == "train"

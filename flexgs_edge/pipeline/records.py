@@ -23,7 +23,7 @@ def scene_info(scene: Scene) -> SceneInfo:
 def views_info(views: Views) -> ViewsInfo:
     """The record of the views; width and height are the largest."""
     return ViewsInfo(
-        cameras=os.fspath(views.cameras_path),
+        cameras=views.cameras_from,
         images=None if views.images_path is None else os.fspath(views.images_path),
         total=len(views.cameras),
         train=len(views.train),

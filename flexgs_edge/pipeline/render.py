@@ -15,7 +15,7 @@ import numpy as np
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.errors import InputError
-from flexgs_edge.pipeline.inputs import NO_CAMERAS, companions_of, find_views, load_scene, resolve_drawing
+from flexgs_edge.pipeline.inputs import WITHOUT_VIEWS, companions_of, find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.options import ViewOptions
 from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace
@@ -59,9 +59,9 @@ def render_views(
         companions = companions_of(input)
         scene = load_scene(input, options.drop_invalid)
         options = resolve_drawing(options, scene, companions)
-        found = find_views(options, companions, with_photos=False)
+        found = find_views(options, companions, scene.source, with_photos=False)
         if found is None:
-            raise InputError(f"{input}: {NO_CAMERAS}")
+            raise InputError(WITHOUT_VIEWS)
         chosen = _choose(views, len(found.cameras))
         places = _places(Path(output), [found.cameras[i].name for i in chosen], force)
     seconds = []

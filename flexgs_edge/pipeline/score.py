@@ -11,7 +11,7 @@ import numpy as np
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.errors import InputError
-from flexgs_edge.pipeline.inputs import NO_CAMERAS, companions_of, find_views, load_scene, resolve_drawing
+from flexgs_edge.pipeline.inputs import WITHOUT_VIEWS, companions_of, find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.options import ViewOptions
 from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace
@@ -60,11 +60,11 @@ def score_gaussians(
         scene = load_scene(input, options.drop_invalid)
         options = resolve_drawing(options, scene, companions)
         # Photos decide at which size poses are drawn, and with it the hits: the same scores as in `compress`.
-        views = find_views(options, companions)
+        views = find_views(options, companions, scene.source)
         if views is None:
-            raise InputError(f"{input}: {NO_CAMERAS}")
+            raise InputError(WITHOUT_VIEWS)
         if not views.train:
-            raise InputError(f"{views.cameras_path}: every view is held out: give more views, or --holdout 0")
+            raise InputError(f"{views.cameras_from}: every view is held out: give more views, or --holdout 0")
     with Workspace(options, budget, clock) as workspace:
         renderer = workspace.renderer
         with clock.stage("load"):

@@ -115,7 +115,7 @@ def fidelity_for_drop(decibel: float, base_psnr: float = DEFAULT_BASE_PSNR) -> f
     """Fidelity in dB at which the modelled drop is `decibel`; `None` when only identical renders would do.
 
     >>> round(fidelity_for_drop(1.0), 1)
-    41.9
+    39.9
     """
     error = error_for_drop(decibel, base_psnr)
     return psnr(error) if error > 0.0 else None

@@ -9,12 +9,14 @@ from html import escape
 from flexgs_edge._version import __version__
 
 _STYLE = """
-:root { color-scheme: light dark; --ink: #1d2329; --paper: #ffffff; --soft: #5b6670; --line: #d7dde2; --band: #f4f6f8; --mark: #0b63c5; }
+:root { color-scheme: light dark; }
+:root { --ink: #1d2329; --paper: #ffffff; --soft: #5b6670; --line: #d7dde2; --band: #f4f6f8; --mark: #0b63c5; }
 @media (prefers-color-scheme: dark) {
   :root { --ink: #e6eaee; --paper: #14181c; --soft: #9aa6b1; --line: #313a42; --band: #1c2228; --mark: #6fb1ff; }
 }
 * { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 64rem; padding: 1rem; font: 1rem/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); }
+body { margin: 0 auto; max-width: 64rem; padding: 1rem; font: 1rem/1.5 system-ui, sans-serif; }
+body { color: var(--ink); background: var(--paper); }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.2rem; margin-top: 2rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
@@ -56,4 +58,5 @@ def data_uri(data: bytes, kind: str) -> str:
 
 def picture(data: bytes, kind: str, caption: str) -> str:
     """An embedded picture with its caption."""
-    return f'<figure><img src="{data_uri(data, kind)}" alt="{escape(caption)}"><figcaption>{escape(caption)}</figcaption></figure>'
+    text = escape(caption)
+    return f'<figure><img src="{data_uri(data, kind)}" alt="{text}"><figcaption>{text}</figcaption></figure>'
