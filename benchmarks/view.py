@@ -21,7 +21,7 @@ from flexgs_edge.scene.ply import PlySource
 STAGES = {
     "projection": ("project",),
     "sort": ("sort_count_first", "sort_scatter_first", "sort_count", "sort_scatter", "exclusive_scan"),
-    "tile lists": ("tile_count", "tile_scatter"),
+    "tile lists": ("tile_room", "tile_count", "tile_scatter"),
     "blend": ("blend",),
 }
 """Kernels of each stage (the scans of the tile lists, 0.1 ms, count as sorting)."""

@@ -76,44 +76,65 @@ inline void splat_range(uint from, uint count, uint *start, uint *end) {
   *end = from + (uint)((ulong)count * (block + 1) / blocks);
 }
 
-__kernel void tile_count(
+// How many drafts each block of splats may write: bounds are counted by `project`, with room to spare.
+__kernel void tile_room(
     const uint from,                  // first splat of the batch in depth order
     const uint count,                 // splats of the batch
-    const float width,                // pixels
-    const float height,
-    const int inria_extent,
     __global const uint *ids,         // [shown] rows in depth order
-    __global const float *records,    // [N, 16]
-    __global uint *counts)            // [blocks, tiles]
+    __global const uint *bounds,      // [N] tiles of each splat's bounding box
+    __global uint *room)              // [2, blocks] drafts of each block: at most, and (later) as many as there are
 {
-  const int tiles_x = ((int)width + TILE - 1) / TILE, tiles_y = ((int)height + TILE - 1) / TILE;
-  __global uint *own = counts + get_global_id(0) * (size_t)(tiles_x * tiles_y);
-  uint start, end;
+  uint start, end, sum = 0;
   splat_range(from, count, &start, &end);
-  for (int tile = 0; tile < tiles_x * tiles_y; ++tile) own[tile] = 0;
-#define COUNT_PAIR(tile, mask) own[tile] += 1
-  for (uint n = start; n < end; ++n) {
-    FOR_EACH_TILE(COUNT_PAIR)
-  }
+  for (uint n = start; n < end; ++n) sum += bounds[ids[n]];
+  room[get_global_id(0)] = sum;
 }
 
-__kernel void tile_scatter(
+inline size_t draft_start(__global const uint *room) {
+  size_t start = 0;
+  for (uint block = 0; block < get_global_id(0); ++block) start += room[block];
+  return start;
+}
+
+// Spans are worked out once, here; `tile_scatter` only moves what this wrote (half the time of working them out again).
+__kernel void tile_count(
     const uint from,
     const uint count,
-    const float width,
+    const float width,                // pixels
     const float height,
     const int inria_extent,
     __global const uint *ids,         // [shown]
     __global const float *records,    // [N, 16]
+    __global uint *room,              // [2, blocks] see `tile_room`
+    __global uint *drafts,            // [capacity, 3] row, tile and block mask, splat by splat
+    __global uint *counts)            // [blocks, tiles]
+{
+  const int tiles_x = ((int)width + TILE - 1) / TILE, tiles_y = ((int)height + TILE - 1) / TILE;
+  __global uint *own = counts + get_global_id(0) * (size_t)(tiles_x * tiles_y);
+  __global uint *const first_draft = drafts + 3 * draft_start(room);
+  __global uint *draft = first_draft;
+  uint start, end;
+  splat_range(from, count, &start, &end);
+  for (int tile = 0; tile < tiles_x * tiles_y; ++tile) own[tile] = 0;
+#define DRAFT_PAIR(tile, mask) (vstore3((uint3)(ids[n], (uint)(tile), mask), 0, draft), draft += 3, own[tile] += 1)
+  for (uint n = start; n < end; ++n) {
+    FOR_EACH_TILE(DRAFT_PAIR)
+  }
+  room[get_global_size(0) + get_global_id(0)] = (uint)((draft - first_draft) / 3);
+}
+
+__kernel void tile_scatter(
+    const uint tiles,
+    __global const uint *room,        // [2, blocks]
+    __global const uint *drafts,      // [capacity, 3]
     __global uint *offsets,           // [blocks, tiles] from the scan; advanced, so that the last row has the tiles' ends
     __global uint2 *pairs)            // [capacity] row and block mask, tile by tile, in depth order
 {
-  const int tiles_x = ((int)width + TILE - 1) / TILE, tiles_y = ((int)height + TILE - 1) / TILE;
-  __global uint *own = offsets + get_global_id(0) * (size_t)(tiles_x * tiles_y);
-  uint start, end;
-  splat_range(from, count, &start, &end);
-#define WRITE_PAIR(tile, mask) pairs[own[tile]++] = (uint2)(ids[n], mask)
-  for (uint n = start; n < end; ++n) {
-    FOR_EACH_TILE(WRITE_PAIR)
+  __global uint *own = offsets + get_global_id(0) * (size_t)tiles;
+  __global const uint *draft = drafts + 3 * draft_start(room);
+  const uint count = room[get_global_size(0) + get_global_id(0)];
+  for (uint n = 0; n < count; ++n) {
+    const uint3 d = vload3(n, draft);
+    pairs[own[d.s1]++] = (uint2)(d.s0, d.s2);
   }
 }

@@ -19,9 +19,10 @@ from flexgs_edge.scene.source import SceneSource
 
 SORT_DIGIT_BITS = 11
 SORT_DIGITS = 1 << SORT_DIGIT_BITS
-PAIR_BYTES = 8
-DEFAULT_PAIRS = 1 << 22
-"""Pairs of a batch when memory allows: 32 MiB, one batch for most views."""
+PAIR_BYTES = 20
+"""A pair (8) and its draft (12)."""
+DEFAULT_PAIRS = 1 << 21
+"""Pairs of a batch when memory allows: 40 MiB, one batch for most views."""
 PAIR_SHARE = 8
 """The tile lists take at most this part (one in eight) of what is free beyond the least: the scene comes next."""
 SUM_BYTES = 12
@@ -103,6 +104,7 @@ class _ViewBuffers:
             "ids_b": ((count,), np.uint32),
             "digits": ((SORT_DIGITS * backend.sort_blocks + 1,), np.uint32),
             "block_pairs": ((backend.sort_blocks,), np.uint64),
+            "room": ((2, backend.tile_blocks), np.uint32),
             "ends": ((self.tiles * backend.tile_blocks + 1,), np.uint32),
             "state": ((self.tiles, 4, TILE * TILE), np.float32),
             "image": ((3, self.padded_height, self.padded_width), np.float32),
@@ -117,12 +119,14 @@ class _ViewBuffers:
             spare = max(budget.free - later, 0) // (PAIR_SHARE * PAIR_BYTES)
             self.capacity = min(self.tiles + spare, max(DEFAULT_PAIRS, self.tiles))
             self.pairs = self._array((self.capacity, 2), np.uint32)
+            self.drafts = self._array((self.capacity, 3), np.uint32)
         except BaseException:
             self.release()
             raise
         self.camera, self.records, self.keys, self.bounds = (made[n] for n in ("camera", "records", "keys", "bounds"))
         self.sorted = [(made["keys_a"], made["ids_a"]), (made["keys_b"], made["ids_b"])]
-        self.digits, self.block_pairs, self.ends = made["digits"], made["block_pairs"], made["ends"]
+        self.digits, self.block_pairs = made["digits"], made["block_pairs"]
+        self.room, self.ends = made["room"], made["ends"]
         self.state, self.image = made["state"], made["image"]
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> Any:
@@ -353,10 +357,16 @@ class Renderer:
 
     def _list_tiles(self, buffers: _ViewBuffers, camera: Camera, start: int, count: int) -> None:
         backend, blocks = self.backend, self.backend.tile_blocks
-        shared = (start, count, camera.width, camera.height, self.inria_extent, buffers.sorted[0][1], buffers.records)
-        backend.launch("tile_count", (blocks,), *shared, buffers.ends)
+        ids = buffers.sorted[0][1]
+        backend.launch("tile_room", (blocks,), start, count, ids, buffers.bounds, buffers.room)
+        backend.launch(
+            "tile_count", (blocks,), start, count, camera.width, camera.height, self.inria_extent, ids, buffers.records,
+            buffers.room, buffers.drafts, buffers.ends,
+        )  # fmt: skip
         backend.launch("exclusive_scan", (1,), buffers.tiles, blocks, buffers.ends)
-        backend.launch("tile_scatter", (blocks,), *shared, buffers.ends, buffers.pairs)
+        backend.launch(
+            "tile_scatter", (blocks,), buffers.tiles, buffers.room, buffers.drafts, buffers.ends, buffers.pairs
+        )
 
     def release(self) -> None:
         """Free the view's buffers (they come back with the next view)."""

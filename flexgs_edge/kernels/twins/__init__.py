@@ -19,7 +19,7 @@ from flexgs_edge.kernels.twins.sort import (
     sort_scatter,
     sort_scatter_first,
 )
-from flexgs_edge.kernels.twins.tiles import tile_count, tile_scatter
+from flexgs_edge.kernels.twins.tiles import tile_count, tile_room, tile_scatter
 
 TWINS: dict[str, Callable[..., None]] = {
     "activate": activate,
@@ -29,6 +29,7 @@ TWINS: dict[str, Callable[..., None]] = {
     "sort_count": sort_count,
     "sort_scatter": sort_scatter,
     "exclusive_scan": exclusive_scan,
+    "tile_room": tile_room,
     "tile_count": tile_count,
     "tile_scatter": tile_scatter,
     "blend": blend,

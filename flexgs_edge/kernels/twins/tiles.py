@@ -69,6 +69,20 @@ def list_pairs(
     return splat[row][keep], (ty[row] * tiles_x + tx)[keep], mask[keep]
 
 
+def tile_room(
+    size: tuple[int, ...], start: int, count: int, ids: np.ndarray, bounds: np.ndarray, room: np.ndarray
+) -> None:
+    """Drafts that each block of the depth-ordered splats [start, start + count) may write, into `room[0]`."""
+    blocks = block_of(count, size[0])
+    room[0] = np.bincount(blocks, weights=bounds[ids[start : start + count]], minlength=size[0]).astype(np.uint32)
+
+
+def _draft_places(room: np.ndarray) -> np.ndarray:
+    """[n] i64: where the drafts of all blocks lie, block by block."""
+    starts = np.cumsum(room[0], dtype=np.int64) - room[0]
+    return _expand(starts, starts + room[1].astype(np.int64) - 1)[1]
+
+
 def tile_count(
     size: tuple[int, ...],
     start: int,
@@ -78,31 +92,26 @@ def tile_count(
     inria_extent: int,
     ids: np.ndarray,
     records: np.ndarray,
+    room: np.ndarray,
+    drafts: np.ndarray,
     counts: np.ndarray,
 ) -> None:
-    """Pairs by tile and block of splats ([blocks, tiles]) of the depth-ordered splats [start, start + count)."""
-    splat, tile, _ = list_pairs(ids[start : start + count], records, f32(width), f32(height), inria_extent)
-    cells = block_of(count, size[0])[splat] * (len(counts) // size[0]) + tile
-    counts[:-1] = np.bincount(cells, minlength=len(counts) - 1)
+    """Drafts (row, tile, mask) of the splats [start, start + count), and how many there are by tile and block of splats."""
+    batch = ids[start : start + count]
+    splat, tile, mask = list_pairs(batch, records, f32(width), f32(height), inria_extent)
+    block = block_of(count, size[0])[splat]
+    room[1] = np.bincount(block, minlength=size[0])
+    drafts[_draft_places(room)] = np.stack([batch[splat], tile, mask], axis=1)
+    counts[:-1] = np.bincount(block * (len(counts) // size[0]) + tile, minlength=len(counts) - 1)
 
 
 def tile_scatter(
-    size: tuple[int, ...],
-    start: int,
-    count: int,
-    width: float,
-    height: float,
-    inria_extent: int,
-    ids: np.ndarray,
-    records: np.ndarray,
-    offsets: np.ndarray,
-    pairs: np.ndarray,
+    size: tuple[int, ...], tiles: int, room: np.ndarray, drafts: np.ndarray, offsets: np.ndarray, pairs: np.ndarray
 ) -> None:
     """Writes (row, mask) tile by tile in depth order; `offsets` end up at each cell's end."""
-    batch = ids[start : start + count]
-    splat, tile, mask = list_pairs(batch, records, f32(width), f32(height), inria_extent)
-    cells = block_of(count, size[0])[splat] * (len(offsets) // size[0]) + tile
+    row, tile, mask = drafts[_draft_places(room)].T
     order = np.argsort(tile, kind="stable")
-    pairs[: len(order), 0] = batch[splat[order]]
+    pairs[: len(order), 0] = row[order]
     pairs[: len(order), 1] = mask[order]
+    cells = np.repeat(np.arange(size[0]), room[1]) * tiles + tile
     offsets[:-1] += np.bincount(cells, minlength=len(offsets) - 1).astype(np.uint32)
