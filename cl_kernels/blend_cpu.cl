@@ -10,7 +10,7 @@
 #define RETIRE_EVERY 16          // splats between two looks for blocks whose pixels have all ended
 
 #ifndef STATS
-#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual) must be defined"
+#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs) must be defined"
 #endif
 
 // Lane l of vector v is pixel (l + v W) of the block, row by row.
@@ -69,6 +69,24 @@ inline uint lane_count(const IW *v) {
 }
 #endif
 
+#if STATS > 1
+// A tile of an image, block by block.
+inline void load_blocks(__global const float *image, uint tiles_x, int height, int tile_px, int tile_py, FW *r, FW *g, FW *b) {
+  const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
+  for (int block = 0; block < BLOCKS; ++block) {
+    __global const float *at = image + (size_t)(tile_py + BLOCK * (block >> 2)) * pitch + tile_px + BLOCK * (block & 3);
+    float lanes[3][16];
+    for (int c = 0; c < 3; ++c)
+      for (int row = 0; row < BLOCK; ++row) vstore4(vload4(0, at + c * plane + row * pitch), row, lanes[c]);
+    for (int v = 0; v < BLOCK_VECTORS; ++v) {
+      r[block * BLOCK_VECTORS + v] = LOADF(lanes[0], v * W);
+      g[block * BLOCK_VECTORS + v] = LOADF(lanes[1], v * W);
+      b[block * BLOCK_VECTORS + v] = LOADF(lanes[2], v * W);
+    }
+  }
+}
+#endif
+
 __kernel void blend(
     const uint tiles_x,
     const uint blocks,                    // rows of `ends`
@@ -89,7 +107,11 @@ __kernel void blend(
     __global uint *hits,                  // [N]
     __global uint *sums,                  // [S, 2, N] low and high words of fixed-point sums, see SUMS in renderer.py
     const uint rows,                      // N
-    __global const float *target          // [3, padded height, padded width] 2: the finished image, 3: the residual
+    __global const float *target          // [3, padded height, padded width] 2, 4: the finished image, 3: the residual
+#endif
+#if STATS == 4
+    ,
+    __global const float *rest            // [3, padded height, padded width] the residual
 #endif
 ) {
   const uint tile = get_global_id(0);
@@ -114,18 +136,15 @@ __kernel void blend(
 
 #if STATS > 1
   FW target_r[BLOCKS * BLOCK_VECTORS], target_g[BLOCKS * BLOCK_VECTORS], target_b[BLOCKS * BLOCK_VECTORS];
-  for (int b = 0; b < BLOCKS; ++b) {
-    const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
-    __global const float *at = target + (size_t)(tile_py + BLOCK * (b >> 2)) * pitch + tile_px + BLOCK * (b & 3);
-    float lanes[3][16];
-    for (int c = 0; c < 3; ++c)
-      for (int row = 0; row < BLOCK; ++row) vstore4(vload4(0, at + c * plane + row * pitch), row, lanes[c]);
-    for (int v = 0; v < BLOCK_VECTORS; ++v) {
-      target_r[b * BLOCK_VECTORS + v] = LOADF(lanes[0], v * W);
-      target_g[b * BLOCK_VECTORS + v] = LOADF(lanes[1], v * W);
-      target_b[b * BLOCK_VECTORS + v] = LOADF(lanes[2], v * W);
-    }
-  }
+  load_blocks(target, tiles_x, height, tile_px, tile_py, target_r, target_g, target_b);
+#endif
+#if STATS == 4
+  FW rest_r[BLOCKS * BLOCK_VECTORS], rest_g[BLOCKS * BLOCK_VECTORS], rest_b[BLOCKS * BLOCK_VECTORS];
+  load_blocks(rest, tiles_x, height, tile_px, tile_py, rest_r, rest_g, rest_b);
+#elif STATS == 3
+#define rest_r target_r
+#define rest_g target_g
+#define rest_b target_b
 #endif
 
   ends += (size_t)(blocks - 1) * get_global_size(0);
@@ -148,10 +167,11 @@ __kernel void blend(
     const FW cr = (FW)r[6], cg = (FW)r[7], cbl = (FW)r[8];
 #if STATS
     IW hit_sum[BLOCK_VECTORS];
-    FW sum_a[BLOCK_VECTORS], sum_b[BLOCK_VECTORS], sum_c[BLOCK_VECTORS], sum_d[BLOCK_VECTORS];
+    FW weights[BLOCK_VECTORS], squares[BLOCK_VECTORS], errors[BLOCK_VECTORS];
+    FW sum_r[BLOCK_VECTORS], sum_g[BLOCK_VECTORS], sum_b[BLOCK_VECTORS];
     for (int v = 0; v < BLOCK_VECTORS; ++v) {
       hit_sum[v] = (IW)0;
-      sum_a[v] = sum_b[v] = sum_c[v] = sum_d[v] = (FW)0.0f;
+      weights[v] = squares[v] = errors[v] = sum_r[v] = sum_g[v] = sum_b[v] = (FW)0.0f;
     }
 #endif
     while (mask) {
@@ -175,21 +195,22 @@ __kernel void blend(
 #if STATS
         hit_sum[v] += hit;
 #endif
-#if STATS == 1
-        sum_a[v] += weight;
-#elif STATS == 2
+#if STATS == 1 || STATS >= 3
+        weights[v] += weight;
+#endif
+#if STATS == 2 || STATS == 4
         // What the pixel would change by without this splat: its own light goes, what lies behind it gets brighter.
         const FW ratio = pick(hit, alpha / ((FW)1.0f - alpha), (FW)0.0f);
         const FW er = fma(weight, cr, -(ratio * (target_r[k] - red[k])));
         const FW eg = fma(weight, cg, -(ratio * (target_g[k] - green[k])));
         const FW eb = fma(weight, cbl, -(ratio * (target_b[k] - blue[k])));
-        sum_a[v] += fma(eb, eb, fma(eg, eg, er * er));
-        sum_b[v] = fma(weight, weight, sum_b[v]);
-#elif STATS == 3
-        sum_a[v] += weight;
-        sum_b[v] = fma(weight, target_r[k], sum_b[v]);
-        sum_c[v] = fma(weight, target_g[k], sum_c[v]);
-        sum_d[v] = fma(weight, target_b[k], sum_d[v]);
+        errors[v] += fma(eb, eb, fma(eg, eg, er * er));
+        squares[v] = fma(weight, weight, squares[v]);
+#endif
+#if STATS >= 3
+        sum_r[v] = fma(weight, rest_r[k], sum_r[v]);
+        sum_g[v] = fma(weight, rest_g[k], sum_g[v]);
+        sum_b[v] = fma(weight, rest_b[k], sum_b[v]);
 #endif
       }
     }
@@ -198,15 +219,21 @@ __kernel void blend(
     if (count) {
 #if STATS == 1
       atomic_add(hits + pair.x, count);
-      ADD_SUM(0, sum_a, FIXED_WEIGHT);
-#elif STATS == 2
-      ADD_SUM(0, sum_a, FIXED_ERROR);
-      ADD_SUM(1, sum_b, FIXED_ERROR);
-#elif STATS == 3
-      ADD_SUM(0, sum_a, FIXED_WEIGHT);
-      ADD_SUM(1, sum_b, FIXED_WEIGHT);
-      ADD_SUM(2, sum_c, FIXED_WEIGHT);
-      ADD_SUM(3, sum_d, FIXED_WEIGHT);
+#endif
+#if STATS == 1 || STATS >= 3
+      ADD_SUM(0, weights, FIXED_WEIGHT);
+#endif
+#if STATS >= 3
+      ADD_SUM(1, sum_r, FIXED_WEIGHT);
+      ADD_SUM(2, sum_g, FIXED_WEIGHT);
+      ADD_SUM(3, sum_b, FIXED_WEIGHT);
+#endif
+#if STATS == 2
+      ADD_SUM(0, errors, FIXED_ERROR);
+      ADD_SUM(1, squares, FIXED_ERROR);
+#elif STATS == 4
+      ADD_SUM(4, errors, FIXED_ERROR);
+      ADD_SUM(5, squares, FIXED_ERROR);
 #endif
     }
 #endif

@@ -7,7 +7,7 @@
 #error "the GPU form is scalar: build with -DW=1"
 #endif
 #ifndef STATS
-#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual) must be defined"
+#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs) must be defined"
 #endif
 
 #define BATCH 64   // splats in local memory at a time
@@ -21,6 +21,9 @@
 #elif STATS == 3
 #define SUMS 4
 #define SUM_UNIT FIXED_WEIGHT
+#elif STATS == 4
+#define SUMS 6
+#define SUM_UNIT (c < 4 ? FIXED_WEIGHT : FIXED_ERROR)
 #endif
 
 __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
@@ -44,6 +47,10 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
     __global uint *sums,
     const uint rows,
     __global const float *target
+#endif
+#if STATS == 4
+    ,
+    __global const float *rest
 #endif
 ) {
   __local float splats[BATCH][9];
@@ -70,6 +77,11 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
   const size_t here = (size_t)py * pitch + px;
 #if STATS > 1
   const float target_r = target[here], target_g = target[plane + here], target_b = target[2 * plane + here];
+#endif
+#if STATS == 4
+  const float rest_r = rest[here], rest_g = rest[plane + here], rest_b = rest[2 * plane + here];
+#elif STATS == 3
+  const float rest_r = target_r, rest_g = target_g, rest_b = target_b;
 #endif
   ends += (size_t)(blocks - 1) * get_num_groups(0);
   const uint first = tile ? ends[tile - 1] : 0u, last = ends[tile];
@@ -104,20 +116,26 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
       }
 #if STATS
       if (p == 0) counts = 0;
-#if STATS == 2
+#if STATS == 2 || STATS == 4
       const float ratio = hit ? alpha / (1.0f - alpha) : 0.0f;
       const float er = fma(weight, splats[n][6], -(ratio * (target_r - red)));
       const float eg = fma(weight, splats[n][7], -(ratio * (target_g - green)));
       const float eb = fma(weight, splats[n][8], -(ratio * (target_b - blue)));
-      parts[0][p] = fma(eb, eb, fma(eg, eg, er * er));
+      const float error = fma(eb, eb, fma(eg, eg, er * er));
+#endif
+#if STATS == 2
+      parts[0][p] = error;
       parts[1][p] = weight;
 #else
       parts[0][p] = weight;
 #endif
-#if STATS == 3
-      parts[1][p] = target_r;
-      parts[2][p] = target_g;
-      parts[3][p] = target_b;
+#if STATS >= 3
+      parts[1][p] = rest_r;
+      parts[2][p] = rest_g;
+      parts[3][p] = rest_b;
+#endif
+#if STATS == 4
+      parts[4][p] = error;
 #endif
       barrier(CLK_LOCAL_MEM_FENCE);
       if (hit) atomic_inc(&counts);
@@ -129,8 +147,12 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
           sum[0] += parts[0][k];
 #if STATS == 2
           sum[1] = fma(parts[1][k], parts[1][k], sum[1]);
-#elif STATS == 3
+#elif STATS >= 3
           for (int c = 1; c < 4; ++c) sum[c] = fma(parts[0][k], parts[c][k], sum[c]);
+#endif
+#if STATS == 4
+          sum[4] += parts[4][k];
+          sum[5] = fma(parts[0][k], parts[0][k], sum[5]);
 #endif
         }
       barrier(CLK_LOCAL_MEM_FENCE);

@@ -45,15 +45,17 @@ __kernel void sh_costs(
     const uint base,                    // row of the scene that the chunk starts at
     const uint degree,                  // SH degree of the chunk, at least 1
     const uint rows,                    // elements of a plane of `sums`
+    const uint plane,                   // plane of `sums` that holds the squared weights
     __global const float *camera,       // [32]
     __global const float *means,        // [3, stride]
     __global const float *sh_rest,      // [3 * K, stride]
-    __global const uint *sums,          // [2, 2, rows] words from the removal blend: squared error, squared weight
+    __global const uint *sums,          // [S, 2, rows] words from a blend with removal costs
     __global long *moments)             // [degree, 4, stride]
 {
   const size_t i = get_global_id(0) * W, s = stride;
   if (i >= count) return;
-  const FW w2 = sum_value(sums + 2 * (size_t)rows, sums + 3 * (size_t)rows, base + i, (int)min(count - (uint)i, (uint)W), 1.0f / FIXED_ERROR);
+  __global const uint *words = sums + 2 * (size_t)plane * rows;
+  const FW w2 = sum_value(words, words + rows, base + i, (int)min(count - (uint)i, (uint)W), 1.0f / FIXED_ERROR);
   if (!ANY(MASK(w2 > (FW)0.0f))) return;
   FW x, y, z;
   view_direction(camera, LOADF(means, i), LOADF(means, s + i), LOADF(means, 2 * s + i), &x, &y, &z);
@@ -84,7 +86,7 @@ __kernel void sh_residual(
     const uint rows,                    // elements of a plane of `sums`
     __global const float *camera,       // [32]
     __global const float *means,        // [3, stride]
-    __global const uint *sums,          // [4, 2, rows] words from the residual blend: weight, red, green, blue
+    __global const uint *sums,          // [S, 2, rows] words from a blend with residuals: weight, red, green, blue first
     __global float *normal)             // [K + 1, 4, stride] red, green, blue, weight
 {
   const size_t i = get_global_id(0) * W, s = stride;

@@ -169,6 +169,16 @@ def test_removal_costs_and_residuals(form: str, pairs: int, monkeypatch: pytest.
     sums = residual_sums(paired, source, camera, padded_target(camera, 19))
     assert (sums[0] > 0).sum() > 40 and (sums[1:] < 0).any() and (sums[1:] > 0).any()
     assert paired.launched["blend_removal"] == paired.launched["blend_residual"] >= 1
+    renderer = Renderer(paired, large_budget(), background=(0.1, 0.5, 1.0))
+    with renderer.load(source) as scene:
+        both = renderer.read_sums(
+            renderer.residual_and_removal_sums(scene, camera, padded_target(camera, 19)), 6, source.count
+        )
+        apart = renderer.read_sums(renderer.removal_sums(scene, camera), 2, source.count)
+        assert (both[4:] == apart).all() and (both[1:4] != 0).any()
+        apart = renderer.read_sums(renderer.residual_sums(scene, camera, padded_target(camera, 19)), 4, source.count)
+        assert (both[:4] == apart).all()
+    renderer.release()
 
 
 @pytest.mark.parametrize("rows", [1, 17, 65])

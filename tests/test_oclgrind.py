@@ -91,6 +91,8 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
         yield costs.removal
         yield costs.sh
         targets: Any = [drawer.render_planes(scene, camera).astype(np.float16) + np.float16(0.1)]
+        sums = drawer.residual_and_removal_sums(scene, camera, targets[0])
+        yield drawer.read_sums(sums, 6, source.count)
     planes = source.read(slice(0, source.count), list(FIELD))
     planes = refit_colours(drawer, planes, np.full(source.count, 4), source.origin, [camera], targets, rounds=1)
     yield planes["sh_dc"]

@@ -9,11 +9,11 @@ import numpy as np
 
 from flexgs_edge.cameras import Camera
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.refit import refit_colours
-from flexgs_edge.render import Renderer
+from flexgs_edge.refit import NormalSums, step_colours
+from flexgs_edge.render import DeviceScene, Renderer
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.score.removal import RemovalCosts, measure_costs
+from flexgs_edge.score.removal import CostSums, RemovalCosts, measure_costs
 
 
 @dataclass
@@ -63,6 +63,8 @@ class PrunePath:
         Scored poses.
     targets : TargetViews
         The original from these poses.
+    refit : bool
+        Mend colours on the way.
     """
 
     def __init__(
@@ -73,28 +75,46 @@ class PrunePath:
         origin: np.ndarray,
         cameras: Sequence[Camera],
         targets: TargetViews,
+        refit: bool = True,
         progress: Progress = SILENT,
     ) -> None:
-        self.renderer, self.origin = renderer, origin
+        self.renderer, self.origin, self.refit = renderer, origin, refit
         self.cameras, self.targets, self.progress = cameras, targets, progress
         start = take_rows(planes, rows)
-        self.snapshots = [Snapshot(rows, start, self._measure(start))]
+        with renderer.load(MemorySource(start, origin=origin)) as scene:
+            costs = measure_costs(renderer, scene, cameras, progress=progress)
+        self.snapshots = [Snapshot(rows, start, costs)]
 
     def descend(self, share: float) -> Snapshot:
-        """Keep `share` of the last snapshot, refit its colours in one round, and measure costs again."""
+        """Keep `share` of the last snapshot, measure costs again, and mend colours by one step.
+
+        One pass gives both, so the costs are those before the step: it moves colours by little, the rest of the change is in the
+        rows that went.
+        """
         last = self.snapshots[-1]
         keep = np.flatnonzero(last.cheapest(last.count - round(last.count * share)))
         planes = take_rows(last.planes, keep)
-        degrees = np.full(len(keep), 4, np.uint8)
-        planes = refit_colours(
-            self.renderer, planes, degrees, self.origin, self.cameras, self.targets, rounds=1, progress=self.progress
-        )
-        self.snapshots.append(Snapshot(last.rows[keep], planes, self._measure(planes)))
+        with self.renderer.load(MemorySource(planes, origin=self.origin)) as scene:
+            if self.refit:
+                costs = self._measure_and_mend(scene, planes)
+            else:
+                costs = measure_costs(self.renderer, scene, self.cameras, progress=self.progress)
+        self.snapshots.append(Snapshot(last.rows[keep], planes, costs))
         return self.snapshots[-1]
 
-    def _measure(self, planes: dict[str, np.ndarray]) -> RemovalCosts:
-        with self.renderer.load(MemorySource(planes, origin=self.origin)) as scene:
-            return measure_costs(self.renderer, scene, self.cameras, progress=self.progress)
+    def _measure_and_mend(self, scene: DeviceScene, planes: dict[str, np.ndarray]) -> RemovalCosts:
+        costs, normal = CostSums(self.renderer, scene), NormalSums(self.renderer, scene)
+        try:
+            for view, camera in enumerate(self.progress.track(self.cameras, "measuring costs", len(self.cameras))):
+                sums = self.renderer.residual_and_removal_sums(scene, camera, self.targets[view])
+                costs.add_view(sums, first=4)
+                normal.add_view(sums)
+            # Nothing has lost its SH on the path yet.
+            step_colours(planes, np.full(scene.count, 4, np.uint8), normal.finish())
+            return costs.finish()
+        finally:
+            costs.release()
+            normal.release()
 
 
 def take_rows(planes: dict[str, np.ndarray], rows: np.ndarray) -> dict[str, np.ndarray]:

@@ -32,8 +32,10 @@ SIZE_SLOPE = -0.45
 FINE_COLOUR = 2.0**-8
 """Colour steps before the refit, as a share of the final ones: only geometry shall move."""
 MOST_ROUNDS = 24
-CLOSE = 0.03
-"""Excess (log of loss over limit) that counts as close enough below the target: about 1.5 % of the bytes."""
+MENDED = 0.6
+"""Loss after the colour refit over the loss before it, until a whole result tells (fox and the sample scene: see PROBES)."""
+PROBES = 3
+"""Unmended results that are looked at between two whole ones, at most: a tenth of the time each."""
 EXTRA_STEPS = 3
 """Steps beyond the effort's own while nothing close to the target holds."""
 AIM = -0.01
@@ -54,23 +56,63 @@ class Effort:
         Share of the Gaussians that stays in each round of the path.
     refit_rounds : int
         Rounds on all coefficients before SH are put on their grid (one on the constant follows).
+    subsets : int
+        Steps a round, as for `refit_colours`.
     steps : int
-        Whole results that are measured.
+        Whole results that are measured, at most while something holds.
+    close : float
+        Excess (log of loss over limit) that ends the search when it is no farther below the target: 0.03 are about 1.5 % of
+        the bytes.
     views : int
         Most scored poses.
     """
 
     keep: float
     refit_rounds: int
+    subsets: int
     steps: int
+    close: float
     views: int
 
 
 EFFORTS = {
-    "fast": Effort(keep=0.66, refit_rounds=1, steps=3, views=24),
-    "balanced": Effort(keep=0.8, refit_rounds=2, steps=4, views=96),
-    "thorough": Effort(keep=0.88, refit_rounds=4, steps=6, views=400),
+    "fast": Effort(keep=0.66, refit_rounds=1, subsets=4, steps=2, close=0.08, views=24),
+    "balanced": Effort(keep=0.8, refit_rounds=1, subsets=6, steps=3, close=0.04, views=96),
+    "thorough": Effort(keep=0.88, refit_rounds=2, subsets=6, steps=6, close=0.015, views=400),
 }
+
+
+@dataclass
+class _Mended:
+    """Colours after a refit, by row of the scene (ascending): where the next refit starts."""
+
+    rows: np.ndarray
+    degrees: np.ndarray
+    planes: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> _Mended:
+        order = np.argsort(rows)
+        return cls(rows[order], degrees[order], {name: planes[name][:, order] for name in ("sh_dc", "sh_rest")})
+
+    def apply(self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """`planes` with these colours where a row was kept with the same SH degree."""
+        at = np.minimum(np.searchsorted(self.rows, rows), len(self.rows) - 1)
+        same = np.flatnonzero((self.rows[at] == rows) & (self.degrees[at] == degrees))
+        changed = {name: planes[name].copy() for name in self.planes}
+        for name, values in changed.items():
+            values[:, same] = self.planes[name][:, at[same]]
+        return {**planes, **changed}
+
+
+@dataclass
+class _Choice:
+    """What a multiplier keeps: rows of the scene, their planes and SH degrees, and the grid steps."""
+
+    rows: np.ndarray
+    planes: dict[str, np.ndarray]
+    degrees: np.ndarray
+    steps: Steps
 
 
 @dataclass(frozen=True)
@@ -141,6 +183,7 @@ class RateSearch:
         self.effort, self.keep_unseen, self.refit, self.on_step = effort, keep_unseen, refit, on_step
         self.bits = BitModel()
         self._slopes: dict[int, Slopes] = {}
+        self._mended: _Mended | None = None
 
     def run(self, target: Target, best_effort: bool = False) -> RateResult:
         """Search; raises `TargetError` with the closest point when nothing holds and `best_effort` is not set."""
@@ -148,6 +191,9 @@ class RateSearch:
         best: tuple[RateStep, GridScene] | None = None
         multiplier = self._start(target)
         self._calibrate(multiplier)
+        # A refit changes the size by little, the loss by much.
+        offset = math.log(MENDED) if self.refit and target.limit_bytes is None else 0.0
+        multiplier = self._aim(target, multiplier, offset)
         for count in range(self.effort.steps + EXTRA_STEPS):
             step, grid = self._whole(multiplier, target)
             steps.append(step)
@@ -155,10 +201,12 @@ class RateSearch:
                 self.on_step(step)
             if best is None or _better(step, best[0], target):
                 best = (step, grid)
-            enough = best[0].holds and best[0].excess > -CLOSE
-            if (count + 1 >= self.effort.steps and enough) or step.multiplier < 1e-30:
+            close = best[0].holds and best[0].excess > -self.effort.close
+            if close or step.multiplier < 1e-30 or (best[0].holds and count + 1 >= self.effort.steps):
                 break
-            multiplier = _next_multiplier(steps, target)
+            offset = step.excess - self._probe(multiplier, target)
+            low, high = _bounds(steps)
+            multiplier = self._aim(target, _next_multiplier(steps, target), offset, low, high)
         assert best is not None
         chosen, grid = best
         if not chosen.holds and not best_effort:
@@ -205,35 +253,65 @@ class RateSearch:
 
     def _calibrate(self, multiplier: float) -> None:
         """Ask the coder what Gaussians cost near the answer. Once: or every step would search another function."""
-        grid, _ = to_grid(*self._choice(multiplier), self.path.origin)
-        _, self.bits = self.size_of(grid)
+        _, self.bits = self.size_of(self._unmended(multiplier))
 
-    def _choice(self, multiplier: float) -> tuple[dict[str, np.ndarray], np.ndarray, Steps]:
-        """Planes of the Gaussians that this multiplier keeps, their SH degrees, and the grid steps."""
+    def _unmended(self, multiplier: float) -> GridScene:
+        choice = self._choice(multiplier)
+        return to_grid(choice.planes, choice.degrees, choice.steps, self.path.origin)[0]
+
+    def _probe(self, multiplier: float, target: Target) -> float:
+        """The excess of a multiplier's result without a refit of its own."""
+        grid = self._unmended(multiplier)
+        if target.limit_bytes is not None:
+            return target.excess(self.size_of(grid)[0], None)
+        return target.excess(0, self.measure(from_grid(grid)))
+
+    def _aim(
+        self, target: Target, multiplier: float, offset: float, low: float = -math.inf, high: float = math.inf
+    ) -> float:
+        """Move to where a whole result (a probe plus `offset`) is expected just below the target; the log stays in (low, high)."""
+        slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
+        seen: list[tuple[float, float]] = []
+        place = math.log(multiplier)
+        for _ in range(PROBES):
+            excess = self._probe(math.exp(place), target) + offset
+            seen.append((place, excess))
+            if abs(excess - AIM) < -AIM:
+                break
+            if len(seen) > 1 and seen[-1][0] != seen[-2][0]:
+                measured = (seen[-1][1] - seen[-2][1]) / (seen[-1][0] - seen[-2][0])
+                slope *= min(max(measured / slope, 0.4), 2.5)
+            place += max(-LARGEST_STRIDE, min(LARGEST_STRIDE, (AIM - excess) / slope))
+            place = max(min(place, high), low)
+        return math.exp(place)
+
+    def _choice(self, multiplier: float) -> _Choice:
         index, keep, degrees = self._snapshot(multiplier)
         snapshot = self.path.snapshots[index]
         rows = np.flatnonzero(keep)
         degrees, weight2 = degrees[rows], snapshot.costs.weight2[rows]
         planes = drop_bands(take_rows(snapshot.planes, rows), degrees, snapshot.costs.sh_mean[:, :, rows], SH_C0)
+        if self._mended is not None:
+            planes = self._mended.apply(snapshot.rows[rows], degrees, planes)
         if index not in self._slopes:
             self._slopes[index] = probe_slopes(self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras)
         steps = choose_steps(self._slopes[index], weight2, degrees, len(snapshot.costs.sh), multiplier)
-        return planes, degrees, holdable(steps, planes)
+        return _Choice(snapshot.rows[rows], planes, degrees, holdable(steps, planes))
 
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
         started = time.perf_counter()
-        planes, degrees, steps = self._choice(multiplier)
-        grid = self._finish(planes, degrees, steps)
+        choice = self._choice(multiplier)
+        grid = self._finish(choice)
         size, _ = self.size_of(grid)
         measurement = self.measure(from_grid(grid))
         excess = target.excess(size, measurement)
-        sh_count = int((degrees > 0).sum())
+        sh_count = int((choice.degrees > 0).sum())
         seconds = time.perf_counter() - started
-        return RateStep(multiplier, len(degrees), sh_count, size, measurement, excess, seconds), grid
+        return RateStep(multiplier, len(choice.rows), sh_count, size, measurement, excess, seconds), grid
 
-    def _finish(self, planes: dict[str, np.ndarray], degrees: np.ndarray, steps: Steps) -> GridScene:
+    def _finish(self, choice: _Choice) -> GridScene:
         """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
-        path = self.path
+        path, planes, degrees, steps = self.path, choice.planes, choice.degrees, choice.steps
         fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
         fine = holdable(fine, planes)
         grid, order = to_grid(planes, degrees, fine, path.origin)
@@ -242,8 +320,15 @@ class RateSearch:
         if self.refit:
             shared = (path.origin, path.cameras, path.targets)
             moved = refit_colours(
-                path.renderer, moved, degrees, *shared, rounds=self.effort.refit_rounds, progress=path.progress
+                path.renderer,
+                moved,
+                degrees,
+                *shared,
+                rounds=self.effort.refit_rounds,
+                subsets=self.effort.subsets,
+                progress=path.progress,
             )
+            self._mended = _Mended.of(choice.rows[order], degrees, moved)
             coarse = from_grid(
                 recolour(
                     replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree])),
@@ -252,7 +337,14 @@ class RateSearch:
                 )
             )
             moved = refit_colours(
-                path.renderer, coarse, degrees, *shared, rounds=1, bands=False, progress=path.progress
+                path.renderer,
+                coarse,
+                degrees,
+                *shared,
+                rounds=1,
+                bands=False,
+                subsets=self.effort.subsets,
+                progress=path.progress,
             )
         final = replace(grid.steps, dc=steps.dc, sh=steps.sh[: grid.sh_degree])
         return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"])
@@ -267,6 +359,18 @@ def _better(step: RateStep, other: RateStep, target: Target) -> bool:
     if target.limit_bytes is not None:
         return step.measurement.loss(target.judge) < other.measurement.loss(target.judge)
     return step.size < other.size
+
+
+def _bounds(steps: Sequence[RateStep]) -> tuple[float, float]:
+    """Logs of the multipliers of the nearest results that hold and that miss, away from both; infinite where none is."""
+    holding = [math.log(s.multiplier) for s in steps if s.holds]
+    missing = [math.log(s.multiplier) for s in steps if not s.holds]
+    if not holding or not missing:
+        return -math.inf, math.inf
+    ends = (max(holding), min(missing)) if max(holding) < min(missing) else (min(holding), max(missing))
+    low, high = min(ends), max(ends)
+    room = NEAREST * (high - low)
+    return low + room, high - room
 
 
 def _next_multiplier(steps: Sequence[RateStep], target: Target) -> float:

@@ -52,8 +52,9 @@ KERNELS: dict[str, KernelSpec] = {
     "blend_stats": KernelSpec("blend_{form}.cl", _BLEND + "bbub", "tile", kernel="blend", stats=1),
     "blend_removal": KernelSpec("blend_{form}.cl", _BLEND + "bbub", "tile", kernel="blend", stats=2),
     "blend_residual": KernelSpec("blend_{form}.cl", _BLEND + "bbub", "tile", kernel="blend", stats=3),
+    "blend_both": KernelSpec("blend_{form}.cl", _BLEND + "bbubb", "tile", kernel="blend", stats=4),
     "residual": KernelSpec("score.cl", "ubbb", "rows"),
-    "sh_costs": KernelSpec("score.cl", "uuuuubbbbb", "rows"),
+    "sh_costs": KernelSpec("score.cl", "uuuuuubbbbb", "rows"),
     "sh_residual": KernelSpec("score.cl", "uuuuubbbb", "rows"),
     "dequantize": KernelSpec("dequantize.cl", "uuuuuuubbbb"),
 }

@@ -77,7 +77,7 @@ def search_best(
                 targets = stack.enter_context(TargetViews(renderer, scene, scored, progress=progress))
             with clock.stage("search"):
                 rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
-                path = PrunePath(renderer, planes, rows, source.origin, scored, targets, progress)
+                path = PrunePath(renderer, planes, rows, source.origin, scored, targets, options.refit, progress)
 
                 def measure(kept: dict[str, np.ndarray]) -> Measurement:
                     with renderer.load(MemorySource(kept, origin=source.origin)) as kept_scene:

@@ -30,11 +30,12 @@ def refit_colours(
     targets: TargetViews,
     rounds: int,
     bands: bool = True,
+    subsets: int = 1,
     progress: Progress = SILENT,
 ) -> dict[str, np.ndarray]:
     """Move colours towards the original's renders, all at once, for a fixed number of rounds.
 
-    Each round adds to every coefficient `relax * sum(Y alpha T r) / sum(|Y| alpha T)` over pixels and poses, with r the
+    Each step adds to every coefficient `relax * sum(Y alpha T r) / sum(|Y| alpha T)` over pixels and poses, with r the
     original's render minus the present one (SIRT: Gilbert 1972). Gaussians that no pose sees stay as they are.
 
     Parameters
@@ -47,8 +48,12 @@ def refit_colours(
         [3] f64, as in `SceneSource`.
     targets : TargetViews
         The original from `cameras`.
+    rounds : int
+        Times that every pose is looked at.
     bands : bool
         Refit the SH above degree 0 as well (otherwise the constant only).
+    subsets : int
+        Steps a round, each after an interleaved part of the poses (ordered subsets: Hudson & Larkin 1994).
 
     Returns
     -------
@@ -56,42 +61,58 @@ def refit_colours(
         The planes, with new `sh_dc` and `sh_rest`.
     """
     planes = {**planes, "sh_dc": planes["sh_dc"].copy(), "sh_rest": planes["sh_rest"].copy()}
-    source = MemorySource(planes, origin=origin)
-    with renderer.load(source) as scene:
-        for _ in progress.track(range(rounds), "refitting colours", rounds):
-            normal = _normal_sums(renderer, scene, cameras, targets)
-            _step(planes, degrees, normal, bands)
+    subsets = max(min(subsets, len(cameras)), 1)
+    parts = [range(first, len(cameras), subsets) for _ in range(rounds) for first in range(subsets)]
+    with renderer.load(MemorySource(planes, origin=origin)) as scene:
+        for part in progress.track(parts, "refitting colours", len(parts)):
+            normal = NormalSums(renderer, scene)
+            try:
+                for view in part:
+                    normal.add_view(renderer.residual_sums(scene, cameras[view], targets[view]))
+                step_colours(planes, degrees, normal.finish(), bands)
+            finally:
+                normal.release()
             scene.refresh("sh_dc", "sh_rest")
     return planes
 
 
-def _normal_sums(renderer: Renderer, scene: DeviceScene, cameras: Sequence[Camera], targets: TargetViews) -> np.ndarray:
-    """[K + 1, 4, n] f32: for every basis function the back-projected residual of three channels and the weight."""
-    backend = renderer.backend
-    arrays: dict[int, tuple[int, Any]] = {}
-    try:
-        for view, camera in enumerate(cameras):
-            sums = renderer.residual_sums(scene, camera, targets[view])
-            for chunk in scene.chunks():
-                if chunk.base not in arrays:
-                    array = backend.array(((chunk.degree + 1) ** 2, 4, chunk.stride), np.float32)
-                    backend.fill(array, 0)
-                    arrays[chunk.base] = (chunk.count, array)
-                backend.launch(
-                    "sh_residual", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, sums.shape[2],
-                    renderer.camera_array, chunk.means, sums, arrays[chunk.base][1],
-                )  # fmt: skip
-        normal = np.zeros(((scene.sh_degree + 1) ** 2, 4, scene.count), np.float32)
-        for base, (count, array) in arrays.items():
-            sums_of_chunk = backend.read(array)[:, :, :count]
+class NormalSums:
+    """Sums over views that a step of the refit is made of: back-projected residuals and weights, for every basis function."""
+
+    def __init__(self, renderer: Renderer, scene: DeviceScene) -> None:
+        self._renderer, self._scene = renderer, scene
+        self._arrays: dict[int, tuple[int, Any]] = {}
+
+    def add_view(self, sums: Any) -> None:
+        """Add the view drawn last; its residual sums begin at plane 0 of `sums`. The order of views is part of the result."""
+        backend = self._renderer.backend
+        for chunk in self._scene.chunks():
+            if chunk.base not in self._arrays:
+                array = backend.array(((chunk.degree + 1) ** 2, 4, chunk.stride), np.float32)
+                backend.fill(array, 0)
+                self._arrays[chunk.base] = (chunk.count, array)
+            backend.launch(
+                "sh_residual", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, sums.shape[2],
+                self._renderer.camera_array, chunk.means, sums, self._arrays[chunk.base][1],
+            )  # fmt: skip
+
+    def finish(self) -> np.ndarray:
+        """[K + 1, 4, n] f32: residual of three channels and weight."""
+        normal = np.zeros(((self._scene.sh_degree + 1) ** 2, 4, self._scene.count), np.float32)
+        for base, (count, array) in self._arrays.items():
+            sums_of_chunk = self._renderer.backend.read(array)[:, :, :count]
             normal[: len(sums_of_chunk), :, base : base + count] = sums_of_chunk
-    finally:
-        for _, array in arrays.values():
+        return normal
+
+    def release(self) -> None:
+        """Free what is held on the backend."""
+        for _, array in self._arrays.values():
             array.release()
-    return normal
+        self._arrays = {}
 
 
-def _step(planes: dict[str, np.ndarray], degrees: np.ndarray, normal: np.ndarray, bands: bool) -> None:
+def step_colours(planes: dict[str, np.ndarray], degrees: np.ndarray, normal: np.ndarray, bands: bool = True) -> None:
+    """One step, in place: `normal` from `NormalSums.finish`, the rest as for `refit_colours`."""
     weight = np.where(normal[:, 3] > 0, normal[:, 3], np.float32(np.inf))
     # The constant's basis is Y_0 everywhere: its step in coefficients is 1 / Y_0 of the mean residual.
     planes["sh_dc"] += np.float32(RELAX_DC / SH_C0) * normal[0, :3] / weight[0]

@@ -262,15 +262,34 @@ class Renderer:
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, 4)
+        self._blend(view, "blend_residual", (hits, sums, sums.shape[2], self._residual(view, target)), again=True)
+        return sums
+
+    def residual_and_removal_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
+        """Both sums of one view, for less than either alone and a half.
+
+        Returns
+        -------
+        array of the backend
+            [6, 2, padded N] u32: the planes of `residual_sums`, then those of `removal_sums`; valid until the next sums.
+        """
+        view = self._prepare(scene, camera)
+        self._blend(view, "blend")
+        hits, sums = self._sum_arrays(scene, 6)
+        residual = self._residual(view, target)
+        self._blend(view, "blend_both", (hits, sums, sums.shape[2], view.buffers.image, residual), again=True)
+        return sums
+
+    def _residual(self, view: _View, target: np.ndarray) -> Any:
         half, residual = view.buffers.target_arrays()
         self.backend.write(half, target.reshape(-1))
         self.backend.launch("residual", (residual.shape[0],), residual.shape[0], half, view.buffers.image, residual)
-        self._blend(view, "blend_residual", (hits, sums, sums.shape[2], residual), again=True)
-        return sums
+        return residual
 
-    def read_sums(self, sums: Any, channels: int, count: int) -> np.ndarray:
-        """[channels, N] i64 from the words of `removal_sums` or `residual_sums`."""
-        words = self.backend.read(sums)[:channels, :, :count].astype(np.uint64)
+    def read_sums(self, sums: Any, channels: int, count: int, first: int = 0) -> np.ndarray:
+        """[channels, N] i64 from the words of sums, from plane `first` on."""
+        words = np.empty((channels, *sums.shape[1:]), np.uint32)
+        words = self.backend.read(sums, words, first * sums.shape[1] * sums.shape[2])[:, :, :count].astype(np.uint64)
         return (words[:, 0] | (words[:, 1] << np.uint64(32))).view(np.int64)
 
     def _sum_arrays(self, scene: DeviceScene, channels: int) -> tuple[Any, Any]:

@@ -55,6 +55,39 @@ class _Wide:
         return (self.high * 2.0**64 + self.low) / unit
 
 
+class CostSums:
+    """Sums over views of what costs are made of.
+
+    Parameters
+    ----------
+    renderer, scene : Renderer, DeviceScene
+    sh_costs : bool
+        Measure the costs of dropping SH degrees as well (empty arrays otherwise).
+    """
+
+    def __init__(self, renderer: Renderer, scene: DeviceScene, sh_costs: bool = True) -> None:
+        self._renderer, self._count = renderer, scene.count
+        self._removal, self._weight2 = _Wide(scene.count), _Wide(scene.count)
+        self._moments = _Moments(renderer, scene, scene.sh_degree if sh_costs else 0)
+
+    def add_view(self, sums: Any, first: int = 0) -> None:
+        """Add the view drawn last; its removal sums begin at plane `first` of `sums`."""
+        self._moments.add_view(sums, first + 1)
+        errors, weights = self._renderer.read_sums(sums, 2, self._count, first)
+        self._removal.add(errors)
+        self._weight2.add(weights)
+
+    def finish(self) -> RemovalCosts:
+        """The costs over the views added."""
+        weight = self._weight2.value(FIXED_ERROR)
+        sh, sh_mean = self._moments.finish(weight)
+        return RemovalCosts(self._removal.value(FIXED_ERROR), weight, sh, sh_mean)
+
+    def release(self) -> None:
+        """Free what is held on the backend."""
+        self._moments.release()
+
+
 def measure_costs(
     renderer: Renderer,
     scene: DeviceScene,
@@ -70,23 +103,15 @@ def measure_costs(
     cameras : sequence of Camera
         The scored poses.
     sh_costs : bool
-        Measure the costs of dropping SH degrees as well (empty arrays otherwise).
+        As for `CostSums`.
     """
-    degree = scene.sh_degree if sh_costs else 0
-    removal, weight2 = _Wide(scene.count), _Wide(scene.count)
-    moments = _Moments(renderer, scene, degree)
+    costs = CostSums(renderer, scene, sh_costs)
     try:
         for camera in progress.track(cameras, "measuring costs", len(cameras)):
-            sums = renderer.removal_sums(scene, camera)
-            moments.add_view(sums)
-            errors, weights = renderer.read_sums(sums, 2, scene.count)
-            removal.add(errors)
-            weight2.add(weights)
-        weight = weight2.value(FIXED_ERROR)
-        sh, sh_mean = moments.finish(weight)
+            costs.add_view(renderer.removal_sums(scene, camera))
+        return costs.finish()
     finally:
-        moments.release()
-    return RemovalCosts(removal.value(FIXED_ERROR), weight, sh, sh_mean)
+        costs.release()
 
 
 class _Moments:
@@ -96,7 +121,7 @@ class _Moments:
         self.renderer, self.scene, self.degree = renderer, scene, degree
         self.arrays: dict[int, tuple[int, Any]] = {}
 
-    def add_view(self, sums: Any) -> None:
+    def add_view(self, sums: Any, plane: int) -> None:
         if not self.degree:
             return
         backend, camera = self.renderer.backend, self.renderer.camera_array
@@ -109,7 +134,7 @@ class _Moments:
                 self.arrays[chunk.base] = (chunk.count, array)
             backend.launch(
                 "sh_costs", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, sums.shape[2],
-                camera, chunk.means, chunk.sh_rest, sums, self.arrays[chunk.base][1],
+                plane, camera, chunk.means, chunk.sh_rest, sums, self.arrays[chunk.base][1],
             )  # fmt: skip
 
     def finish(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from flexgs_edge.kernels.twins.activate import activate
-from flexgs_edge.kernels.twins.blend import blend, blend_removal, blend_residual, blend_stats
+from flexgs_edge.kernels.twins.blend import blend, blend_both, blend_removal, blend_residual, blend_stats
 from flexgs_edge.kernels.twins.dequantize import dequantize
 from flexgs_edge.kernels.twins.project import project
 from flexgs_edge.kernels.twins.score import residual, sh_costs, sh_residual
@@ -36,6 +36,7 @@ TWINS: dict[str, Callable[..., None]] = {
     "blend_stats": blend_stats,
     "blend_removal": blend_removal,
     "blend_residual": blend_residual,
+    "blend_both": blend_both,
     "residual": residual,
     "sh_costs": sh_costs,
     "sh_residual": sh_residual,

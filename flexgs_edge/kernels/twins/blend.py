@@ -63,41 +63,52 @@ def _fixed(lanes: np.ndarray, unit: float) -> np.ndarray:
     return np.clip(total * f32(unit), f32(-FIXED_LARGEST), f32(FIXED_LARGEST)).astype(np.int64)
 
 
+PLANES = {
+    1: ("weight",),
+    2: ("error", "square"),
+    3: ("weight", "red", "green", "blue"),
+    4: ("weight", "red", "green", "blue", "error", "square"),
+}
+"""What the fixed-point sums of each kind of statistics hold."""
+
+
 def _add_sums(
     stats: int,
     lists: _Lists,
     entries: _Entries,
-    target: np.ndarray | None,
+    rest: np.ndarray | None,
     rows_of: np.ndarray,
     hits: np.ndarray,
     sums: np.ndarray,
 ) -> None:
     """Adds to hits and to the fixed-point sums, in the kernel's order: lanes over blocks, then the tree over lanes.
 
-    `target` is [3, units, 16]. stats 1: weights; 2: squared errors and squared weights; 3: weights and weighted targets.
+    `rest` is the residual, [3, units, 16].
     """
-    channels, unit = {1: (1, FIXED_WEIGHT), 2: (2, FIXED_ERROR), 3: (4, FIXED_WEIGHT)}[stats]
-    lanes = np.zeros((channels, len(rows_of), 16), f32)
+    planes = PLANES[stats]
+    lanes = {name: np.zeros((len(rows_of), 16), f32) for name in planes}
     owner = np.repeat(np.arange(len(lists.counts)), lists.counts)
     for b in range(16):
         chosen = np.flatnonzero(owner % 16 == b)
         pair, weight = lists.pair[chosen], entries.weight[chosen]
-        if stats == 2:
-            lanes[0, pair] += entries.error[chosen]
-            lanes[1, pair] = fma(weight, weight, lanes[1, pair])
-            continue
-        lanes[0, pair] += weight
-        for c in range(channels - 1):
-            assert target is not None
-            lanes[1 + c, pair] = fma(weight, target[c, owner[chosen]], lanes[1 + c, pair])
+        if "weight" in lanes:
+            lanes["weight"][pair] += weight
+        if "error" in lanes:
+            lanes["error"][pair] += entries.error[chosen]
+            lanes["square"][pair] = fma(weight, weight, lanes["square"][pair])
+        if "red" in lanes:
+            assert rest is not None
+            for c, name in enumerate(("red", "green", "blue")):
+                lanes[name][pair] = fma(weight, rest[c, owner[chosen]], lanes[name][pair])
     count = np.bincount(lists.pair, weights=entries.hit.sum(axis=1), minlength=len(rows_of)).astype(np.uint32)
     some = count > 0
     if stats == 1:
         np.add.at(hits, rows_of, count)
-    for c in range(channels):
+    for c, name in enumerate(planes):
         low, high = sums[c].astype(np.uint64)
         total = (low | high << np.uint64(32)).view(np.int64)
-        np.add.at(total, rows_of[some], _fixed(lanes[c][some], unit))
+        unit = FIXED_ERROR if name in ("error", "square") else FIXED_WEIGHT
+        np.add.at(total, rows_of[some], _fixed(lanes[name][some], unit))
         words = total.view(np.uint64)
         sums[c, 0] = words & np.uint64(0xFFFFFFFF)
         sums[c, 1] = words >> np.uint64(32)
@@ -123,6 +134,7 @@ def blend(
     sums: np.ndarray | None = None,
     rows: int = 0,
     target: np.ndarray | None = None,
+    rest: np.ndarray | None = None,
     stats: int = 0,
 ) -> None:
     """Blend the tile lists into `state`, and into `image` ([3, padded height, padded width]) at the end."""
@@ -145,9 +157,10 @@ def blend(
             trans = np.where((px < f32(width)) & (py < f32(height)), f32(1), f32(-1))
         ys, xs = py.astype(np.int64), px.astype(np.int64)
         own_target = target.reshape(image.shape)[:, ys, xs] if stats > 1 and target is not None else None
+        own_rest = own_target if rest is None else rest.reshape(image.shape)[:, ys, xs]
         entries = _blend_blocks(lists, part[:, 0], records, (px, py), colour, trans, stats, own_target)
         if entries is not None and hits is not None and sums is not None:
-            _add_sums(stats, lists, entries, own_target, part[:, 0], hits, sums)
+            _add_sums(stats, lists, entries, own_rest, part[:, 0], hits, sums)
         if finish:
             image[:, ys, xs] = fma(np.abs(trans), background[:, None, None], colour)
         else:
@@ -167,7 +180,9 @@ def _blend_blocks(
 ) -> _Entries | None:
     """Blend every block's list into `colour` and `trans`; returns what the statistics need when asked for."""
     shape = (len(lists.pair) if stats else 0, 16)
-    entries = _Entries(np.zeros(shape, bool), np.zeros(shape, f32), np.zeros(shape if stats == 2 else (0, 16), f32))
+    entries = _Entries(
+        np.zeros(shape, bool), np.zeros(shape, f32), np.zeros(shape if stats in (2, 4) else (0, 16), f32)
+    )
     by_length = np.argsort(-lists.counts, kind="stable")
     lengths = lists.counts[by_length]
     for step in range(int(lengths[0]) if len(lengths) else 0):
@@ -191,7 +206,7 @@ def _blend_blocks(
         if not stats:
             continue
         entries.hit[entry], entries.weight[entry] = hit, weight
-        if stats == 2:
+        if stats in (2, 4):
             assert target is not None
             ratio = np.where(hit, alpha / (f32(1) - alpha), f32(0))
             behind = (target[c, units] - colour[c, units] for c in range(3))
@@ -203,3 +218,4 @@ def _blend_blocks(
 blend_stats = partial(blend, stats=1)
 blend_removal = partial(blend, stats=2)
 blend_residual = partial(blend, stats=3)
+blend_both = partial(blend, stats=4)

@@ -37,6 +37,7 @@ def sh_costs(
     base: int,
     degree: int,
     rows: int,
+    plane: int,
     camera: np.ndarray,
     means: np.ndarray,
     sh_rest: np.ndarray,
@@ -44,7 +45,7 @@ def sh_costs(
     moments: np.ndarray,
 ) -> None:
     """Moments w2 d and w2 |d|^2 of the colour d above each lower degree ([degree, 4, stride] i64)."""
-    w2 = _sum_values(sums[1][:, base : base + count], 1.0 / FIXED_ERROR)
+    w2 = _sum_values(sums[plane][:, base : base + count], 1.0 / FIXED_ERROR)
     some = np.flatnonzero(w2 > 0)
     basis = sh_basis(degree, *_directions(camera, means[:, some]))
     d = [np.zeros(len(some), f32) for _ in range(3)]
