@@ -69,11 +69,10 @@ def test_each_gaussian_for_itself() -> None:
     assert chosen(costs, 1e12) == [-1, -1, -1, -1]
 
 
-def test_unseen_gaussians_are_kept_without_sh_or_dropped() -> None:
+def test_unseen_gaussians_are_kept_without_sh() -> None:
     costs = costs_of([0, 1e9, 0], [[0, 1e9, 1e9]], [0.0, 1.0, 0.0])
     assert chosen(costs, 1.0) == [0, 1, 0]
-    assert chosen(costs, 1.0, keep_unseen=False) == [-1, 1, -1]
-    assert chosen(costs, 1e30, keep_unseen=True) == [0, -1, 0]
+    assert chosen(costs, 1e30) == [0, -1, 0]
 
 
 def test_scenes_without_sh_and_without_gaussians() -> None:

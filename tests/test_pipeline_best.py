@@ -162,6 +162,7 @@ def test_the_refit_pays(project: Path, tmp_path: Path) -> None:
     [
         ("keep", 40),
         ("drop", 0),
+        ("25%", 10),
     ],
 )
 def test_gaussians_that_no_pose_sees(project: Path, tmp_path: Path, unseen: str, kept: int) -> None:
@@ -169,6 +170,7 @@ def test_gaussians_that_no_pose_sees(project: Path, tmp_path: Path, unseen: str,
     planes = {name: np.concatenate([values, values[:, :40]], axis=1) for name, values in planes.items()}
     planes["means"][2, COUNT:] -= 5000.0  # behind all of them
     planes["log_scales"][:, COUNT:] = -3
+    planes["log_scales"][:2, COUNT + 5 : COUNT + 15] = -2  # these ten would show most of all
     planes["opacity_logits"][:, COUNT:] = 2
     write_ply(tmp_path / "far.ply", MemorySource(planes, 1))
     words = {**TINY, "cameras": str(project / "cameras.json"), "min_fidelity": 30.0, "unseen": unseen}
@@ -176,6 +178,9 @@ def test_gaussians_that_no_pose_sees(project: Path, tmp_path: Path, unseen: str,
     source = open_scene(tmp_path / "a.fgs")
     depth = source.read(slice(0, source.count), ["means"])["means"][2] + source.origin[2]
     assert (depth < -1000).sum() == kept
+    if unseen == "25%":
+        scales = source.read(slice(0, source.count), ["log_scales"])["log_scales"][:, depth < -1000]
+        assert (scales.max(axis=0) > -2.5).all()
 
 
 def test_dead_splats_go_first(project: Path, tmp_path: Path) -> None:
@@ -218,7 +223,8 @@ def test_one_gaussian(project: Path, tmp_path: Path) -> None:
         ({"save_scores": "s.npy"}, "--save-scores belongs to --method paper"),
         ({"bits": "auto"}, "--bits belongs to --method paper"),
         ({"groups": 7}, "--groups belongs to --method paper"),
-        ({"unseen": "hide"}, "--unseen 'hide': expected one of"),
+        ({"unseen": "hide"}, "--unseen hide: expected keep, drop, or a share"),
+        ({"unseen": "120%"}, "--unseen 120%: expected"),
         ({"max_drop": 1.0, "min_ratio": 3.0}, "--max-drop and --min-ratio: give one target"),
     ],
 )

@@ -36,10 +36,10 @@ class BitModel:
         return self.base + sum(self.bands[:degree])
 
 
-def choose(
-    costs: RemovalCosts, bits: BitModel, multiplier: float, keep_unseen: bool = True
-) -> tuple[np.ndarray, np.ndarray]:
+def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
     """The cheapest of {removed, SH 0, ..., SH D} under cost + multiplier * bits, each Gaussian for itself.
+
+    Gaussians that no pose sees stay, without SH: nothing is known of them.
 
     Parameters
     ----------
@@ -48,8 +48,6 @@ def choose(
     bits : BitModel
     multiplier : float
         Squared error that a bit is worth.
-    keep_unseen : bool
-        Keep Gaussians that no pose sees (without SH): nothing is known of them.
 
     Returns
     -------
@@ -62,7 +60,7 @@ def choose(
     degrees = np.argmin(lagrangian, axis=0).astype(np.uint8)
     keep = REMOVAL_FACTOR * costs.removal >= np.min(lagrangian, axis=0)
     unseen = costs.weight2 <= 0
-    keep[unseen] = keep_unseen
+    keep[unseen] = True
     degrees[unseen] = 0
     return keep, degrees
 

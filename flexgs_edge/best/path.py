@@ -65,6 +65,8 @@ class PrunePath:
         The original from these poses.
     refit : bool
         Mend colours on the way.
+    unseen : float
+        Share of the Gaussians that no pose sees that stays, the most visible ones from elsewhere first.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class PrunePath:
         cameras: Sequence[Camera],
         targets: TargetViews,
         refit: bool = True,
+        unseen: float = 1.0,
         progress: Progress = SILENT,
     ) -> None:
         self.renderer, self.origin, self.refit = renderer, origin, refit
@@ -83,6 +86,9 @@ class PrunePath:
         start = take_rows(planes, rows)
         with renderer.load(MemorySource(start, origin=origin)) as scene:
             costs = measure_costs(renderer, scene, cameras, progress=progress)
+        keep = np.flatnonzero(~_hidden(start, costs.weight2, unseen))
+        if len(keep) < len(rows):
+            rows, start, costs = rows[keep], take_rows(start, keep), costs.take(keep)
         self.snapshots = [Snapshot(rows, start, costs)]
 
     def descend(self, share: float) -> Snapshot:
@@ -115,6 +121,16 @@ class PrunePath:
         finally:
             costs.release()
             normal.release()
+
+
+def _hidden(planes: dict[str, np.ndarray], weight2: np.ndarray, share: float) -> np.ndarray:
+    """[n] bool: all but `share` of the rows that no pose sees, by opacity times the area of the two longest axes."""
+    unseen = np.flatnonzero(weight2 <= 0)
+    logits, scales = planes["opacity_logits"][0, unseen].astype(np.float64), planes["log_scales"][:, unseen]
+    visible = -np.logaddexp(0.0, -logits) + np.sort(scales, axis=0)[1:].sum(axis=0, dtype=np.float64)
+    gone = np.zeros(len(weight2), bool)
+    gone[unseen[np.argsort(visible, kind="stable")[: len(unseen) - round(share * len(unseen))]]] = True
+    return gone
 
 
 def take_rows(planes: dict[str, np.ndarray], rows: np.ndarray) -> dict[str, np.ndarray]:

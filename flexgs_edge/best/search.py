@@ -175,12 +175,11 @@ class RateSearch:
         size_of: Callable[[GridScene], tuple[int, BitModel]],
         measure: Callable[[dict[str, np.ndarray]], Measurement],
         effort: Effort,
-        keep_unseen: bool = True,
         refit: bool = True,
         on_step: Callable[[RateStep], None] | None = None,
     ) -> None:
         self.path, self.size_of, self.measure = path, size_of, measure
-        self.effort, self.keep_unseen, self.refit, self.on_step = effort, keep_unseen, refit, on_step
+        self.effort, self.refit, self.on_step = effort, refit, on_step
         self.bits = BitModel()
         self._slopes: dict[int, Slopes] = {}
         self._mended: _Mended | None = None
@@ -246,7 +245,7 @@ class RateSearch:
             if index == len(self.path.snapshots):
                 self.path.descend(self.effort.keep)
             snapshot = self.path.snapshots[index]
-            keep, degrees = choose(snapshot.costs, self.bits, multiplier, self.keep_unseen)
+            keep, degrees = choose(snapshot.costs, self.bits, multiplier)
             if keep.mean() >= self.effort.keep or snapshot.count < 16:
                 break
         return index, keep, degrees
@@ -269,7 +268,7 @@ class RateSearch:
     def _aim(
         self, target: Target, multiplier: float, offset: float, low: float = -math.inf, high: float = math.inf
     ) -> float:
-        """Move to where a whole result (a probe plus `offset`) is expected just below the target; the log stays in (low, high)."""
+        """Move to where a whole result (a probe plus `offset`) should lie just below the target; the log stays in (low, high)."""
         slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
         seen: list[tuple[float, float]] = []
         place = math.log(multiplier)

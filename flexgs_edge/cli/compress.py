@@ -70,10 +70,10 @@ from flexgs_edge.cli import words
 @words.option(
     "Method",
     "--unseen",
-    type=click.Choice(["keep", "drop"]),
+    metavar="keep|drop|N%",
     default="keep",
     show_default=True,
-    help="Gaussians that no training pose sees (best only): kept without SH, or dropped.",
+    help="Gaussians that no training pose sees (best only): kept without SH, dropped, or the largest N % of them kept.",
 )
 @words.option(
     "Method", "--refit/--no-refit", default=True, help="Refit colours to what was pruned and quantized (best only)."

@@ -77,7 +77,17 @@ def search_best(
                 targets = stack.enter_context(TargetViews(renderer, scene, scored, progress=progress))
             with clock.stage("search"):
                 rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
-                path = PrunePath(renderer, planes, rows, source.origin, scored, targets, options.refit, progress)
+                path = PrunePath(
+                    renderer,
+                    planes,
+                    rows,
+                    source.origin,
+                    scored,
+                    targets,
+                    options.refit,
+                    options.unseen_share,
+                    progress,
+                )
 
                 def measure(kept: dict[str, np.ndarray]) -> Measurement:
                     with renderer.load(MemorySource(kept, origin=source.origin)) as kept_scene:
@@ -87,7 +97,7 @@ def search_best(
                     if on_step:
                         on_step(as_step(step, source.count))
 
-                search = RateSearch(path, size_and_bits, measure, plan, options.unseen == "keep", options.refit, report)
+                search = RateSearch(path, size_and_bits, measure, plan, options.refit, report)
                 found = search.run(target, options.best_effort)
         return found.grid, _as_search(found, source.count)
     finally:

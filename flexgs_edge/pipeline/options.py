@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from flexgs_edge.adapt import REFINE_STEPS, Judge, MaxDrop, MinFidelity, Target, min_ratio
@@ -20,7 +21,6 @@ NO_CAMERAS = "none"
 """`--cameras none`: no views at all; only fixed rates work then."""
 METHODS = ("best", "paper")
 SELECTS = ("test", "train")
-UNSEEN = ("keep", "drop")
 DEFAULT_MAX_DROP = 1.0
 PAPER_ONLY = {"prune_rate": None, "sh_rate": None, "score": "gs", "save_scores": None, "bits": "paper", "groups": None}
 """Options that only `--method paper` knows, with their defaults."""
@@ -110,8 +110,8 @@ class CompressOptions(ViewOptions):
         Steps of the search.
     best_effort : bool
         Write the closest point when the target cannot be met.
-    unseen : {"keep", "drop"}
-        What becomes of Gaussians that no training pose sees (`best`).
+    unseen : str
+        What becomes of Gaussians that no training pose sees (`best`): `keep`, `drop`, or the share that stays, such as `20%`.
     refit : bool
         Refit colours after pruning and quantizing (`best`).
     dry_run : bool
@@ -145,7 +145,6 @@ class CompressOptions(ViewOptions):
         for word, value, known in (
             ("--method", self.method, METHODS),
             ("--select", self.select, SELECTS),
-            ("--unseen", self.unseen, UNSEEN),
             ("--effort", self.effort, tuple(REFINE_STEPS)),
         ):
             if value not in known:
@@ -163,6 +162,7 @@ class CompressOptions(ViewOptions):
                 )
         self._check_targets()
         self.bit_spec()
+        _ = self.unseen_share
 
     def _check_targets(self) -> None:
         words = ("max_drop", "min_fidelity", "max_size", "min_ratio")
@@ -176,6 +176,20 @@ class CompressOptions(ViewOptions):
                 f"{given[0]} with --prune-rate and --sh-rate: fixed rates leave nothing to search; give one or the other"
             )
         self.target("drop", 1)
+
+    @property
+    def unseen_share(self) -> float:
+        """Share from 0 to 1 of the Gaussians that no pose sees that stays."""
+        word = self.unseen.strip().lower()
+        if word in ("keep", "drop"):
+            return float(word == "keep")
+        try:
+            share = float(word.removesuffix("%")) / 100 if word.endswith("%") else math.nan
+        except ValueError:
+            share = math.nan
+        if not 0.0 <= share <= 1.0:
+            raise InputError(f"--unseen {self.unseen}: expected keep, drop, or a share from 0% to 100%")
+        return share
 
     @property
     def fixed(self) -> Choice | None:

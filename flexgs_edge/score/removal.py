@@ -39,6 +39,10 @@ class RemovalCosts:
     sh: np.ndarray
     sh_mean: np.ndarray
 
+    def take(self, rows: np.ndarray) -> RemovalCosts:
+        """The costs of some rows."""
+        return RemovalCosts(self.removal[rows], self.weight2[rows], self.sh[:, rows], self.sh_mean[:, :, rows])
+
 
 class _Wide:
     """Sums of 64-bit fixed-point values beyond 64 bits: adding is exact, so any order gives the same bits."""
