@@ -137,6 +137,23 @@ def test_strange_values(form: str, extent: str) -> None:
     assert statistics.hits[[10, 11, 13, 15]].any()
 
 
+@pytest.mark.parametrize("extent", ["exact", "inria"])
+@pytest.mark.parametrize("form", FORMS)
+def test_antialiased_views(form: str, extent: str) -> None:
+    """Opacity compensation: ordinary rows, needles, splats flat to the last bit, and rows at the ends of float32."""
+    paired = PairedBackend(open_form(form), 3)
+    rotation, translation = look_from(23)
+    camera = make_camera(45, 37, rotation=rotation, translation=translation)
+    arrays = random_scene(200, 23, 1).read(slice(0, 200), list(FIELD))
+    arrays["log_scales"][0] += 2
+    arrays["log_scales"][2, 50:150] = -87
+    arrays["log_scales"][1, 100:150] = -12
+    arrays["quats"][:, 50:110:3] = np.array([[1], [0], [1], [0]])
+    for source in (MemorySource(arrays, 1), strange_scene(), random_scene(17, 24)):
+        assert draw(paired, source, camera, extent=extent, antialiased=True).any()
+        assert count(paired, source, [camera, make_camera(40, 24)], extent=extent, antialiased=True).hits.any()
+
+
 @pytest.mark.parametrize("payload", [0x7FC00000, 0xFFC00000, 0x7FC00001, 0xFFFFFFFF])
 @pytest.mark.parametrize("form", FORMS)
 def test_invalid_rows_leave_no_trace(form: str, payload: int) -> None:
