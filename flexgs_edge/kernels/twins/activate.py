@@ -43,7 +43,7 @@ def activate(
 
 
 def _factor(m0: Triple, m1: Triple, m2: Triple) -> list[np.ndarray]:
-    """xx yx zx yy zy zz of the lower triangular F with F F^T = M M^T, from the rows of M."""
+    """Lower triangle (xx yx zx yy zy zz) of the F with F F^T = M M^T, from the rows of M."""
     xx = dot3(*m0, *m0)
     u = _direction(m0, xx)
     yx, zx = dot3(*m1, *u), dot3(*m2, *u)
