@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flexgs_edge.constants import ALPHA_MIN, FACTOR_MIN, LOG2_E
-from flexgs_edge.kernels.twins.arithmetic import dot3, f32, fexp2, flog2, fma
-
-Triple = tuple[np.ndarray, np.ndarray, np.ndarray]
+from flexgs_edge.kernels.twins.arithmetic import Triple, dot3, f32, fexp2, flog2, fma
 
 
 def activate(

@@ -21,7 +21,7 @@ from flexgs_edge.constants import (
     SPAN_SLACK_RELATIVE,
     TILE,
 )
-from flexgs_edge.kernels.twins.arithmetic import dot3, f32, flog2, fma
+from flexgs_edge.kernels.twins.arithmetic import Triple, dot3, f32, flog2, fma
 
 _LOG2_E = f32(LOG2_E)
 
@@ -88,9 +88,6 @@ def _bounds(
         spans.append((first, last))
     (x0, x1), (y0, y1) = spans
     return (x1 - x0 + f32(1)) * (y1 - y0 + f32(1)), (x1 >= x0) & (y1 >= y0)
-
-
-Triple = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _from_covariance(cov: np.ndarray, t0: Triple, t1: Triple) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
