@@ -15,6 +15,7 @@ from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.decompress import ANTIALIASED_NOTE, decompress
 from flexgs_edge.pipeline.evaluate import evaluate
 from flexgs_edge.pipeline.info import info, info_text
+from flexgs_edge.pipeline.inputs import load_scene
 from flexgs_edge.pipeline.render import render_views
 from flexgs_edge.pipeline.score import score_gaussians
 from flexgs_edge.scene import FIELD, MemorySource, PlySource, write_ply
@@ -119,3 +120,30 @@ def test_info_says_that_a_model_is_antialiased(model: Path, tmp_path: Path) -> N
     (tmp_path / "cfg_args").write_text("antialiasing=True")
     with pytest.raises(FormatError, match="cfg_args"):
         info(tmp_path / "a.ply")
+
+
+def test_the_3d_filter_of_mip_splatting(tmp_path: Path) -> None:
+    """Scales and opacities are stored without it: read with it, by the formulas of its paper, and drawn antialiased."""
+    source = random_scene(50, 8, 1, size=-3)
+    write_ply(tmp_path / "plain.ply", source)
+    head, data = (tmp_path / "plain.ply").read_bytes().split(b"end_header\n")
+    rows = np.frombuffer(data, np.float32).reshape(50, -1)
+    widths = np.random.default_rng(9).uniform(0, 0.1, (50, 1)).astype(np.float32)
+    widths[7] = 0
+    head += b"property float filter_3D\nend_header\n"
+    (tmp_path / "mip.ply").write_bytes(head + np.hstack([rows, widths]).tobytes())
+
+    plain = source.read(slice(0, 50), list(FIELD))
+    variances = np.exp(2 * plain["log_scales"].astype(np.float64))
+    wider = variances + np.square(widths[:, 0].astype(np.float64))
+    opacity = 1 / (1 + np.exp(-plain["opacity_logits"].astype(np.float64))) * np.sqrt((variances / wider).prod(axis=0))
+    scene = load_scene(tmp_path / "mip.ply")
+    read = scene.source.read(slice(0, 50), list(FIELD))
+    np.testing.assert_allclose(np.exp(2 * read["log_scales"]), wider, rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-read["opacity_logits"])), opacity, rtol=1e-5)
+    np.testing.assert_allclose(read["log_scales"][:, 7], plain["log_scales"][:, 7], rtol=1e-6)
+    assert all(np.array_equal(read[name], plain[name]) for name in ("means", "quats", "sh_dc", "sh_rest"))
+    assert scene.settings == {"antialiased": True} and "filter_3D applied" in scene.source.notes[0]
+    assert "antialiased: yes" in info_text(info(tmp_path / "mip.ply"))
+    picked = scene.source.select(np.array([3, 40])).read(slice(0, 2), ["opacity_logits"])["opacity_logits"]
+    assert np.array_equal(picked, read["opacity_logits"][:, [3, 40]])
