@@ -105,6 +105,12 @@ MUTATIONS = (
         "inv = (FW)1.0f / sqrt(fma(z, z, fma(y, y, fma(x, x, w * w))))",
         "inv = (FW)1.0f",
     ),
+    Mutation("opacity not compensated", "project.cl", "level = fma((FW)0.5f, flog2(", "level = fma((FW)0.0f, flog2("),
+    Mutation(
+        "compensation by the area's ratio, not its root", "project.cl", "fma((FW)0.5f, flog2(", "fma((FW)1.0f, flog2("
+    ),
+    Mutation("sign in the area before dilation", "project.cl", "nz = fma(g00, g11, -(", "nz = fma(g00, g11, ("),
+    Mutation("factor's rows not made orthogonal", "activate.cl", "m20 = fma(-yz, ux, m20)", "m20 = m20"),
     Mutation("determinant not checked", "project.cl", "MASK(det < (FW)INFINITY)", "MASK(det == det)"),
     Mutation(
         "hit counted on the splat that ends",

@@ -1,12 +1,14 @@
-// Stored attributes -> what every view needs: 3D covariance and log2 of the opacity. Once a scene, not once a view.
+// Stored attributes -> what every view needs: 3D covariance (or its factor) and log2 of the opacity. Once a scene, not once a view.
 // Twin: flexgs_edge.kernels.twins.activate
 
 __kernel void activate(
     const uint stride,                    // elements of a plane, a multiple of 16
+    const int antialiased,                // 1: the factor of the covariance, which keeps the areas of needles and flat splats
     __global const float *log_scales,     // [3, stride] natural log, scene units
     __global const float *quats,          // [4, stride] w x y z, any norm
     __global const float *logits,         // [stride]
-    __global float *cov,                  // [6, stride] xx xy xz yy yz zz, scene units^2
+    __global float *cov,                  // [6, stride] xx xy xz yy yz zz, scene units^2; the factor F in units: cov = F F^T,
+                                          // F lower triangular, columns xx yx zx, yy zy, zz
     __global float *log2_opacity)         // [stride], -inf where the opacity is below ALPHA_MIN
 {
   const size_t i = get_global_id(0) * W;
@@ -38,12 +40,37 @@ __kernel void activate(
   FW m21 = (FW)2.0f * fma(y, z, w * x) * s1;
   FW m22 = fma((FW)-2.0f, fma(y, y, x * x), (FW)1.0f) * s2;
 
-  STOREF(dot3(m00, m01, m02, m00, m01, m02), cov, i);
-  STOREF(dot3(m00, m01, m02, m10, m11, m12), cov, (size_t)stride + i);
-  STOREF(dot3(m00, m01, m02, m20, m21, m22), cov, 2 * (size_t)stride + i);
-  STOREF(dot3(m10, m11, m12, m10, m11, m12), cov, 3 * (size_t)stride + i);
-  STOREF(dot3(m10, m11, m12, m20, m21, m22), cov, 4 * (size_t)stride + i);
-  STOREF(dot3(m20, m21, m22, m20, m21, m22), cov, 5 * (size_t)stride + i);
+  FW xx = dot3(m00, m01, m02, m00, m01, m02), xy, xz, yy, yz, zz;
+  if (antialiased) {
+    // Modified Gram-Schmidt on the rows: the factor is that of a matrix within a few ulp of M, whatever its rank. A row without
+    // length gives no direction to take away; the limit is far from where devices differ in flushing to zero.
+    FW inv0 = pick(MASK(xx > (FW)FACTOR_MIN), (FW)1.0f / sqrt(xx), (FW)0.0f);
+    FW ux = m00 * inv0, uy = m01 * inv0, uz = m02 * inv0;
+    xx = sqrt(xx);
+    xy = dot3(m10, m11, m12, ux, uy, uz);
+    xz = dot3(m20, m21, m22, ux, uy, uz);
+    m10 = fma(-xy, ux, m10), m11 = fma(-xy, uy, m11), m12 = fma(-xy, uz, m12);
+    m20 = fma(-xz, ux, m20), m21 = fma(-xz, uy, m21), m22 = fma(-xz, uz, m22);
+    yy = dot3(m10, m11, m12, m10, m11, m12);
+    FW inv1 = pick(MASK(yy > (FW)FACTOR_MIN), (FW)1.0f / sqrt(yy), (FW)0.0f);
+    ux = m10 * inv1, uy = m11 * inv1, uz = m12 * inv1;
+    yy = sqrt(yy);
+    yz = dot3(m20, m21, m22, ux, uy, uz);
+    m20 = fma(-yz, ux, m20), m21 = fma(-yz, uy, m21), m22 = fma(-yz, uz, m22);
+    zz = sqrt(dot3(m20, m21, m22, m20, m21, m22));
+  } else {
+    xy = dot3(m00, m01, m02, m10, m11, m12);
+    xz = dot3(m00, m01, m02, m20, m21, m22);
+    yy = dot3(m10, m11, m12, m10, m11, m12);
+    yz = dot3(m10, m11, m12, m20, m21, m22);
+    zz = dot3(m20, m21, m22, m20, m21, m22);
+  }
+  STOREF(xx, cov, i);
+  STOREF(xy, cov, (size_t)stride + i);
+  STOREF(xz, cov, 2 * (size_t)stride + i);
+  STOREF(yy, cov, 3 * (size_t)stride + i);
+  STOREF(yz, cov, 4 * (size_t)stride + i);
+  STOREF(zz, cov, 5 * (size_t)stride + i);
 
   FW opacity = (FW)1.0f / ((FW)1.0f + fexp2(LOADF(logits, i) * (FW)-LOG2_E));
   FW level = flog2(fmax(opacity, (FW)ALPHA_MIN));

@@ -24,6 +24,11 @@ DEFAULT_NEAR: Final = 0.2
 """Near plane in scene units; Gaussians with camera z <= near are culled."""
 DILATION: Final = 0.3
 """Added to both diagonal terms of the 2D covariance, in px^2: a splat never gets thinner than a pixel."""
+SHARE_MIN: Final = 1.0 / 255.0**2
+"""Smallest det before / det after the dilation that can show: opacity is at most 1, and its factor is the square root. The
+reference program floors the factor at 0.005 instead, which leaves splats of opacity above 0.784 at alpha 0.0039 to 0.005."""
+FACTOR_MIN: Final = 1e-30
+"""Rows of a covariance's factor whose squared length (scene units^2) is below this count as zero."""
 JACOBIAN_MARGIN: Final = 0.15
 """The Jacobian is taken at a point clamped to the image plus this share of its width (height) on each side:
 1.3 times the half field of view for a centred principal point."""

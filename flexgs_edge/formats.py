@@ -6,6 +6,7 @@ prints stays out of ours, and a file that crashes it is an error like any other.
 
 from __future__ import annotations
 
+import gzip
 import importlib.util
 import os
 import subprocess
@@ -233,6 +234,16 @@ def _sh_places(format: Format, degree: int) -> np.ndarray:
     return places
 
 
+def _spz_antialiased(path: str | os.PathLike[str]) -> bool:
+    """Bit 0 of byte 14 of the header, which is plain from version 4 on and inside gzip before; the converter drops it."""
+    with open(path, "rb") as file:
+        start = file.read(16)
+    if start[:2] == b"\x1f\x8b":
+        with gzip.open(path) as unpacked:
+            start = unpacked.read(16)
+    return start[:4] == b"NGSP" and len(start) == 16 and bool(start[14] & 1)
+
+
 def _convert(path: str | os.PathLike[str], source: Path, source_format: str, target: Path, target_format: str) -> None:
     """Run the converter; `path` is the user's file, for messages."""
     # Absolute: a name that starts with a dash is no option. Output is never ours: the converter prints as it goes.
@@ -291,7 +302,7 @@ class _WorldSource(_WrappedSource):
 
 
 class _ForeignSource(_WrappedSource):
-    """An expanded scene; opacities of exactly 0 and 1 get finite logits."""
+    """An expanded scene; opacities of exactly 0 and 1 get finite logits. `settings` say what the file says about drawing."""
 
     def __init__(
         self,
@@ -306,6 +317,7 @@ class _ForeignSource(_WrappedSource):
             raise FormatError(f"{path}: not a Gaussian scene as {CONVERTER} reads it: {error}") from error
         super().__init__(parent, os.fspath(path), parent.origin)
         self.format = format
+        self.settings = {"antialiased": True} if format.name == "spz" and _spz_antialiased(path) else {}
         weakref.finalize(self, folder.cleanup)
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:

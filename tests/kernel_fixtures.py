@@ -48,9 +48,10 @@ def draw(
     near: float = 0.2,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     extent: str = "exact",
+    antialiased: bool = False,
 ) -> np.ndarray:
     """One image ([H, W, 3] f32) of a scene that is loaded and freed for it."""
-    renderer = Renderer(backend, large_budget(), near, background, extent)
+    renderer = Renderer(backend, large_budget(), near, background, extent, antialiased)
     with renderer.load(source) as scene:
         image = renderer.render(scene, camera)
     renderer.release()
@@ -58,10 +59,15 @@ def draw(
 
 
 def count(
-    backend: Backend, source: SceneSource, cameras: list[Camera], near: float = 0.2, extent: str = "exact"
+    backend: Backend,
+    source: SceneSource,
+    cameras: list[Camera],
+    near: float = 0.2,
+    extent: str = "exact",
+    antialiased: bool = False,
 ) -> Statistics:
     """Statistics of a scene over views."""
-    renderer = Renderer(backend, large_budget(), near, extent=extent)
+    renderer = Renderer(backend, large_budget(), near, extent=extent, antialiased=antialiased)
     statistics = Statistics.zeros(source.count)
     with renderer.load(source) as scene:
         for camera in cameras:
@@ -71,10 +77,14 @@ def count(
 
 
 def removal_costs(
-    backend: Backend, source: SceneSource, camera: Camera, background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    backend: Backend,
+    source: SceneSource,
+    camera: Camera,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    antialiased: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Squared error of removing each row, and its sum of squared weights, in one view ([N] i64, units of 1 / FIXED_ERROR)."""
-    renderer = Renderer(backend, large_budget(), background=background)
+    renderer = Renderer(backend, large_budget(), background=background, antialiased=antialiased)
     with renderer.load(source) as scene:
         errors, weights = renderer.read_sums(renderer.removal_sums(scene, camera), 2, source.count)
     renderer.release()

@@ -108,7 +108,7 @@ def sh_basis(degree: int, direction: np.ndarray) -> np.ndarray:
     return np.array(basis)
 
 
-def _project(arrays: dict[str, np.ndarray], degree: int, camera: Camera, near: float) -> _Splats:
+def _project(arrays: dict[str, np.ndarray], degree: int, camera: Camera, near: float, antialiased: bool) -> _Splats:
     world = arrays["means"].T
     rotation, translation, size = camera.rotation, camera.translation, (camera.width, camera.height)
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
@@ -156,11 +156,26 @@ def _project(arrays: dict[str, np.ndarray], degree: int, camera: Camera, near: f
     det = a * c - b * b
     det_error = ea * c + ec * a + 2 * abs(b) * eb + 3 * EPS * abs(det)
     shown &= (det > 0) & np.isfinite(np.stack([a, c, det]).astype(np.float32)).all(axis=0)
+    factor, factor_error = np.ones(len(depth)), np.zeros(len(depth))
+    if antialiased:
+        rows = to_pixels @ matrix
+        # The factor that is kept instead of the covariance mixes the columns: errors are those of whole rows.
+        rows_error = np.linalg.norm(to_pixels_error @ abs(matrix) + absolute @ matrix_error, axis=2)
+        rows_error += 24 * EPS * np.linalg.norm(absolute @ abs(matrix), axis=2)
+        length = np.linalg.norm(rows, axis=2)
+        area = np.linalg.norm(np.cross(rows[:, 0], rows[:, 1]), axis=1)
+        area_error = length[:, 0] * rows_error[:, 1] + length[:, 1] * rows_error[:, 0] + rows_error.prod(axis=1)
+        area_error += 5 * EPS * length.prod(axis=1)
+        factor = area / np.sqrt(det)
+        det_error = np.minimum(det_error, 2 * area * area_error + 0.3 * (ea + ec) + 4 * EPS * det)
+        factor_error = area_error / area + det_error / (2 * det) + 2 * EPS
     conic = np.stack([c, -b, a], axis=1) / det[:, None]
     conic_error = np.stack([ec, eb, ea], axis=1) / det[:, None] + abs(conic) * (det_error / det + 3 * EPS)[:, None]
 
     colour, colour_error = _colours(arrays, degree, world - camera.center, abs(world) + abs(camera.center))
     opacity_error = EXP2_ERROR + 4 * EPS * (1 + abs(logit))
+    if antialiased:
+        opacity_error = opacity_error + factor_error + math.log(2) * (LOG2_ERROR + 2 * EPS * abs(np.log2(factor)))
     return _Splats(
         shown,
         depth.astype(np.float32),
@@ -169,7 +184,7 @@ def _project(arrays: dict[str, np.ndarray], degree: int, camera: Camera, near: f
         flat,
         conic,
         conic_error,
-        opacity,
+        opacity * factor,
         opacity_error + EXP2_ERROR + math.log(2) * (LOG2_ERROR + 2 * EPS * abs(np.log2(opacity))),
         colour,
         colour_error,
@@ -212,12 +227,13 @@ def render(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     extent: str = "exact",
     stop: float = STOP,
+    antialiased: bool = False,
 ) -> Reference:
     """Render `source` from `camera` (both in world coordinates)."""
     stored = source.read(slice(0, source.count), list(FIELD))
     arrays = {name: plane.astype(np.float64) for name, plane in stored.items()}
     with np.errstate(all="ignore"):  # behind the camera and at infinity values are nonsense, and culled
-        splats = _project(arrays, source.sh_degree, camera.moved(source.origin), near)
+        splats = _project(arrays, source.sh_degree, camera.moved(source.origin), near, antialiased)
     height, width, count = camera.height, camera.width, source.count
     xs, ys = np.arange(width)[None, :], np.arange(height)[:, None]
     image, trans = np.zeros((height, width, 3)), np.ones((height, width))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import gzip
 import subprocess
 import sys
 import tempfile
@@ -14,6 +15,7 @@ import pytest
 from flexgs_edge import formats
 from flexgs_edge.errors import BudgetError, FormatError, InputError
 from flexgs_edge.formats import FORMATS, OPACITY_LIMIT, format_of, read_foreign, write_foreign
+from flexgs_edge.pipeline.inputs import load_scene
 from flexgs_edge.scene import FIELD, MemorySource, PlySource, SceneSource, open_scene, sh_rest_count
 
 SUFFIXES = tuple(FORMATS)
@@ -45,6 +47,16 @@ def scene(count: int = 700, degree: int = 3, seed: int = 0, far: float = 0.0) ->
     }
     origin = np.array([far, 0.0, 0.0])
     return MemorySource({k: v.astype(np.float32) for k, v in planes.items()}, degree, origin)
+
+
+def test_spz_says_that_a_model_is_antialiased(tmp_path: Path) -> None:
+    path = tmp_path / "a.spz"
+    write_foreign(path, scene(50, 1))
+    assert load_scene(path).settings == {}
+    packed = bytearray(gzip.decompress(path.read_bytes()))
+    packed[14] |= 1
+    path.write_bytes(gzip.compress(bytes(packed)))
+    assert load_scene(path).settings == {"antialiased": True}
 
 
 def planes_of(source: SceneSource) -> dict[str, np.ndarray]:

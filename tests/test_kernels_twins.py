@@ -271,3 +271,20 @@ def test_sums_beyond_32_bits(form: str) -> None:
     scene = random_scene(3, 9, size=math.log(30.0), opacity=8)
     statistics = count(PairedBackend(open_form(form), 1), scene, [make_camera(48, 48)] * 3)
     assert statistics.weights.max() > 2**33
+
+
+@pytest.mark.parametrize("extent", ["exact", "inria"])
+@pytest.mark.parametrize("form", FORMS)
+def test_antialiased_views(form: str, extent: str) -> None:
+    """Opacity compensation: ordinary rows, needles, splats flat to the last bit, and rows at the ends of float32."""
+    paired = PairedBackend(open_form(form), 3)
+    rotation, translation = look_from(23)
+    camera = make_camera(45, 37, rotation=rotation, translation=translation)
+    arrays = random_scene(200, 23, 1).read(slice(0, 200), list(FIELD))
+    arrays["log_scales"][0] += 2
+    arrays["log_scales"][2, 50:150] = -87
+    arrays["log_scales"][1, 100:150] = -12
+    arrays["quats"][:, 50:110:3] = np.array([[1], [0], [1], [0]])
+    for source in (MemorySource(arrays, 1), strange_scene(), random_scene(17, 24)):
+        assert draw(paired, source, camera, extent=extent, antialiased=True).any()
+        assert count(paired, source, [camera, make_camera(40, 24)], extent=extent, antialiased=True).hits.any()

@@ -36,25 +36,32 @@ def assert_matches(
     near: float = 0.2,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     extent: str = "exact",
+    antialiased: bool = False,
 ) -> None:
     """Image within the bound where no decision is on the edge; hits and weights within what those decisions leave open."""
     backend = open_form(form)
-    image = draw(backend, source, camera, near, background, extent)
+    image = draw(backend, source, camera, near, background, extent, antialiased)
     difference = abs(image - reference.image).max(axis=2)
     assert np.isfinite(image).all()
     beyond = (difference - reference.bound)[~reference.fragile]
     assert (beyond <= 0).all(), beyond.max()
-    statistics = count(backend, source, [camera], near, extent)
+    statistics = count(backend, source, [camera], near, extent, antialiased)
     assert (abs(statistics.hits - reference.hits) <= reference.unsure).all()
     assert (abs(statistics.weight_sums - reference.weights) <= reference.weight_bound).all()
 
 
 @cache
-def random_case(seed: int, degree: int, extent: str) -> tuple[MemorySource, Camera, Reference]:
+def random_case(
+    seed: int, degree: int, extent: str, antialiased: bool = False, size: float = -2.0
+) -> tuple[MemorySource, Camera, Reference]:
     rotation, translation = look_from(seed)
     camera = make_camera(45, 37, rotation=rotation, translation=translation)
-    source = random_scene(60, seed, degree)
-    return source, camera, reference_renderer.render(source, camera, background=(0.2, 0.5, 1.0), extent=extent)
+    source = random_scene(60, seed, degree, size)
+    return (
+        source,
+        camera,
+        reference_renderer.render(source, camera, background=(0.2, 0.5, 1.0), extent=extent, antialiased=antialiased),
+    )
 
 
 @pytest.mark.parametrize("extent", ["exact", "inria"])
@@ -354,3 +361,67 @@ def test_sh_basis_of_the_twin(degree: int) -> None:
     exact = reference_renderer.sh_basis(degree, direction.astype(np.float64))
     for ours, theirs in zip(sh_basis(degree, *direction.T), exact[1:]):
         np.testing.assert_allclose(ours, theirs, atol=2e-6)
+
+
+@pytest.mark.parametrize("extent", ["exact", "inria"])
+@pytest.mark.parametrize("size", [-2.0, -4.0])
+@pytest.mark.parametrize("form", ALL_FORMS)
+def test_antialiased_scenes(form: str, size: float, extent: str) -> None:
+    """Opacity compensation, at a third of a pixel and at four pixels a splat, within the same bounds."""
+    source, camera, reference = random_case(1, 1, extent, True, size)
+    assert reference.fragile.mean() < 0.01 and np.median(reference.bound) < 2e-4
+    plain = random_case(1, 1, extent, False, size)[2]
+    assert reference.hits.sum() < (0.75 if size < -3 else 0.99) * plain.hits.sum()
+    assert_matches(form, source, camera, reference, background=(0.2, 0.5, 1.0), extent=extent, antialiased=True)
+
+
+@pytest.mark.parametrize("form", ALL_FORMS)
+def test_antialiased_needles_and_flat_splats(form: str) -> None:
+    """Areas that float32 cannot tell from the covariance's entries: peaks of needles up to 300 pixels, and of flat splats."""
+    rng = np.random.default_rng(31)
+    camera = make_camera(33, 31, focal=300)
+    peaks = []
+    for deviations in (
+        (4.0, 0.003, 0.003),
+        (4.0, 0.02, 0.003),
+        (1.0, 1.0, 1e-9),
+        (2.0, 1e-4, 0.3),
+        (0.01, 0.01, 1e-12),
+    ):
+        for _ in range(6):
+            arrays = make_splats(np.array([[0.0, 0.0, 4.0]]), np.array([deviations]), opacity=0.9).read(
+                slice(0, 1), list(FIELD)
+            )
+            arrays["quats"][:, 0] = rng.normal(size=4)
+            source = MemorySource(arrays)
+            peak = reference_renderer.render(source, camera, antialiased=True).image[15, 16, 0]
+            assert draw(open_form(form), source, camera, antialiased=True)[15, 16, 0] == pytest.approx(peak, abs=2e-5)
+            peaks.append(peak)
+    assert min(peaks) < 0.3 and max(peaks) > 0.85
+
+
+def test_compensation_keeps_the_light_of_far_splats() -> None:
+    """A thin splat from 8 times as far must give 1/64 of the light; the dilation alone makes it many times brighter."""
+    light = np.zeros((2, 2))
+    for angle in np.linspace(0, np.pi, 6, endpoint=False):
+        source = make_splats(np.zeros((1, 3)), np.array([[0.2, 0.03, 0.03]]), angle, 0.9)
+        for row, antialiased in enumerate((False, True)):
+            for column, distance in enumerate((4.0, 32.0)):
+                camera = make_camera(41, 41, focal=60, translation=(0.0, 0.0, distance))
+                image = draw(open_form("w16"), source, camera, antialiased=antialiased)
+                light[row, column] += image.sum(dtype=np.float64) * distance**2
+    assert light[0, 1] > 8 * light[0, 0]
+    # Less what alpha < 1/255 cuts off: 1 % of the near one's light, 8 % of the far one's.
+    assert light[1, 1] == pytest.approx(light[1, 0] * 0.92 / 0.99, rel=0.03)
+
+
+@pytest.mark.parametrize("form", ALL_FORMS)
+def test_antialiased_removal_costs(form: str) -> None:
+    """Compensated opacities are what removal is measured with."""
+    source, camera = random_scene(50, 43, size=-3.5), make_camera(40, 30)
+    reference = reference_renderer.render(source, camera, background=(0.2, 0.5, 1.0), antialiased=True)
+    errors, weights = removal_costs(open_form(form), source, camera, (0.2, 0.5, 1.0), antialiased=True)
+    sure = (reference.unsure == 0) & (reference.hits > 0)
+    assert sure.sum() > 10
+    np.testing.assert_allclose(errors[sure] / FIXED_ERROR, reference.removal[sure], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(weights[sure] / FIXED_ERROR, reference.weights2[sure], rtol=1e-4, atol=1e-6)

@@ -94,6 +94,15 @@ def test_companions_of_a_model_folder_and_of_a_ply_inside_it(model: Path) -> Non
         assert (found.cameras, found.images, found.white_background) == (model / "cameras.json", photos, True)
 
 
+@pytest.mark.parametrize(
+    ("words", "antialiased"), [("antialiasing=True", True), ("antialiasing=False", False), ("antialiasing='yes'", None)]
+)
+def test_cfg_args_may_say_that_the_model_is_antialiased(model: Path, words: str, antialiased: bool | None) -> None:
+    assert find_companions(model).antialiased is None
+    (model / "cfg_args").write_text(f"Namespace({words})")
+    assert find_companions(model).antialiased is antialiased
+
+
 def test_photos_beside_the_model_when_the_source_path_is_elsewhere(model: Path) -> None:
     (model / "images").mkdir()
     (model / "cfg_args").write_text("Namespace(images='images', source_path='/no/such/place', white_background=False)")

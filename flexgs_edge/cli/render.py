@@ -33,7 +33,7 @@ def command(
 ) -> None:
     """Draw views of a scene as PNG files, named after the cameras.
 
-    Near plane, background and extent are those that a .fgs was made with, unless given. The time of a view is
+    Near plane, background, extent and antialiasing are those that a .fgs was made with, unless given. The time of a view is
     the median over all that were drawn; opening the device, compiling kernels and writing files are not in it.
 
     \b

@@ -198,6 +198,13 @@ drawing_options = stack(
         type=click.Choice(["exact", "inria"]),
         help="Reach of a splat: the exact ellipse of alpha >= 1/255, or INRIA's 3 sigma in whole tiles. Default: exact.",
     ),
+    option(
+        "Views",
+        "--antialiased/--no-antialiased",
+        default=None,
+        help="Compensate opacities for the dilation, for models trained so (INRIA's --antialiasing, gsplat's antialiased, "
+        "Mip-Splatting). Default: the file's (or cfg_args'), else not.",
+    ),
 )
 base_psnr_option = option(
     "Quality",

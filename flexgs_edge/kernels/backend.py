@@ -38,8 +38,8 @@ class KernelSpec:
 _BLEND = "uuiiii" + "fff" + "bbbbb"
 
 KERNELS: dict[str, KernelSpec] = {
-    "activate": KernelSpec("activate.cl", "ubbbbb", "rows"),
-    "project": KernelSpec("project.cl", "uuuiibbbbbbbbb", "rows"),
+    "activate": KernelSpec("activate.cl", "uibbbbb", "rows"),
+    "project": KernelSpec("project.cl", "uuuiiibbbbbbbbb", "rows"),
     "sort_count_first": KernelSpec("sort.cl", "ubbbb"),
     "sort_scatter_first": KernelSpec("sort.cl", "ubbbb"),
     "sort_count": KernelSpec("sort.cl", "uubb"),

@@ -16,6 +16,8 @@ from flexgs_edge.scene import check_writable, inria_dtype, write_ply
 WRITE_COPIES = 3
 """Times a chunk's rows that decoding and writing hold at once: codes, planes, rows of the PLY."""
 
+ANTIALIASED_NOTE = "an antialiased model: a PLY cannot say so; viewers must be told, and here --antialiased"
+
 
 def decompress(
     input: str | Path, output: str | Path, force: bool = False, memory_limit: int | None = None
@@ -44,5 +46,7 @@ def decompress(
         row = inria_dtype(scene.source.sh_degree).itemsize
         rows = budget.rows("decoding", WRITE_COPIES * row, minimum=min(scene.source.count, 1024), most=65536)
         notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
+        if scene.settings.get("antialiased") is True:
+            notes = (*notes, ANTIALIASED_NOTE)
     size = os.stat(output).st_size
     return DecompressResult(scene_info(scene), os.fspath(output), size, run_info(budget, clock), notes)

@@ -145,6 +145,7 @@ def _scene_info(path: Path, source: SceneSource) -> dict[str, Any]:
         "source_ply_bytes": ply,
         "cameras": None if beside.cameras is None else os.fspath(beside.cameras),
         "images": None if beside.images is None else os.fspath(beside.images),
+        "antialiased": getattr(source, "settings", {}).get("antialiased", beside.antialiased),
         "notes": list(source.notes),
     }
 
@@ -164,6 +165,8 @@ def info_text(found: dict[str, Any]) -> str:
     for word in ("cameras", "images"):
         if word in found:
             lines.append(f"{word + ':':<12} {found[word] or 'none beside it'}")
+    if found.get("antialiased"):
+        lines.append("antialiased: yes")
     lines += [f"note:        {note}" for note in found["notes"]]
     lines += _layer_lines(found)
     if "channels" in found:

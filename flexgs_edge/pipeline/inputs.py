@@ -37,7 +37,7 @@ class Scene:
     input_count : int
         Gaussians in the file, before any were left out.
     settings : dict
-        Of a `.fgs`; empty for other files.
+        Of a `.fgs`; of other files what they say about drawing (`antialiased` in a `.spz`), mostly nothing.
     """
 
     path: Path
@@ -102,7 +102,7 @@ def load_scene(path: str | Path, drop_invalid: bool = False) -> Scene:
 
 
 def resolve_drawing(options: Options, scene: Scene, companions: Companions) -> Options:
-    """Options with near plane, background and extent filled in: as given, else as the files say, else the defaults."""
+    """Options with all that drawing needs filled in: as given, else as the files say, else the defaults."""
     stored = scene.settings
     background = options.background
     if background is None:
@@ -112,7 +112,14 @@ def resolve_drawing(options: Options, scene: Scene, companions: Companions) -> O
     if near is None:
         found = stored.get("near")
         near = float(found) if isinstance(found, (int, float)) and found > 0 else DEFAULT_NEAR
-    return replace(options, near=near, background=background, extent=options.extent or stored.get("extent") or "exact")
+    antialiased = options.antialiased
+    if antialiased is None:
+        found = stored.get("antialiased", companions.antialiased)
+        antialiased = found if isinstance(found, bool) else False
+        if antialiased:
+            LOG.info("drawn antialiased, as %s says", "the file" if "antialiased" in stored else "cfg_args")
+    extent = options.extent or stored.get("extent") or "exact"
+    return replace(options, near=near, background=background, extent=extent, antialiased=antialiased)
 
 
 def _background(value: object, default: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -176,10 +183,11 @@ def _images(options: ViewOptions, companions: Companions) -> Path | None:
 
 
 def merge_companions(first: Companions, second: Companions) -> Companions:
-    """Cameras and photos of one place (`first` where it has cameras), the background of either."""
+    """Cameras and photos of one place (`first` where it has cameras), background and antialiasing of either."""
     chosen = first if first.cameras is not None else second
     white = first.white_background if first.white_background is not None else second.white_background
-    return Companions(chosen.cameras, chosen.images, white)
+    antialiased = first.antialiased if first.antialiased is not None else second.antialiased
+    return Companions(chosen.cameras, chosen.images, white, antialiased)
 
 
 def companions_of(path: str | Path) -> Companions:

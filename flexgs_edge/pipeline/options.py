@@ -48,6 +48,8 @@ class ViewOptions:
         Red, green, blue in [0, 1]. Default: what a `.fgs` or `cfg_args` says, else black.
     extent : str, optional
         `exact` or `inria`. Default: what a `.fgs` says, else `exact`.
+    antialiased : bool, optional
+        Opacities compensated for the dilation. Default: what a `.fgs` or `cfg_args` says, else not.
     drop_invalid : bool
         Leave rows with NaN, infinity or zero quaternions out.
     memory_limit : int, optional
@@ -64,6 +66,7 @@ class ViewOptions:
     near: float | None = None
     background: tuple[float, float, float] | None = None
     extent: str | None = None
+    antialiased: bool | None = None
     drop_invalid: bool = False
     memory_limit: int | None = None
     device: str | None = None

@@ -121,4 +121,5 @@ def make_settings(
         "near": options.near,
         "background": list(options.background),
         "extent": options.extent,
+        "antialiased": options.antialiased,
     }

@@ -45,7 +45,7 @@ class Workspace:
     Parameters
     ----------
     options : ViewOptions
-        With near plane, background and extent filled in.
+        With near plane, background, extent and antialiasing filled in.
     budget : MemoryBudget
         Everything is taken from it.
     clock : Stopwatch
@@ -53,7 +53,8 @@ class Workspace:
     """
 
     def __init__(self, options: ViewOptions, budget: MemoryBudget, clock: Stopwatch) -> None:
-        assert options.near is not None and options.background is not None and options.extent is not None
+        assert options.near is not None and options.background is not None
+        assert options.extent is not None and options.antialiased is not None
         self.budget = budget
         self.clock = clock
         before = current_rss()
@@ -62,7 +63,9 @@ class Workspace:
         if not self.backend.is_numpy:
             # The runtime and its compiler stay loaded: 80 MiB for PoCL with its kernels cached, 210 MiB without.
             budget.take("the OpenCL runtime", max(current_rss() - before, 0) + BUILD_BYTES)
-        self.renderer = Renderer(self.backend, budget, options.near, options.background, options.extent)
+        self.renderer = Renderer(
+            self.backend, budget, options.near, options.background, options.extent, options.antialiased
+        )
 
     def __enter__(self) -> Workspace:
         return self

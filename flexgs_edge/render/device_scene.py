@@ -23,7 +23,7 @@ SUM_BYTES = 12
 
 
 def plane_bytes(sh_degree: int) -> int:
-    """Bytes a row of an activated chunk: means, covariance, log2 of the opacity, colour."""
+    """Bytes a row of an activated chunk: means, covariance (or its factor), log2 of the opacity, colour."""
     return 4 * (3 + 6 + 1 + 3 + FIELD["sh_rest"].width(sh_degree))
 
 
@@ -57,7 +57,9 @@ def padded(count: int) -> int:
     return -(-count // LANES) * LANES
 
 
-def activate_chunk(backend: Backend, base: int, count: int, degree: int, planes: dict[str, Any]) -> Chunk:
+def activate_chunk(
+    backend: Backend, base: int, count: int, degree: int, planes: dict[str, Any], antialiased: bool = False
+) -> Chunk:
     """Activate stored planes (arrays of the backend with `padded(count)` columns) and free what is not needed after."""
     stride = padded(count)
     cov = backend.array((6, stride), np.float32)
@@ -66,6 +68,7 @@ def activate_chunk(backend: Backend, base: int, count: int, degree: int, planes:
         "activate",
         (stride,),
         stride,
+        int(antialiased),
         planes["log_scales"],
         planes["quats"],
         planes["opacity_logits"],
@@ -159,13 +162,18 @@ class DeviceScene:
     planes : SourcePlanes or QuantizedPlanes
         Asked for each chunk once when the scene fits into the budget, once a view when it does not.
     budget : MemoryBudget
+    antialiased : bool
+        How it is drawn: `cov` of the chunks is then the covariance's factor.
     """
 
-    def __init__(self, backend: Backend, planes: SourcePlanes | QuantizedPlanes, budget: MemoryBudget) -> None:
+    def __init__(
+        self, backend: Backend, planes: SourcePlanes | QuantizedPlanes, budget: MemoryBudget, antialiased: bool = False
+    ) -> None:
         self.backend = backend
         self.count = planes.count
         self.sh_degree = planes.sh_degree if planes.sh_count else 0
         self.origin = planes.origin
+        self.antialiased = antialiased
         self.statistics: list[Any] = []
         self.resident = False
         self._planes = planes
@@ -212,7 +220,8 @@ class DeviceScene:
                 yield start, min(start + self._rows, last), degree
 
     def _load(self, start: int, stop: int, degree: int) -> Chunk:
-        return activate_chunk(self.backend, start, stop - start, degree, self._planes.load(start, stop, degree))
+        planes = self._planes.load(start, stop, degree)
+        return activate_chunk(self.backend, start, stop - start, degree, planes, self.antialiased)
 
     def chunks(self) -> Iterator[Chunk]:
         """The scene's chunks in row order; a streamed chunk lives until the next one is asked for."""

@@ -171,6 +171,8 @@ class Renderer:
         Red, green, blue in [0, 1].
     extent : {"exact", "inria"}
         Pixels that a splat may reach: the ellipse of alpha >= 1/255, or the reference rasteriser's tiles of ceil(3 sigma).
+    antialiased : bool
+        Multiply opacities by sqrt(det before / det after) the dilation of the 2D covariance, as the model was trained.
     """
 
     def __init__(
@@ -180,6 +182,7 @@ class Renderer:
         near: float = DEFAULT_NEAR,
         background: Sequence[float] = (0.0, 0.0, 0.0),
         extent: str = "exact",
+        antialiased: bool = False,
     ) -> None:
         if extent not in EXTENTS:
             raise InputError(f"extent {extent!r}: expected one of {', '.join(EXTENTS)}")
@@ -188,6 +191,7 @@ class Renderer:
         self.near = near
         self.background = tuple(float(np.float32(c)) for c in background)
         self.inria_extent = int(extent == "inria")
+        self.antialiased = antialiased
         self.splats_shown = 0
         self._buffers: _ViewBuffers | None = None
 
@@ -200,12 +204,12 @@ class Renderer:
     def load(self, source: SceneSource) -> DeviceScene:
         """Bring a scene to the backend (all of it, or chunk by chunk for each view when it does not fit)."""
         self.release()
-        return DeviceScene(self.backend, SourcePlanes(self.backend, source), self.budget)
+        return DeviceScene(self.backend, SourcePlanes(self.backend, source), self.budget, self.antialiased)
 
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
         """Bring a quantized scene to the backend, dequantized there."""
         self.release()
-        return DeviceScene(self.backend, QuantizedPlanes(self.backend, quantized), self.budget)
+        return DeviceScene(self.backend, QuantizedPlanes(self.backend, quantized), self.budget, self.antialiased)
 
     def render(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
         """The image of `scene` from `camera` (world coordinates).
@@ -313,7 +317,7 @@ class Renderer:
         for chunk in scene.chunks():
             backend.launch(
                 "project", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, self.inria_extent,
-                buffers.camera, chunk.means, chunk.cov, chunk.log2_opacity, chunk.sh_dc, chunk.sh_rest,
+                int(scene.antialiased), buffers.camera, chunk.means, chunk.cov, chunk.log2_opacity, chunk.sh_dc, chunk.sh_rest,
                 buffers.records, buffers.keys, buffers.bounds,
             )  # fmt: skip
         shown, pairs = self._sort(scene.count, buffers)

@@ -66,13 +66,15 @@ class Companions:
     cameras: Path | None = None
     images: Path | None = None
     white_background: bool | None = None
+    antialiased: bool | None = None
 
 
 def find_companions(path: str | os.PathLike[str]) -> Companions:
-    """Find the cameras, photos and background that belong to a scene.
+    """Find the cameras, photos and ways of drawing that belong to a scene.
 
     Looks beside the file (`cameras.json`, `images/`), or in the model folder: the one given, or the one that holds
-    the file as `point_cloud/iteration_*/*.ply`. A model folder's `cfg_args` names photos elsewhere and the background.
+    the file as `point_cloud/iteration_*/*.ply`. A model folder's `cfg_args` names photos elsewhere, the background, and
+    may say that the model is antialiased (the reference program leaves `antialiasing` out of it, others put it in).
 
     Raises
     ------
@@ -86,12 +88,13 @@ def find_companions(path: str | os.PathLike[str]) -> Companions:
     if inside and not (folder / "cameras.json").is_file():
         folder = holder.parent.parent
     settings = _read_cfg_args(folder / "cfg_args")
-    white = settings.get("white_background")
+    white, antialiased = settings.get("white_background"), settings.get("antialiasing")
     cameras = folder / "cameras.json"
     return Companions(
         cameras if cameras.is_file() else None,
         _find_images(folder, settings),
         white if isinstance(white, bool) else None,
+        antialiased if isinstance(antialiased, bool) else None,
     )
 
 

@@ -10,14 +10,14 @@ import io
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
 from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.scene.atomic import atomic_write
 from flexgs_edge.scene.fields import FIELD, FIELDS
-from flexgs_edge.scene.ply_layout import PlyHeader, gaussian_layout, read_header
+from flexgs_edge.scene.ply_layout import SMOOTHING, PlyHeader, gaussian_layout, read_header, smoothing_of
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
 _BLOCK_ROWS = 4096
@@ -36,7 +36,8 @@ class PlySource(SceneSource):
 
     Binary files are read by row ranges; ascii files, and those with lists in or before the vertices, are loaded whole
     by plyfile. The origin is chosen by `choose_origin` from a sample of the positions; it is taken off in float64 before
-    positions are rounded to float32.
+    positions are rounded to float32. Mip-Splatting's `filter_3D` is applied to scales and opacities, and `settings` then say
+    that the model is antialiased.
 
     Parameters
     ----------
@@ -59,6 +60,8 @@ class PlySource(SceneSource):
                 header = read_header(self.path, file)
                 stamp = _stamp(file)
             self.sh_degree, self.notes = gaussian_layout(header)
+            self._smoothed = smoothing_of(header)
+            self.settings: dict[str, Any] = {"antialiased": True} if self._smoothed else {}
             header.check_size(stamp[1])
             self._rows: _RowReader = _FileRows(header, stamp) if header.plain else _ArrayRows(_load_whole(header))
         except OSError as error:
@@ -85,12 +88,25 @@ class PlySource(SceneSource):
         with np.errstate(over="ignore", invalid="ignore"):
             for part, block in self._rows.blocks(rows):
                 for field, plane in planes.items():
+                    if self._smoothed and field in ("log_scales", "opacity_logits"):
+                        plane[:, part] = _smooth(block)[field]
+                        continue
                     for channel, name in enumerate(FIELD[field].ply_names(self.sh_degree)):
                         values = block[name]
                         if field == "means":
                             values = values.astype(np.float64) - self.origin[channel]
                         plane[channel, part] = values
         return planes
+
+
+def _smooth(block: np.ndarray) -> dict[str, np.ndarray]:
+    """Log-scales and logits after the filter: variances add, and the opacity keeps what the Gaussian holds in all."""
+    scales = np.stack([block[name] for name in FIELD["log_scales"].ply]).astype(np.float64)
+    with np.errstate(all="ignore"):  # no filter is -inf; what is not finite is reported by check_scene
+        wide = np.logaddexp(2 * scales, 2 * np.log(block[SMOOTHING].astype(np.float64))) / 2
+        log_opacity = -np.logaddexp(0, -block["opacity"].astype(np.float64)) + (scales - wide).sum(axis=0)
+        logits = log_opacity - np.log(-np.expm1(log_opacity))
+    return {"log_scales": wide, "opacity_logits": logits[None]}
 
 
 def choose_origin(positions: np.ndarray) -> np.ndarray:

@@ -37,6 +37,8 @@ _HEADER_LIMIT = 1 << 20
 """Bytes: headers of scenes have 2 kB; a file without `end_header` is not read to its end."""
 _SILENT = ("nx", "ny", "nz")
 """INRIA's own properties that carry nothing."""
+SMOOTHING = "filter_3D"
+"""Mip-Splatting's own property: standard deviation, scene units, of a filter that scales and opacities are stored without."""
 
 
 @dataclass
@@ -251,11 +253,21 @@ def gaussian_layout(header: PlyHeader) -> tuple[int, tuple[str, ...]]:
     if wrong:
         kind = "a list" if by_name[wrong[0]].length else f"type {by_name[wrong[0]].type}"
         raise FormatError(f"{header.path}: property {wrong[0]!r} is {kind}; expected float or double")
-    known = {*needed, *_SILENT}
+    smoothed = smoothing_of(header)
+    known = {*needed, *_SILENT, *((SMOOTHING,) if smoothed else ())}
     extra = [name for name in by_name if name not in known]
     notes = [f"extra properties left out: {_list(extra)}"] if extra else []
+    if smoothed:
+        notes.append(
+            f"{SMOOTHING} applied to scales and opacities (Mip-Splatting; it dilates by 0.1 px^2, here it is 0.3)"
+        )
     notes += [f"element {e.name!r} left out ({e.count} rows)" for e in header.elements if e is not vertex]
     return degree, tuple(notes)
+
+
+def smoothing_of(header: PlyHeader) -> bool:
+    """Whether the vertices have Mip-Splatting's 3D filter still to be applied."""
+    return any(p.name == SMOOTHING and p.length is None and p.type.startswith("f") for p in header.vertex.properties)
 
 
 def _sh_degree(path: Path, by_name: dict[str, Property]) -> int:

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexgs_edge.constants import ALPHA_MIN, LOG2_E
-from flexgs_edge.kernels.twins.arithmetic import dot3, f32, fexp2, flog2, fma
+from flexgs_edge.constants import ALPHA_MIN, FACTOR_MIN, LOG2_E
+from flexgs_edge.kernels.twins.arithmetic import Triple, dot3, f32, fexp2, flog2, fma
 
 
 def activate(
     size: tuple[int, ...],
     stride: int,
+    antialiased: int,
     log_scales: np.ndarray,
     quats: np.ndarray,
     logits: np.ndarray,
     cov: np.ndarray,
     log2_opacity: np.ndarray,
 ) -> None:
-    """Stored attributes to 3D covariance ([6, stride]) and log2 of the opacity ([stride], -inf below ALPHA_MIN)."""
+    """Stored attributes to 3D covariance or its factor ([6, stride]) and log2 of the opacity ([stride], -inf below ALPHA_MIN)."""
     s0, s1, s2 = (fexp2(row * f32(LOG2_E)) for row in log_scales)
     big = np.fmax(np.fmax(np.abs(quats[0]), np.abs(quats[1])), np.fmax(np.abs(quats[2]), np.abs(quats[3])))
     w, x, y, z = (row / big for row in quats)
@@ -28,9 +29,34 @@ def activate(
     m0 = (fma(-two, fma(z, z, y * y), one) * s0, two * fma(x, y, -(w * z)) * s1, two * fma(x, z, w * y) * s2)
     m1 = (two * fma(x, y, w * z) * s0, fma(-two, fma(z, z, x * x), one) * s1, two * fma(y, z, -(w * x)) * s2)
     m2 = (two * fma(x, z, -(w * y)) * s0, two * fma(y, z, w * x) * s1, fma(-two, fma(y, y, x * x), one) * s2)
-    for row, (a, b) in enumerate(((m0, m0), (m0, m1), (m0, m2), (m1, m1), (m1, m2), (m2, m2))):
-        cov[row] = dot3(*a, *b)
+    if antialiased:
+        cov[:] = _factor(m0, m1, m2)
+    else:
+        for row, (a, b) in enumerate(((m0, m0), (m0, m1), (m0, m2), (m1, m1), (m1, m2), (m2, m2))):
+            cov[row] = dot3(*a, *b)
 
     opacity = one / (one + fexp2(logits.reshape(-1) * f32(-LOG2_E)))
     level = flog2(np.fmax(opacity, f32(ALPHA_MIN)))
     log2_opacity[:] = np.where(opacity >= f32(ALPHA_MIN), level, f32(-np.inf))
+
+
+def _factor(m0: Triple, m1: Triple, m2: Triple) -> list[np.ndarray]:
+    """Lower triangle (xx yx zx yy zy zz) of the F with F F^T = M M^T, from the rows of M."""
+    xx = dot3(*m0, *m0)
+    u = _direction(m0, xx)
+    yx, zx = dot3(*m1, *u), dot3(*m2, *u)
+    m1, m2 = _without(m1, yx, u), _without(m2, zx, u)
+    yy = dot3(*m1, *m1)
+    u = _direction(m1, yy)
+    zy = dot3(*m2, *u)
+    m2 = _without(m2, zy, u)
+    return [np.sqrt(xx), yx, zx, np.sqrt(yy), zy, np.sqrt(dot3(*m2, *m2))]
+
+
+def _direction(row: Triple, square: np.ndarray) -> Triple:
+    inverse = np.where(square > f32(FACTOR_MIN), f32(1) / np.sqrt(square), f32(0))
+    return row[0] * inverse, row[1] * inverse, row[2] * inverse
+
+
+def _without(row: Triple, part: np.ndarray, u: Triple) -> Triple:
+    return fma(-part, u[0], row[0]), fma(-part, u[1], row[1]), fma(-part, u[2], row[2])

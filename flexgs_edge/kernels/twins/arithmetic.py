@@ -11,6 +11,8 @@ from flexgs_edge.constants import EXP2_HIGH, EXP2_LOW, EXP2_MAGIC, EXP2_POLY, LO
 f32 = np.float32
 Values = Union[np.ndarray, "np.floating[Any]"]
 """An array of float32, or one float32."""
+Triple = tuple[np.ndarray, ...]
+"""x, y and z of many rows."""
 
 _TIE_BITS = np.int64(0x1FFFFFFF)
 _TIE = np.int64(0x10000000)
