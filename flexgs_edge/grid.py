@@ -134,7 +134,7 @@ class GridScene:
         return int(np.count_nonzero(self.sh_degrees))
 
     def take(self, rows: np.ndarray) -> GridScene:
-        """The rows `rows` (ascending), with the SH degree that is left."""
+        """The rows `rows` in their order, with the SH degree that is left."""
         rows = np.arange(self.count)[rows]
         degrees = self.sh_degrees[rows]
         top = int(degrees.max(initial=0))

@@ -20,6 +20,7 @@ from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.evaluate import evaluate
 from flexgs_edge.pipeline.info import info
 from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.pipeline.trim import trim
 from flexgs_edge.report.result import CompressResult
 from flexgs_edge.report.summary import compress_text
 from flexgs_edge.scene import MemorySource, open_scene, write_ply
@@ -231,6 +232,31 @@ def test_one_gaussian(project: Path, tmp_path: Path) -> None:
 def test_words_that_make_no_sense(words: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         CompressOptions(method="best", **words)
+
+
+def test_layers_are_the_same_scene_and_worth_most_first(project: Path, tmp_path: Path) -> None:
+    words = {**TINY, "cameras": str(project / "cameras.json"), "min_fidelity": 40.0}
+    plain = compress(project / "point_cloud.ply", tmp_path / "plain.fgs", **words)
+    layered = compress(project / "point_cloud.ply", tmp_path / "layered.fgs", layers=3, **words)
+    assert plain.quality is not None and layered.quality is not None
+    assert plain.count == layered.count and abs(plain.quality.fidelity - layered.quality.fidelity) < 1e-3  # type: ignore[operator]
+    rows = [layer["rows"] for layer in info(tmp_path / "layered.fgs")["layers"]]
+    assert len(rows) == 3 and all(rows)
+    trim(tmp_path / "layered.fgs", tmp_path / "half.fgs", layered.size - 1)
+    half = open_scene(tmp_path / "half.fgs")
+    assert half.count == sum(rows[:2])
+    # The first layers against as many rows from the file's other end: what matters comes first.
+    whole = open_scene(tmp_path / "layered.fgs")
+    views: dict[str, Any] = {"device": "numpy", "cameras": words["cameras"], "images": "none"}
+    write_ply(tmp_path / "rest.ply", whole.select(np.arange(whole.count - half.count, whole.count)))
+    best, rest = (
+        evaluate(tmp_path / name, tmp_path / "layered.fgs", **views).quality for name in ("half.fgs", "rest.ply")
+    )
+    assert best.fidelity > rest.fidelity + 3  # type: ignore[operator]
+    with pytest.raises(InputError, match="--layers 5"):
+        CompressOptions(method="best", layers=5)
+    with pytest.raises(InputError, match="only --method best"):
+        CompressOptions(method="paper", layers=2)
 
 
 def test_cameras_are_needed(project: Path, tmp_path: Path) -> None:

@@ -97,11 +97,15 @@ class _Mended:
 
     def apply(self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """`planes` with these colours where a row was kept with the same SH degree."""
+        if not len(self.rows):
+            return planes
         at = np.minimum(np.searchsorted(self.rows, rows), len(self.rows) - 1)
         same = np.flatnonzero((self.rows[at] == rows) & (self.degrees[at] == degrees))
         changed = {name: planes[name].copy() for name in self.planes}
         for name, values in changed.items():
-            values[:, same] = self.planes[name][:, at[same]]
+            # A grid may have lost its highest degrees: coefficients are channel by channel.
+            mended = self.planes[name].reshape(3, -1, len(self.rows))
+            values.reshape(3, -1, len(rows))[:, : mended.shape[1], same] = mended[:, :, at[same]]
         return {**planes, **changed}
 
 

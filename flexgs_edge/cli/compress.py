@@ -80,6 +80,15 @@ from flexgs_edge.cli import words
 )
 @words.option(
     "Method",
+    "--layers",
+    metavar="N",
+    type=int,
+    default=1,
+    show_default=True,
+    help="Up to 4 layers that each double the bytes (best only): `trim` then cuts the file to a size without the original.",
+)
+@words.option(
+    "Method",
     "--score",
     metavar="gs|meson|FILE",
     default="gs",

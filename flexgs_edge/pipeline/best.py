@@ -10,6 +10,7 @@ import numpy as np
 
 from flexgs_edge.adapt import Measurement, SearchResult, Step, Target
 from flexgs_edge.best.choice import BitModel
+from flexgs_edge.best.layers import assign_layers
 from flexgs_edge.best.path import PrunePath
 from flexgs_edge.best.search import EFFORTS, RateResult, RateSearch, RateStep
 from flexgs_edge.budget import MemoryBudget
@@ -32,6 +33,8 @@ COPIES = 3
 snapshots at 0.8 of each other sum to four scenes less what the smallest ones share)."""
 
 
+LAYERS_COST = 1.05
+"""Bytes of a layered file over those of one without, at most: neighbours on the curve are farther apart."""
 SETTINGS_MOST = 1536
 """Bytes that the settings in the header take at most: the search counts them before they are known."""
 
@@ -84,9 +87,9 @@ def search_best(
                     source.origin,
                     scored,
                     targets,
-                    options.refit,
-                    options.unseen_share,
-                    progress,
+                    refit=options.refit,
+                    unseen=options.unseen_share,
+                    progress=progress,
                 )
 
                 def measure(kept: dict[str, np.ndarray]) -> Measurement:
@@ -97,9 +100,17 @@ def search_best(
                     if on_step:
                         on_step(as_step(step, source.count))
 
-                search = RateSearch(path, size_and_bits, measure, plan, options.refit, report)
+                def size_of(grid: GridScene) -> tuple[int, BitModel]:
+                    size, bits = size_and_bits(grid)
+                    return (size if options.layers == 1 else round(LAYERS_COST * size)), bits
+
+                search = RateSearch(path, size_of, measure, plan, options.refit, report)
                 found = search.run(target, options.best_effort)
-        return found.grid, _as_search(found, source.count)
+            grid = found.grid
+            if options.layers > 1:
+                with clock.stage("layers"):
+                    grid = assign_layers(grid, options.layers, search.bits, renderer, scored, progress)
+        return grid, _as_search(found, source.count)
     finally:
         budget.give(size)
 

@@ -18,7 +18,7 @@ from flexgs_edge.bitspec import PAPER, BitSpec
 from flexgs_edge.budget import MemoryBudget, format_size
 from flexgs_edge.codec import FgsSource, coded_size, open_fgs, write_grid
 from flexgs_edge.codec.container import write_container
-from flexgs_edge.errors import InputError
+from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.grid import GridScene, from_grid
 from flexgs_edge.pipeline.best import search_best
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
@@ -189,7 +189,9 @@ class _Job:
                 with self.clock.stage("write"):
                     size = write_grid(place, grid, settings)
                 if search.reached and plan.target.limit_bytes is not None and size > plan.target.limit_bytes:
-                    raise AssertionError(f"the file has {size} bytes, more than the search allowed for")
+                    raise TargetError(
+                        f"{plan.target.describe()}: {options.layers} layers make the file {size} bytes; ask for fewer layers"
+                    )
                 quality = self._measure_source(open_fgs(place), report)
             LOG.info("wrote %s, %s", output, format_size(size))
         return self._result(output, size, search.chosen.choice, grid, search, quality)

@@ -21,6 +21,7 @@ NO_CAMERAS = "none"
 """`--cameras none`: no views at all; only fixed rates work then."""
 METHODS = ("best", "paper")
 SELECTS = ("test", "train")
+LAYERS_MOST = 4
 DEFAULT_MAX_DROP = 1.0
 PAPER_ONLY = {"prune_rate": None, "sh_rate": None, "score": "gs", "save_scores": None, "bits": "paper", "groups": None}
 """Options that only `--method paper` knows, with their defaults."""
@@ -117,6 +118,8 @@ class CompressOptions(ViewOptions):
         What becomes of Gaussians that no training pose sees (`best`): `keep`, `drop`, or the share that stays, such as `20%`.
     refit : bool
         Refit colours after pruning and quantizing (`best`).
+    layers : int
+        Layers that `trim` can cut the file at, 1 to 4 (`best`).
     dry_run : bool
         Do everything but write.
     force : bool
@@ -140,6 +143,7 @@ class CompressOptions(ViewOptions):
     best_effort: bool = False
     unseen: str = "keep"
     refit: bool = True
+    layers: int = 1
     dry_run: bool = False
     force: bool = False
 
@@ -163,6 +167,10 @@ class CompressOptions(ViewOptions):
                 raise InputError(
                     f"--{name.replace('_', '-')} belongs to --method paper: leave it out, or ask for that method"
                 )
+        if not 1 <= self.layers <= LAYERS_MOST:
+            raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
+        if self.layers > 1 and self.method != "best":
+            raise InputError(f"--layers {self.layers}: only --method best writes layered files")
         self._check_targets()
         self.bit_spec()
         _ = self.unseen_share
