@@ -107,6 +107,8 @@ class CompressOptions(ViewOptions):
         What becomes of Gaussians that no training pose sees (`best`).
     refit : bool
         Refit colours after pruning and quantizing (`best`).
+    report : str, optional
+        Folder for a page about the run (index.html) and its record (result.json).
     dry_run : bool
         Do everything but write.
     force : bool
@@ -130,6 +132,7 @@ class CompressOptions(ViewOptions):
     best_effort: bool = False
     unseen: str = "keep"
     refit: bool = True
+    report: str | None = None
     dry_run: bool = False
     force: bool = False
 
