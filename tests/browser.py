@@ -15,11 +15,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+NAMES = ("chromium", "google-chrome")
 FLAGS = (
     "--headless=new",
     "--no-sandbox",
     "--disable-gpu",
+    "--disable-dev-shm-usage",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
@@ -29,7 +30,9 @@ FLAGS = (
     "--remote-debugging-pipe",
 )
 # The browser reads commands from descriptor 3 and writes to 4; pytest may have files of its own at those numbers.
-LAUNCHER = "import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4); os.execvp(sys.argv[3], sys.argv[3:])"
+LAUNCHER = (
+    "import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4); os.execvp(sys.argv[3], sys.argv[3:])"
+)
 PATIENCE = 60.0
 
 
@@ -109,7 +112,9 @@ class Browser:
     def open(self, page: Path, width: int, height: int = 800, dark: bool = False, script: bool = True) -> None:
         """Load a page on a screen of this size."""
         self.events.clear()
-        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
+        self.send(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
+        )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.send("Emulation.setEmulatedMedia", features=[scheme])
         self.send("Emulation.setScriptExecutionDisabled", value=not script)
@@ -132,7 +137,8 @@ class Browser:
         clip = {}
         if selector:
             box = self.run(
-                f"(b => [b.x + scrollX, b.y + scrollY, b.width, b.height])(document.querySelector({selector!r}).getBoundingClientRect())"
+                f"(b => [b.x + scrollX, b.y + scrollY, b.width, b.height])"
+                f"(document.querySelector({selector!r}).getBoundingClientRect())"
             )
             clip = {"clip": dict(zip(("x", "y", "width", "height", "scale"), [*box, 1]))}
         answer = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=full or bool(selector), **clip)

@@ -19,9 +19,12 @@ STYLE = """
 .chart .way { fill: none; stroke: var(--soft); opacity: .45; }
 .chart .step { fill: var(--paper); stroke: var(--mark); stroke-width: 1.5; } .chart .holds { fill: var(--mark); }
 .chart .chosen { fill: none; stroke: var(--ink); stroke-width: 2; }
-.chart .target { stroke: var(--warm); stroke-width: 1.5; stroke-dasharray: 5 3; } .chart text.target-word { fill: var(--warm); }
-.key { color: var(--soft); font-size: .9rem; } .key svg { width: 1rem; height: 1rem; vertical-align: -.15em; }
-td.bar { width: 12rem; min-width: 6rem; padding-right: 0; text-align: left; }
+.chart .target { stroke: var(--warm); stroke-width: 1.5; stroke-dasharray: 5 3; }
+.chart text.target-word { fill: var(--warm); }
+.key { color: var(--soft); font-size: .9rem; }
+.key svg { display: inline-block; width: 1rem; height: 1rem; background: none; vertical-align: -.15em; }
+.bars td:first-child { white-space: normal; overflow-wrap: normal; } td.bar { width: 16vw; min-width: 16vw; padding-right: 0;
+  text-align: left; }
 td.bar span { display: block; height: .7rem; min-width: 1px; background: var(--mark); border-radius: 2px; }
 """
 
@@ -67,13 +70,17 @@ def step_chart(steps: Sequence[Step], chosen: Step, target: Target) -> str:
     return "\n".join([*parts, "</svg>", _KEY])
 
 
-_KEY = (
-    '<p class="key">'
-    '<svg class="chart" viewBox="0 0 16 16" aria-hidden="true"><circle class="step holds" cx="8" cy="8" r="4"/></svg> holds the target '
-    '&ensp;<svg class="chart" viewBox="0 0 16 16" aria-hidden="true"><circle class="step" cx="8" cy="8" r="4"/></svg> misses it '
-    '&ensp;<svg class="chart" viewBox="0 0 16 16" aria-hidden="true"><circle class="chosen" cx="8" cy="8" r="6"/></svg> chosen '
-    '&ensp;<svg class="chart" viewBox="0 0 16 16" aria-hidden="true"><path class="target" d="M0 8h16"/></svg> target'
-    "</p>"
+def _key(mark: str, words: str) -> str:
+    return f'<svg class="chart" viewBox="0 0 16 16" aria-hidden="true">{mark}</svg> {words}'
+
+
+_KEY = "&ensp; ".join(
+    (
+        '<p class="key">' + _key('<circle class="step holds" cx="8" cy="8" r="4"/>', "holds the target"),
+        _key('<circle class="step" cx="8" cy="8" r="4"/>', "misses it"),
+        _key('<circle class="chosen" cx="8" cy="8" r="6"/>', "chosen"),
+        _key('<path class="target" d="M0 8h16"/>', "target") + "</p>",
+    )
 )
 
 
@@ -94,10 +101,8 @@ def _target_line(target: Target, limit: float | None, x: object, y: object) -> s
         )
     if limit is None:
         return ""
-    return (
-        f'<path class="target" d="M{_LEFT} {y(limit):.1f}H{WIDTH - _RIGHT}"/>'
-        f'<text class="target-word" x="{WIDTH - _RIGHT}" y="{y(limit) - 5:.1f}" text-anchor="end">{text(target.describe())}</text>'
-    )
+    word = f'<text class="target-word" x="{WIDTH - _RIGHT}" y="{y(limit) - 5:.1f}" text-anchor="end">'
+    return f'<path class="target" d="M{_LEFT} {y(limit):.1f}H{WIDTH - _RIGHT}"/>{word}{text(target.describe())}</text>'
 
 
 def _step_words(step: Step) -> str:
@@ -149,6 +154,6 @@ def bar_table(heads: Sequence[str], rows: Iterable[tuple[str, float, Sequence[ob
         for name, value, cells in rows
     )
     return (
-        f'<div class="scroll" tabindex="0" role="region" aria-label="{text(label)}"><table>\n'
+        f'<div class="scroll bars" tabindex="0" role="region" aria-label="{text(label)}"><table>\n'
         f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody>\n</table></div>"
     )

@@ -17,15 +17,21 @@ from flexgs_edge.report.tones import ERROR_SCALE, css_ramp
 
 _STYLE = """
 .lead { font-size: 1.1rem; }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); gap: .6rem; margin: 1.2rem 0; padding: 0; list-style: none; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); gap: .6rem; margin: 1.2rem 0;
+  padding: 0; list-style: none; }
 .tiles li { padding: .7rem .9rem; border-radius: 8px; background: var(--band); }
-.tiles b { display: block; font-size: 1.4rem; line-height: 1.3; font-variant-numeric: tabular-nums; } .tiles span { color: var(--soft); font-size: .9rem; }
+.tiles b { display: block; font-size: 1.4rem; line-height: 1.3; font-variant-numeric: tabular-nums; }
+.tiles span { color: var(--soft); font-size: .9rem; }
 dl { display: grid; grid-template-columns: minmax(6rem, auto) minmax(0, 1fr); gap: .25rem 1rem; margin: .5rem 0; }
 dt { color: var(--soft); } dd { margin: 0; }
 .warn { padding: .6rem .9rem; border-left: 4px solid var(--warm); background: var(--band); }
+.two { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 24rem), 1fr)); gap: 1rem 2rem; }
+.two > * { min-width: 0; }
 details { margin: .8rem 0; } summary { cursor: pointer; color: var(--mark); }
 footer { margin-top: 3rem; }
 """
+FEW_STEPS = 16
+"""With more steps their table is folded up."""
 _WORDS = (
     (
         "drop",
@@ -41,18 +47,17 @@ _WORDS = (
 def compress_page(result: CompressResult, material: Material) -> str:
     """The page of a `compress`."""
     quality = result.quality
-    name = PurePath(result.output or result.scene.path).name
-    done = "would be" if result.output is None else "is"
-    lead = f"{format_size(result.scene.ply_bytes)} of PLY {'would become' if result.output is None else 'became'} {format_size(result.size)}."
+    name = _name(result.output or result.scene.path)
+    done, became = ("would be", "would become") if result.output is None else ("is", "became")
+    lead = f"{format_size(result.scene.ply_bytes)} of PLY {became} {format_size(result.size)}."
     if quality is not None:
         lead += f" {_loss_words(quality, result.quality_views)}"
     parts = [f'<p class="lead">{text(lead)}</p>']
     if result.output is None:
         parts.append("<p>A dry run: no file was written, and this is what it would be.</p>")
     if result.reached is False:
-        parts.append(
-            f'<p class="warn">The target, {text(result.target)}, was not reached: this is the closest point (--best-effort).</p>'
-        )
+        missed = f"The target, {result.target}, was not reached: this is the closest point (--best-effort)."
+        parts.append(f'<p class="warn">{text(missed)}</p>')
     parts.append(
         _tiles(
             [
@@ -89,8 +94,12 @@ def evaluate_page(result: EvaluateResult, material: Material) -> str:
     parts += _views_section(result.views, material)
     facts = [*_scene_facts("scene", result.scene), *_scene_facts("against", result.reference)]
     parts += _run_section(facts, result.run)
-    title = f"{PurePath(result.scene.path).name} against {PurePath(result.reference.path).name}"
+    title = f"{_name(result.scene.path)} against {_name(result.reference.path)}"
     return page(title, "\n".join(parts), _styles(), _script(material))
+
+
+def _name(path: str) -> str:
+    return PurePath(path).name or path
 
 
 def _styles() -> str:
@@ -107,7 +116,7 @@ def _loss_words(quality: Quality, kind: str) -> str:
         return f"The renders are identical ({over})."
     if quality.drop is not None:
         return f"Against the photos {quality.drop:.2f} dB of PSNR were lost ({over})."
-    return f"Its renders have a PSNR of {quality.fidelity:.2f} dB against the original's ({over}), without photos to compare with."
+    return f"Its renders have a PSNR of {quality.fidelity:.2f} dB against the original's ({over}); there are no photos."
 
 
 def _quality_tiles(quality: Quality | None) -> list[tuple[str, str]]:
@@ -137,14 +146,14 @@ def _facts(items: Iterable[tuple[str, object]]) -> str:
 def _pictures(material: Material, quality: Quality, left: str, right: str) -> list[str]:
     if not material.shots:
         return []
-    scale = (
-        f'Error maps: the largest difference of the three channels, <span class="ramp" style="background:{css_ramp()}"></span> '
-        f"from 0 to {ERROR_SCALE:g} of the full range and more; the same scale in all maps of all pages."
-    )
+    ramp = f'<span class="ramp" style="background:{css_ramp()}"></span>'
+    widest = max(shot.width for shot in material.shots)
     return [
         "<h2>Pictures</h2>",
         viewer.viewer(material.shots, quality, left, right),
-        f'<p class="key">{scale} All figures are of the renders as drawn; the pictures here are JPEG, at most {material.shots[0].width} pixels wide.</p>',
+        f'<p class="key">Error maps: the largest difference of the three channels, {ramp} from 0 to {ERROR_SCALE:g} of the full '
+        "range and more; the same scale in all maps of all pages. All figures are of the renders as drawn; the pictures here are "
+        f"JPEG, {widest} pixels wide.</p>",
     ]
 
 
@@ -176,7 +185,8 @@ def _search_section(result: CompressResult, material: Material) -> list[str]:
     if search is None or result.target is None or material.target is None:
         words = "fixed rates, nothing was searched" if result.target is None else "no step was measured"
         return ["<h2>Search</h2>", f"<p>Target: {words}.</p>"]
-    words = f"Target: {result.target}. {'Reached' if result.reached else 'Not reached'} after {len(search.steps)} steps; decided by {decided_words(result)}."
+    verdict = "Reached" if result.reached else "Not reached"
+    words = f"Target: {result.target}. {verdict} after {len(search.steps)} steps; decided by {decided_words(result)}."
     rows = []
     for number, step in enumerate(search.steps, start=1):
         found = step.measurement
@@ -185,13 +195,14 @@ def _search_section(result: CompressResult, material: Material) -> list[str]:
         if found is not None:
             figures = [_decibel(found.drop, missing=True), _decibel(found.modelled_drop), _decibel(found.fidelity)]
         rates = [f"{step.choice.prune / 1000:g}", f"{step.choice.sh / 1000:g}"]
-        rows.append([f"{number} {step.phase}", *rates, format_size(step.size), *figures, mark, f"{step.seconds:.1f} s"])
-    heads = ["step", "prune rate", "SH rate", "size", "drop", "modelled", "fidelity", "", "time"]
+        rows.append([f"{number} {step.phase}", format_size(step.size), *figures, mark, *rates, f"{step.seconds:.1f} s"])
+    heads = ["step", "size", "drop", "modelled", "fidelity", "target", "prune rate", "SH rate", "time"]
+    state = " open" if len(rows) <= FEW_STEPS else ""
     return [
         "<h2>Search</h2>",
         f"<p>{text(words)}</p>",
-        chart.step_chart(search.steps, search.chosen, material.target),
-        f"<details><summary>All steps</summary>{table(heads, rows, 'Steps of the search')}</details>",
+        f'<div class="two"><div>{chart.step_chart(search.steps, search.chosen, material.target)}</div>',
+        f"<details{state}><summary>All steps</summary>{table(heads, rows, 'Steps of the search')}</details></div>",
     ]
 
 
@@ -205,13 +216,8 @@ def _contents_section(contents: Mapping[str, Any] | None) -> list[str]:
     rows: list[tuple[str, float, list[object]]] = []
     for name, item in channels.items():
         more = [item["bits"], item["groups"]] if packed else [_short(item["step"]), _short(item["bits_per_row"])]
-        rows.append(
-            (
-                name,
-                item["bytes"],
-                [_count(item["bytes"]), f"{100 * item['bytes'] / size:.1f} %", _count(item["rows"]), *more],
-            )
-        )
+        share = f"{100 * item['bytes'] / size:.1f} %"
+        rows.append((name, item["bytes"], [_count(item["bytes"]), share, _count(item["rows"]), *more]))
     rest = contents["overhead_bytes"]
     rows.append(("headers and checksums", rest, [_count(rest), f"{100 * rest / size:.1f} %", "", "", ""]))
     each = f", {contents['bits_per_gaussian']:.1f} bits a Gaussian" if contents.get("bits_per_gaussian") else ""
@@ -238,15 +244,9 @@ def _pictured(material: Material) -> Iterable[tuple[int, int]]:
 def _compress_facts(result: CompressResult) -> list[tuple[str, object]]:
     facts = _scene_facts("scene", result.scene)
     facts.append(("file", result.output or "none (dry run)"))
-    facts.append(
-        (
-            "size",
-            f"{_count(result.size)} bytes, {result.ratio:.2f} times smaller ({result.ratio_without_normals:.2f} than a PLY without normals)",
-        )
-    )
-    kept = (
-        f"{_count(result.count)} of {_count(result.scene.count)} Gaussians, {_count(result.sh_count)} of them with SH"
-    )
+    ratios = f"{result.ratio:.2f} times smaller ({result.ratio_without_normals:.2f} than a PLY without normals)"
+    facts.append(("size", f"{_count(result.size)} bytes, {ratios}"))
+    kept = f"{_count(result.count)} of {_count(result.scene.count)} Gaussians, {_count(result.sh_count)} with SH"
     facts.append(("kept", f"{kept} (prune rate {result.prune_rate:g}, SH rate {result.sh_rate:g})"))
     facts.append(("method", result.method + (f", score {result.score}" if result.score else "")))
     if result.steps is not None:

@@ -11,21 +11,22 @@ from flexgs_edge.report.material import Rig
 
 SIDE = 360
 """Width of a plan in its own units: a phone's, as for charts."""
-WEDGE = 0.07
+WEDGE = 0.055
 """Length of the wedge that shows where a camera looks, as a share of the plan."""
 ROOM = 0.06
 """Empty rim, as a share of the plan."""
-FAR = 1.5
+FAR = 0.35
 """The scene's points widen the plan by at most so many times the cameras' own extent: some scenes reach to the horizon."""
 MOST_NAMES = 400
 """With more cameras their names (seen under a pointer) are left out: a page is not a list."""
 
 STYLE = """
-.plans { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 19rem), 1fr)); gap: 1rem; align-items: start; }
+.plans { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 19rem), 1fr)); gap: 1rem;
+  align-items: start; }
 .plans figure { margin: 0; }
 .plan { display: block; width: 100%; background: var(--band); border-radius: 6px; font-size: 12px; font-weight: 600; }
-.plan .points { fill: none; stroke: var(--soft); stroke-width: 1.4; stroke-linecap: round; opacity: .5; }
-.plan .wedge { fill: var(--mark); fill-opacity: .14; stroke: var(--mark); stroke-opacity: .55; stroke-width: .7; }
+.plan .points { fill: none; stroke: var(--soft); stroke-width: 1.4; stroke-linecap: round; opacity: .65; }
+.plan .wedge { fill: var(--mark); fill-opacity: .1; stroke: var(--mark); stroke-opacity: .55; stroke-width: .7; }
 .plan .stand { fill: var(--mark); }
 .plan .held { fill: var(--warm); stroke: var(--warm); } .plan .held.wedge { fill-opacity: .2; }
 .plan text { fill: var(--ink); paint-order: stroke; stroke: var(--band); stroke-width: 3px; }
@@ -52,7 +53,8 @@ def plans(rig: Rig, numbers: Mapping[str, int]) -> str:
     scene = "dots: the scene; " if len(rig.points) else ""
     return (
         f'<div class="plans">{top}{side}</div>\n<p class="key">{marks}'
-        f"{key} views; {scene}wedges: where cameras look; numbers: the pictures above. Up is what the cameras call up, on average.</p>"
+        f"{key} views; {scene}wedges: where cameras look; numbers: the pictures above. Up is what the cameras call up, on "
+        "average.</p>"
     )
 
 
