@@ -37,8 +37,9 @@ PATIENCE = 60.0
 
 
 def find_browser() -> str | None:
-    """The browser's program, if there is one."""
-    return next((found for name in NAMES if (found := shutil.which(name))), None)
+    """The browser's program, if there is one; not a snap, which sees neither our files nor our pipes."""
+    found = (shutil.which(name) for name in NAMES)
+    return next((path for path in found if path and os.path.basename(os.path.realpath(path)) != "snap"), None)
 
 
 class Browser:
