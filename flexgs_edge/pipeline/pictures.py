@@ -49,10 +49,10 @@ def chosen_ranks(count: int) -> list[int]:
     """Places, from the worst view on, of the views that are shown.
 
     >>> chosen_ranks(10), chosen_ranks(2), chosen_ranks(0)
-    ([0, 2, 4, 7, 9], [0, 1], [])
+    ([0, 2, 4, 6, 9], [0, 1], [])
     """
     most = min(count, MOST_SHOTS)
-    return [i * (count - 1) // max(most - 1, 1) if i < most - 1 or count == 1 else count - 1 for i in range(most)]
+    return [i * (count - 1) // max(most - 1, 1) for i in range(most)]
 
 
 def draw_shots(judge: Judge, scene: DeviceScene, quality: Quality, progress: Progress = SILENT) -> tuple[Shot, ...]:
