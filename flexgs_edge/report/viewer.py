@@ -21,8 +21,8 @@ STYLE = """
 .stage figure { margin: 0; } .stage img { display: block; width: 100%; border-radius: 6px; background: var(--band); }
 .controls { display: none; }
 .js .stage { position: relative; display: block; overflow: hidden; border-radius: 6px; touch-action: pan-y;
-  cursor: ew-resize;
-  width: min(100%, 80vh * var(--width) / var(--height)); margin: 0 auto; --cut: 50%; }
+  cursor: ew-resize; --cut: 50%; }
+.js .stage, .js .controls { width: min(100%, 80vh * var(--width) / var(--height)); margin: 0 auto; }
 .js .stage figure { display: none; } .js .stage figure.original { display: block; }
 .js .stage[data-right=compressed] figure.compressed, .js .stage[data-right=error] figure.error,
   .js .stage[data-right=photo] figure.photo
@@ -100,9 +100,10 @@ def _view(number: int, shot: Shot, figures: ViewQuality, left: str, right: str) 
         for index, (kind, label, _) in enumerate(layers[1:])
     )
     return (
-        f'<article class="view" id="view-{number}">\n<h3><b>{number}</b>{shot.place}: {name}</h3>\n'
+        f'<article class="view" id="view-{number}" style="--width:{shot.width};--height:{shot.height}">\n'
+        f"<h3><b>{number}</b>{shot.place}: {name}</h3>\n"
         f"<p>{text(view_words(figures))}</p>\n"
-        f'<div class="stage" style="--width:{shot.width};--height:{shot.height}">\n{pictures}\n</div>\n<div class="controls">'
+        f'<div class="stage">\n{pictures}\n</div>\n<div class="controls">'
         f'<input type="range" min="0" max="100" value="50" aria-label="Wipe between both pictures of view {name}">'
         f"<fieldset><legend>{text(left)} beside</legend>{choices}</fieldset></div>\n</article>"
     )
