@@ -48,6 +48,8 @@ class Reporter:
     """
 
     def __init__(self, folder: str | Path, force: bool) -> None:
+        if not os.fspath(folder):
+            raise InputError("--report: expected a folder, found nothing")
         self.folder, self.force = Path(folder), force
         self._shots: tuple[Shot, ...] = ()
         self._rig: Rig | None = None
@@ -65,7 +67,7 @@ class Reporter:
             exists, plain, parent = folder.exists(), folder.is_dir(), folder.parent.is_dir()
         except OSError as error:
             raise InputError(f"--report {self.folder}: cannot write there ({error.strerror})") from error
-        if not str(self.folder) or (exists and not plain):
+        if exists and not plain:
             raise InputError(f"--report {self.folder}: expected a folder, found a file")
         if not parent:
             raise InputError(f"--report {self.folder}: the folder {folder.parent} does not exist; make it first")

@@ -153,7 +153,7 @@ def _pictures(material: Material, quality: Quality, left: str, right: str) -> li
         viewer.viewer(material.shots, quality, left, right),
         f'<p class="key">Error maps: the largest difference of the three channels, {ramp} from 0 to {ERROR_SCALE:g} of the full '
         "range and more; the same scale in all maps of all pages. All figures are of the renders as drawn; the pictures here are "
-        f"JPEG, {widest} pixels wide.</p>",
+        f"JPEG, at most {widest} pixels wide.</p>",
     ]
 
 
