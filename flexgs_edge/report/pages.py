@@ -27,11 +27,12 @@ dt { color: var(--soft); } dd { margin: 0; }
 .warn { padding: .6rem .9rem; border-left: 4px solid var(--warm); background: var(--band); }
 .two { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 24rem), 1fr)); gap: 1rem 2rem; }
 .two > * { min-width: 0; }
+.tall .scroll { max-height: 32rem; overflow-y: auto; } .tall th { position: sticky; top: 0; }
 details { margin: .8rem 0; } summary { cursor: pointer; color: var(--mark); }
 footer { margin-top: 3rem; }
 """
-FEW_STEPS = 16
-"""With more steps their table is folded up."""
+FEW_ROWS = 16
+"""With more steps their table is folded up, and with more views theirs gets a height of its own."""
 _WORDS = (
     (
         "drop",
@@ -177,7 +178,8 @@ def _view_section(shots: tuple[Shot, ...], quality: Quality, kind: str) -> list[
             else [name, *alike]
         )
     title = f"The {kind} view{'s' if len(rows) != 1 else ''}, worst first"
-    return [f"<h2>{text(title)}</h2>", table(heads, rows, title)]
+    tall = ' class="tall"' if len(rows) > FEW_ROWS else ""
+    return [f"<h2>{text(title)}</h2>", f"<div{tall}>{table(heads, rows, title)}</div>"]
 
 
 def _search_section(result: CompressResult, material: Material) -> list[str]:
@@ -197,7 +199,7 @@ def _search_section(result: CompressResult, material: Material) -> list[str]:
         rates = [f"{step.choice.prune / 1000:g}", f"{step.choice.sh / 1000:g}"]
         rows.append([f"{number} {step.phase}", format_size(step.size), *figures, mark, *rates, f"{step.seconds:.1f} s"])
     heads = ["step", "size", "drop", "modelled", "fidelity", "target", "prune rate", "SH rate", "time"]
-    state = " open" if len(rows) <= FEW_STEPS else ""
+    state = " open" if len(rows) <= FEW_ROWS else ""
     return [
         "<h2>Search</h2>",
         f"<p>{text(words)}</p>",
