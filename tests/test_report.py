@@ -233,6 +233,11 @@ def test_no_name_gets_out_of_its_place() -> None:
         assert not re.search("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u202a-\u202e]", html)
 
 
+def test_a_gain_is_not_called_a_loss() -> None:
+    result, material = hand_made("n", quality=Quality((ViewQuality("n", 1e-3, 1e-3, 2e-3),)))
+    assert "PSNR rose by 3.01 dB (mean over 1 held-out view)" in Page(compress_page(result, material)).text
+
+
 def test_odd_bytes_in_real_paths(project: Path, tmp_path: Path) -> None:
     place = tmp_path / "a<b>&\"'\udcff"
     place.mkdir()

@@ -116,6 +116,8 @@ def _loss_words(quality: Quality, kind: str) -> str:
     if quality.fidelity is None:
         return f"The renders are identical ({over})."
     if quality.drop is not None:
+        if quality.drop < 0:  # compression can smooth noise away
+            return f"Against the photos PSNR rose by {-quality.drop:.2f} dB ({over})."
         return f"Against the photos {quality.drop:.2f} dB of PSNR were lost ({over})."
     return f"Its renders have a PSNR of {quality.fidelity:.2f} dB against the original's ({over}); there are no photos."
 
