@@ -22,6 +22,11 @@ if ! command -v oclgrind >/dev/null; then
   apt_install oclgrind 2>/dev/null || say "no oclgrind here: its tests are skipped"
 fi
 
+# Opens the pages of reports: those tests skip where there is no browser.
+if ! command -v chromium >/dev/null && ! command -v google-chrome >/dev/null; then
+  apt_install chromium 2>/dev/null || say "no browser here: the tests of report pages are skipped"
+fi
+
 if [ $# -eq 0 ]; then
   rm -f .coverage .coverage.* # left by a run that was killed
   set -- --cov=flexgs_edge --cov-report=term --cov-fail-under=90

@@ -13,6 +13,7 @@ from flexgs_edge.cli import words
 @words.scene_argument
 @words.option("Output", "-o", "--output", metavar="OUT.fgs", help="File to write (not needed with --dry-run).")
 @words.option("Output", "--dry-run", is_flag=True, help="Do everything but write; the size shown is exact.")
+@words.report_option
 @words.option(
     "Target (one of them; default --max-drop 1.0)",
     "--max-drop",
@@ -169,7 +170,7 @@ def command(input: str, output: str | None, json_path: str | None, quiet: bool, 
 
     Exit code 3 says that the target cannot be met, and names the closest point.
     """
-    progress = words.start(quiet, json_path, options["force"])
+    progress = words.start(quiet, json_path, options["force"], options["report"])
     from flexgs_edge.pipeline.compress import compress
     from flexgs_edge.pipeline.options import CompressOptions
     from flexgs_edge.report.summary import compress_text

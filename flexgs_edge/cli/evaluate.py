@@ -15,6 +15,7 @@ from flexgs_edge.cli import words
     "Quality", "--against", metavar="REF", required=True, help="The original: a .ply, a .fgs or a model folder."
 )
 @words.base_psnr_option
+@words.report_option
 @words.cameras_option
 @words.images_option
 @words.holdout_option
@@ -26,7 +27,14 @@ from flexgs_edge.cli import words
 @words.json_option
 @words.talk_options
 def command(
-    input: str, against: str, base_psnr: float, force: bool, json_path: str | None, quiet: bool, **options: Any
+    input: str,
+    against: str,
+    base_psnr: float,
+    report: str | None,
+    force: bool,
+    json_path: str | None,
+    quiet: bool,
+    **options: Any,
 ) -> None:
     """Measure what a scene lost against another one, view by view, mean and worst.
 
@@ -39,11 +47,13 @@ def command(
       flexgs-edge evaluate scene.fgs --against point_cloud.ply
       flexgs-edge evaluate decoded.ply --against point_cloud.ply --cameras cameras.json --images photos
       flexgs-edge evaluate scene.fgs --against point_cloud.ply --holdout 0 --json quality.json
+      flexgs-edge evaluate scene.fgs --against point_cloud.ply --report page
+          figures and pictures in page/index.html
     """
-    progress = words.start(quiet, json_path, force)
+    progress = words.start(quiet, json_path, force, report)
     from flexgs_edge.pipeline.evaluate import evaluate
     from flexgs_edge.pipeline.options import ViewOptions
     from flexgs_edge.report.summary import evaluate_text
 
-    result = evaluate(input, against, ViewOptions(**options), base_psnr, progress)
+    result = evaluate(input, against, ViewOptions(**options), base_psnr, progress, report, force)
     words.emit(evaluate_text(result), result.to_json(), json_path, force)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
@@ -235,6 +235,13 @@ memory_option = option(
     help="Most memory for the whole run, such as 600MiB or 2GB; work is cut into parts that fit. Default: 3/4 of what is free.",
 )
 force_option = option("Run", "-f", "--force", is_flag=True, help="Overwrite files that exist.")
+report_option = option(
+    "Output",
+    "--report",
+    metavar="DIR",
+    help="Write a page to DIR/index.html: figures, the search, bytes, views with original and result under a slider, cameras; "
+    "and the record to DIR/result.json.",
+)
 json_option = option(
     "Run",
     "--json",
@@ -256,7 +263,7 @@ talk_options = stack(
 )
 
 
-def start(quiet: bool, json_path: str | None = None, force: bool = False) -> Progress:
+def start(quiet: bool, json_path: str | None = None, force: bool = False, report: str | None = None) -> Progress:
     """Set up the log on stderr and check the JSON file before any work; progress bars for the job."""
     log = logging.getLogger("flexgs_edge")
     handler = logging.StreamHandler(sys.stderr)
@@ -267,6 +274,8 @@ def start(quiet: bool, json_path: str | None = None, force: bool = False) -> Pro
     if json_path not in (None, "-"):
         from flexgs_edge.scene.atomic import check_writable
 
+        if report is not None and Path(str(json_path)).resolve() == (Path(report) / "result.json").resolve():
+            raise InputError(f"--json {json_path}: --report {report} writes this file already; leave --json out")
         check_writable(str(json_path), force)
     return Progress(enabled=False if quiet else None)
 
@@ -276,7 +285,9 @@ def emit(text: str, record: dict[str, Any], json_path: str | None, force: bool =
     click.echo(text, nl=False, err=json_path == "-")
     if json_path is None:
         return
-    words = json.dumps(record, indent=2, allow_nan=False) + "\n"
+    from flexgs_edge.report.result import json_text
+
+    words = json_text(record)
     if json_path == "-":
         click.echo(words, nl=False)
         return

@@ -27,10 +27,12 @@ from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.plan import EVERYTHING, Plan, make_settings
 from flexgs_edge.pipeline.records import scene_info, views_info
+from flexgs_edge.pipeline.report import Reporter
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, run_info
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice, nonzero_sh, order_from_scores
 from flexgs_edge.quantize import QuantizedScene
+from flexgs_edge.render import DeviceScene
 from flexgs_edge.render.quality import Quality, error_for_drop
 from flexgs_edge.report.result import CompressResult
 from flexgs_edge.scene import MemorySource, SceneSource, check_writable
@@ -77,6 +79,7 @@ def compress(
     """
     options = replace(options or CompressOptions(), **words)
     target_path = _check_outputs(output, options)
+    reporter = Reporter.maybe(options.report, options.force)
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(options.memory_limit)
     with clock.stage("open"):
@@ -89,10 +92,19 @@ def compress(
         scores = (
             None if plan.computes_scores or not plan.needs_scores else load_scores(options.score, scene.source.count)
         )
+        if reporter is not None and views is not None:
+            reporter.see_cameras(views, scene)
     with ExitStack() as stack:
         workspace = stack.enter_context(Workspace(options, budget, clock)) if views is not None else None
-        job = _Job(options, scene, views, plan, budget, clock, workspace, progress)
-        return job.run(target_path, scores)
+        if reporter is not None and views is not None:
+            reporter.reserve(budget, views, plan.report)
+        job = _Job(options, scene, views, plan, budget, clock, workspace, progress, reporter)
+        result = job.run(target_path, scores)
+    if reporter is not None:
+        if target_path is not None:
+            reporter.read_contents(target_path)
+        reporter.write(result, plan.target)
+    return result
 
 
 def _check_outputs(output: str | Path | None, options: CompressOptions) -> Path | None:
@@ -121,7 +133,9 @@ class _Job:
         clock: Stopwatch,
         workspace: Workspace | None,
         progress: Progress,
+        reporter: Reporter | None = None,
     ) -> None:
+        self.reporter = reporter
         self.options, self.scene, self.views, self.plan = options, scene, views, plan
         self.budget, self.clock, self.workspace, self.progress = budget, clock, workspace, progress
         self.source = scene.source
@@ -180,6 +194,8 @@ class _Job:
             decide.close()
         settings = make_settings(options, plan, self.scene, self.views, search, None)
         if output is None:
+            if self.reporter is not None:
+                self.reporter.read_contents_of(lambda place: write_grid(place, grid, settings))
             size, quality = (
                 coded_size(grid, settings),
                 self._measure_source(MemorySource(from_grid(grid), origin=grid.origin), report),
@@ -199,7 +215,7 @@ class _Job:
     def _measure_source(self, source: SceneSource, report: Judge) -> Quality:
         assert self.workspace is not None
         with self.clock.stage("measure"), self.workspace.renderer.load(source) as scene:
-            return report.compare(scene, with_ssim=True, progress=self.progress)
+            return self._compare(scene, report)
 
     def _judges(self) -> tuple[Judge | None, Judge | None]:
         """The judge that decides and the one that reports; one and the same unless the training poses decide."""
@@ -286,6 +302,8 @@ class _Job:
         """Write the file under another name, measure what it decodes to, and only then give it its name."""
         settings = make_settings(self.options, self.plan, self.scene, self.views, search, quantized.bits)
         if output is None:
+            if self.reporter is not None:
+                self.reporter.read_contents_of(lambda place: write_container(place, quantized, settings))
             return self._measure(quantized, report)
         with temporary_name(output, self.options.force) as place:
             with self.clock.stage("write"):
@@ -302,7 +320,13 @@ class _Job:
         if self.workspace is None or report is None:
             return None
         with self.clock.stage("measure"), self.workspace.renderer.load_quantized(quantized) as scene:
-            return report.compare(scene, with_ssim=True, progress=self.progress)
+            return self._compare(scene, report)
+
+    def _compare(self, scene: DeviceScene, report: Judge) -> Quality:
+        quality = report.compare(scene, with_ssim=True, progress=self.progress)
+        if self.reporter is not None:
+            self.reporter.look(report, scene, quality, self.clock, self.progress)
+        return quality
 
     def _result(
         self,

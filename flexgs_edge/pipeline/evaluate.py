@@ -21,6 +21,7 @@ from flexgs_edge.pipeline.inputs import (
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import ViewOptions
 from flexgs_edge.pipeline.records import scene_info, views_info
+from flexgs_edge.pipeline.report import Reporter
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.result import EvaluateResult
@@ -32,6 +33,8 @@ def evaluate(
     options: ViewOptions | None = None,
     base_psnr: float = DEFAULT_BASE_PSNR,
     progress: Progress = SILENT,
+    report: str | Path | None = None,
+    force: bool = False,
     **words: Any,
 ) -> EvaluateResult:
     """Measure what a scene lost against another one.
@@ -46,12 +49,17 @@ def evaluate(
         What the command line would say; `holdout=0` evaluates every view, otherwise the held-out views.
     base_psnr : float
         PSNR of the original that the modelled drop starts from, dB.
+    report : path, optional
+        Folder for a page about the run (index.html) and its record (result.json).
+    force : bool
+        Overwrite the files of an earlier report.
     **words
         Single options by the names of `ViewOptions`.
     """
     options = replace(options or ViewOptions(), **words)
     if not 0.0 < base_psnr < 200.0:
         raise InputError(f"--base-psnr {base_psnr:g}: expected decibels between 0 and 200")
+    reporter = Reporter.maybe(report, force)
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(options.memory_limit)
     with clock.stage("open"):
@@ -64,8 +72,12 @@ def evaluate(
         if views is None:
             raise InputError(WITHOUT_VIEWS)
         indices = views.held_out or views.train
+        if reporter is not None:
+            reporter.see_cameras(views, reference)
     with ExitStack() as stack:
         workspace = stack.enter_context(Workspace(options, budget, clock))
+        if reporter is not None:
+            reporter.reserve(budget, views, indices)
         renderer = workspace.renderer
         judge = Judge(renderer, reference.source, views, indices, budget, True, base_psnr)
         stack.callback(judge.close)
@@ -73,7 +85,9 @@ def evaluate(
             judge.prepare(original, progress)
         with clock.stage("measure"), renderer.load(scene.source) as compressed:
             quality = judge.compare(compressed, with_ssim=True, progress=progress)
-        return EvaluateResult(
+            if reporter is not None:
+                reporter.look(judge, compressed, quality, clock, progress)
+        result = EvaluateResult(
             scene=scene_info(scene),
             reference=scene_info(reference),
             views=views_info(views),
@@ -81,3 +95,7 @@ def evaluate(
             quality_views="held-out" if views.held_out else "training",
             run=workspace.run_info(),
         )
+    if reporter is not None:
+        reporter.read_contents(input)
+        reporter.write(result)
+    return result

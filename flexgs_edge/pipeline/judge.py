@@ -59,7 +59,7 @@ class Judge:
         self.cameras = views.of(indices)
         self.photos = views.photos if with_photos else None
         self.base_psnr = base_psnr
-        self._indices = list(indices)
+        self.indices = list(indices)
         self._budget = budget
         self._kept: dict[tuple[str, int], np.ndarray] = {}
         self._original_error: list[float] = []
@@ -81,7 +81,7 @@ class Judge:
             image = _planes(self.renderer.render(scene, camera))
             self._keep(("original", i), image)
             if self.photos is not None:
-                photo = _planes(self.photos.load(self._indices[i]))
+                photo = _planes(self.photos.load(self.indices[i]))
                 self._original_error.append(mse(image, photo))
                 self._keep(("photo", i), photo)
 
@@ -116,6 +116,11 @@ class Judge:
             found.append(compare_view(camera.name, image, self._original(i), self._photo(i), error, with_ssim))
         return Quality(tuple(found), self.base_psnr)
 
+    def images(self, scene: DeviceScene, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Render of `scene`, render of the original and photo of the view `indices[i]`: [H, W, 3] f32 in [0, 1]."""
+        image = _planes(self.renderer.render(scene, self.cameras[i]))
+        return image, _planes(self._original(i)), self._photo(i)
+
     def _keep(self, key: tuple[str, int], image: np.ndarray) -> None:
         if image.nbytes <= self._left:
             self._left -= image.nbytes
@@ -132,7 +137,7 @@ class Judge:
             return None
         if ("photo", i) in self._kept:
             return self._kept["photo", i]
-        return self.photos.load(self._indices[i])
+        return self.photos.load(self.indices[i])
 
 
 def measurement_of(quality: Quality) -> Measurement:

@@ -120,6 +120,8 @@ class CompressOptions(ViewOptions):
         Refit colours after pruning and quantizing (`best`).
     layers : int
         Layers that `trim` can cut the file at, 1 to 4 (`best`).
+    report : str, optional
+        Folder for a page about the run (index.html) and its record (result.json).
     dry_run : bool
         Do everything but write.
     force : bool
@@ -144,6 +146,7 @@ class CompressOptions(ViewOptions):
     unseen: str = "keep"
     refit: bool = True
     layers: int = 1
+    report: str | None = None
     dry_run: bool = False
     force: bool = False
 

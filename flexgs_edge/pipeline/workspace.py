@@ -18,20 +18,24 @@ BUILD_BYTES = 24 * 2**20
 
 
 class Stopwatch:
-    """Wall seconds by stage, in the order of first entry."""
+    """Wall seconds by stage, in the order of first entry; a stage inside another is counted once, as the inner one."""
 
     def __init__(self) -> None:
         self.stages: dict[str, float] = {}
+        self._inner = 0.0
         self._started = time.perf_counter()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Add the block's wall time to `name`."""
-        started = time.perf_counter()
+        started, outside, self._inner = time.perf_counter(), self._inner, 0.0
+        self.stages.setdefault(name, 0.0)
         try:
             yield
         finally:
-            self.stages[name] = self.stages.get(name, 0.0) + time.perf_counter() - started
+            took = time.perf_counter() - started
+            self.stages[name] += took - self._inner
+            self._inner = outside + took
 
     @property
     def total(self) -> float:

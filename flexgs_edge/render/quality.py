@@ -237,13 +237,16 @@ class Quality:
         return self._mean("original_ssim")
 
     @property
+    def by_loss(self) -> list[int]:
+        """Indices of the views, the worst first: by drop where all have photos, else by their error."""
+        drops = [view.drop for view in self.views]
+        losses = [view.error if None in drops else drop or 0.0 for view, drop in zip(self.views, drops)]
+        return sorted(range(len(losses)), key=lambda index: -losses[index])
+
+    @property
     def worst(self) -> ViewQuality | None:
         """The view with the largest drop (with photos) or the lowest fidelity (without); `None` without views."""
-        if not self.views:
-            return None
-        if all(view.drop is not None for view in self.views):
-            return max(self.views, key=lambda view: view.drop or 0.0)
-        return max(self.views, key=lambda view: view.error)
+        return self.views[self.by_loss[0]] if self.views else None
 
 
 def compare_view(

@@ -7,6 +7,7 @@ ends in `_ms`, milliseconds), quality dB. null stands for "identical" (PSNRs and
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -312,6 +313,11 @@ class DecompressResult:
             "notes": list(self.notes),
             "run": self.run.to_json(),
         }
+
+
+def json_text(record: dict[str, Any]) -> str:
+    """A record as `--json` and reports write it."""
+    return json.dumps(record, indent=2, allow_nan=False) + "\n"
 
 
 def step_json(step: Step) -> dict[str, Any]:

@@ -59,6 +59,12 @@ def _decision_lines(result: CompressResult) -> list[str]:
     steps = result.search.steps if result.search else ()
     verdict = "reached" if result.reached else "NOT reached: this is the closest point (--best-effort)"
     lines = [_line("target", f"{result.target}: {verdict}, after {len(steps)} steps")]
+    lines.append(_line("decided by", decided_words(result)))
+    return lines
+
+
+def decided_words(result: CompressResult) -> str:
+    """Which figure decided, and on which views."""
     by = {
         "drop": "the drop against the photos",
         "modelled drop": "the modelled drop (no photos decide: error against the original's renders)",
@@ -70,8 +76,7 @@ def _decision_lines(result: CompressResult) -> list[str]:
         "training": "on the training poses",
         "none": "without views",
     }[result.decision_views]
-    lines.append(_line("decided by", f"{by}, {where}"))
-    return lines
+    return f"{by}, {where}"
 
 
 def evaluate_text(result: EvaluateResult) -> str:
