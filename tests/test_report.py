@@ -186,7 +186,15 @@ def test_fixed_rates_have_no_search_and_no_views_no_pictures(project: Path, tmp_
     assert "fixed rates, nothing was searched" in page.text and len(page.pictures("photo")) == 3
     assert page.named("svg", "chart") == []
     scores = str(tmp_path / "scores.npy")
-    compress(tmp_path / "lone.ply", tmp_path / "b.fgs", report=str(tmp_path / "blind"), score=scores, **rates, **FAST)
+    compress(
+        tmp_path / "lone.ply",
+        tmp_path / "b.fgs",
+        report=str(tmp_path / "blind"),
+        score=scores,
+        cameras="none",
+        **rates,
+        **FAST,
+    )
     page = read_page(tmp_path / "blind")
     assert "not measured: no cameras" in page.text and page.named("img") == [] and page.named("svg") == []
     assert "headers and checksums" in page.text
