@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from flexgs_edge.codec import octree
+from flexgs_edge.codec.features import Sums, Term
 from flexgs_edge.codec.groups import Group, GroupKind, fit_group
-from flexgs_edge.codec.rans import TOTAL, Decoder, Encoder, StreamError, Tables, lane_count
+from flexgs_edge.codec.rans import PRECISION, TOTAL, Decoder, Encoder, StreamError, Tables, lane_count
 from flexgs_edge.codec.tables import decode_tables, encode_tables, from_levels, merge_contexts, to_levels
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds, sh_kinds, walk_chunk
 from flexgs_edge.errors import InputError
@@ -74,6 +76,11 @@ class Model:
     levels: list[np.ndarray]
     tables: list[Tables]
 
+    @cached_property
+    def slots(self) -> list[np.ndarray]:
+        """First slot of the table of every context, as `Decoder.get_at` takes it."""
+        return [mapping.astype(np.intp) << PRECISION for mapping in self.mappings]
+
     def to_bytes(self) -> bytes:
         """The model section of a file."""
         records = b"".join(group.to_bytes() for group in self.groups)
@@ -105,20 +112,24 @@ def _tables(levels: np.ndarray) -> Tables:
     return from_levels(levels)
 
 
-def split(codes: np.ndarray, group: Group, base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Symbols [m], which of them are escapes [m], and offsets [m] from the alphabet's lowest code."""
-    offset = codes.astype(np.int64) - base - group.low
-    symbols = offset >> group.shift
-    escaped = (symbols < 0) | (symbols >= group.symbols - 1)
-    return np.where(escaped, group.symbols - 1, symbols).astype(np.uint8), escaped, offset
+def split(codes: np.ndarray, group: Group, base: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Symbols [m] u8, offsets [m] from the alphabet's lowest code in f64, and where symbols are escapes."""
+    offset = codes - np.float64(base) if isinstance(base, float) else codes - base
+    symbols = np.floor(offset * 2.0**-group.shift) if group.shift else offset
+    last = group.symbols - 1
+    if len(codes) and symbols.min() >= 0 and symbols.max() < last:
+        return symbols.astype(np.uint8), offset, np.zeros(0, np.intp)
+    escaped = (symbols < 0) | (symbols >= last)
+    return np.where(escaped, last, symbols).astype(np.uint8), offset, np.flatnonzero(escaped)
 
 
 class _FitPort:
     """Collects samples."""
 
-    def __init__(self, groups: int, stride: int) -> None:
+    def __init__(self, groups: list[GroupKind], stride: int) -> None:
+        self.kinds = groups
         self.stride = stride
-        self.samples: list[list[tuple[list[np.ndarray], np.ndarray]]] = [[] for _ in range(groups)]
+        self.samples: list[list[tuple[list[np.ndarray], np.ndarray]]] = [[] for _ in groups]
 
     def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
         assert symbols is not None
@@ -128,16 +139,27 @@ class _FitPort:
         assert codes is not None
         return codes
 
-    def channel(self, group: int, features: list[np.ndarray], codes: np.ndarray | None) -> np.ndarray:
+    def known(self, group: int, count: int, terms: list[Term], before: list[Term] | None = None) -> list[Term]:
+        return terms if before is None else before + terms
+
+    def channel(
+        self, group: int, known: list[Term], rows: slice, own: tuple[np.ndarray, ...], codes: np.ndarray | None
+    ) -> np.ndarray:
         assert codes is not None
-        # The same share of every pass: the weights are to fit the last ones, which have most rows.
-        part = slice(None, None, self.stride)
-        self.samples[group].append(([feature[part].copy() for feature in features], codes[part].copy()))
+        features = np.zeros((self.kinds[group].features, len(codes)), np.float32)
+        for place, feature in enumerate(own):
+            features[place] = feature
+        for term in known:
+            features[list(term.places)] = term.values[:, rows]
+        # Of every pass the same share: the weights are to fit the last ones, which have most rows.
+        self.samples[group].append((list(features), codes.copy()))
         return codes
 
 
 class _CountPort:
     """Counts symbols by context, and keeps the batches."""
+
+    stride = 1
 
     def __init__(self, groups: list[Group]) -> None:
         self.groups = groups
@@ -147,9 +169,13 @@ class _CountPort:
 
     def _add(self, alphabet: int, contexts: np.ndarray, symbols: np.ndarray, raw: list[_Raw]) -> None:
         counts = self.counts[alphabet]
-        place = contexts.astype(np.int64) * counts.shape[1] + symbols
+        place = contexts.astype(np.intp)
+        place *= counts.shape[1]
+        place += symbols
         counts += np.bincount(place, minlength=counts.size).reshape(counts.shape)
-        self.batches.append((alphabet, contexts.astype(np.uint8), symbols.astype(np.uint8), raw))
+        self.batches.append(
+            (alphabet, contexts.astype(np.uint8, copy=False), symbols.astype(np.uint8, copy=False), raw)
+        )
 
     def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
         assert symbols is not None
@@ -163,20 +189,26 @@ class _CountPort:
         self._add(1, np.zeros(cells, np.uint8), symbols, raw)
         return codes
 
-    def channel(self, group: int, features: list[np.ndarray], codes: np.ndarray | None) -> np.ndarray:
+    def known(self, group: int, count: int, terms: list[Term], before: Sums | None = None) -> Sums:
+        return self.groups[group].known(terms, count, before)
+
+    def channel(
+        self, group: int, known: Sums, rows: slice, own: tuple[np.ndarray, ...], codes: np.ndarray | None
+    ) -> np.ndarray:
         assert codes is not None
         fitted = self.groups[group]
-        base, contexts = fitted.predict(features)
-        symbols, escaped, offset = split(codes, fitted, base)
-        raw = _raw(offset[~escaped], fitted.shift) + _raw(offset[escaped], 32)
+        base, contexts = fitted.predict(known, rows, own)
+        symbols, offset, escaped = split(codes, fitted, base)
+        raw = _raw(np.delete(offset, escaped), fitted.shift) + _raw(offset[escaped], 32)
         self._add(group + 2, contexts, symbols, raw)
         return codes
 
 
 def _raw(values: np.ndarray, bits: int) -> list[_Raw]:
     """The low `bits` of integers [m], at most 8 a batch, lowest first."""
-    if len(values) == 0:
+    if len(values) == 0 or bits == 0:
         return []
+    values = values.astype(np.int64)
     return [
         (min(bits - at, 8), (values >> at & (1 << min(bits - at, 8)) - 1).astype(np.uint8)) for at in range(0, bits, 8)
     ]
@@ -185,15 +217,17 @@ def _raw(values: np.ndarray, bits: int) -> list[_Raw]:
 class _DecodePort:
     """Decodes batches, counting what each alphabet costs if asked."""
 
+    stride = 1
+
     def __init__(self, model: Model, stream: Decoder, cost: np.ndarray | None = None) -> None:
         self.model = model
         self.stream = stream
         self.cost = cost
 
     def _get(self, alphabet: int, contexts: np.ndarray) -> np.ndarray:
-        rows = self.model.mappings[alphabet][contexts]
-        symbols = self.stream.get(self.model.tables[alphabet], rows)
+        symbols = self.stream.get_at(self.model.tables[alphabet], self.model.slots[alphabet].take(contexts))
         if self.cost is not None:
+            rows = self.model.mappings[alphabet][contexts]
             self.cost[alphabet] += self.model.tables[alphabet].bits(rows, symbols)
         return symbols
 
@@ -222,19 +256,27 @@ class _DecodePort:
             raise StreamError(f"repeats: wanted {rows - cells} in all, got {int(symbols.sum())}")
         return symbols
 
-    def channel(self, group: int, features: list[np.ndarray], codes: np.ndarray | None) -> np.ndarray:
+    def known(self, group: int, count: int, terms: list[Term], before: Sums | None = None) -> Sums:
+        return self.model.groups[group].known(terms, count, before)
+
+    def channel(
+        self, group: int, known: Sums, rows: slice, own: tuple[np.ndarray, ...], codes: np.ndarray | None
+    ) -> np.ndarray:
         fitted = self.model.groups[group]
-        base, contexts = fitted.predict(features)
+        base, contexts = fitted.predict(known, rows, own)
         symbols = self._get(group + 2, contexts)
-        offset = symbols.astype(np.int64) << fitted.shift
-        escaped = symbols == fitted.symbols - 1
-        count = int(np.count_nonzero(escaped))
+        offset = symbols.astype(np.float64)
         if fitted.shift:
-            offset[~escaped] |= self._raw(group + 2, len(symbols) - count, fitted.shift)
+            offset *= float(1 << fitted.shift)
+        escaped = np.flatnonzero(symbols == fitted.symbols - 1)
+        count = len(escaped)
+        if fitted.shift:
+            plain = np.delete(np.arange(len(symbols)), escaped)
+            offset[plain] += self._raw(group + 2, len(plain), fitted.shift)
         if count:
             offset[escaped] = self._raw(group + 2, count, 32).astype(np.uint32).astype(np.int32)
-        offset += base + fitted.low
-        if offset.max(initial=0) > CODE_LIMIT or offset.min(initial=0) < -CODE_LIMIT:
+        offset += base
+        if len(offset) and not -CODE_LIMIT <= offset.min() <= offset.max() <= CODE_LIMIT:
             raise StreamError(f"{fitted.kind.name}: wanted codes within {CODE_LIMIT}")
         return offset
 
@@ -292,7 +334,7 @@ def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS) -> Encoded:
     layers = np.bincount(grid.layer, minlength=1).tolist()
     chunks = plan_chunks(layers, chunk_rows)
     kinds = group_kinds(grid.sh_degree)
-    fit = _FitPort(len(kinds), max(min(grid.count, chunk_rows) // SAMPLE_ROWS, 1))
+    fit = _FitPort(kinds, max(min(grid.count, chunk_rows) // SAMPLE_ROWS, 1))
     for i in sorted({len(chunks) * k // SAMPLE_CHUNKS for k in range(SAMPLE_CHUNKS)} if chunks else ()):
         _walk(grid, cells, chunks[i], depth, fit)
     groups = [fit_group(kind, samples) for kind, samples in zip(kinds, fit.samples, strict=True)]
