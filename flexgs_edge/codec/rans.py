@@ -18,7 +18,7 @@ FLOOR = 1 << 16
 LANES_MOST = 512
 
 _LOW, _SHIFT, _WORD = np.uint32(TOTAL - 1), np.uint32(PRECISION), np.uint32(16)
-_FLOOR, _ONE = np.uint32(FLOOR), np.uint32(1)
+_FLOOR = np.uint32(FLOOR)
 
 
 def lane_count(rows: int) -> int:
@@ -66,11 +66,10 @@ class Tables:
 
     @property
     def moves(self) -> np.ndarray:
-        """[t * 2^14] u32: frequency - 1, and place in its symbol, of every slot: one look-up a step of the decoder."""
+        """[t * 2^14] u32: frequency, and place in its symbol, of every slot: one look-up a step of the decoder."""
         if self._moves is None:
             freqs = self.freqs.reshape(-1)
-            # Below 0 it wraps round, and comes back with the slot's number.
-            moves = np.repeat((freqs << _SHIFT) - np.uint32(TOTAL) - (self.entries & _LOW), freqs)
+            moves = np.repeat((freqs << _SHIFT) - (self.entries & _LOW), freqs)
             moves.reshape(-1, TOTAL)[:] += np.arange(TOTAL, dtype=np.uint32)
             self._moves = moves
         return self._moves
@@ -181,7 +180,6 @@ class Decoder:
             np.right_shift(state, _SHIFT, state)
             np.bitwise_and(move, _LOW, low)
             np.right_shift(move, _SHIFT, move)
-            np.add(move, _ONE, move)
             np.multiply(state, move, state)
             np.add(state, low, state)
             np.less(state, _FLOOR, empty)
