@@ -258,16 +258,25 @@ def from_grid(
 
 def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:
     """[3 * K, n] f32, zero above each row's degree."""
-    index = np.arange(grid.count)[rows]
-    degrees = grid.sh_degrees[index]
-    planes = np.zeros((3, sh_rest_count(grid.sh_degree), len(index)), np.float32)
+    if isinstance(rows, slice):
+        start, stop, step = rows.indices(grid.count)
+        rows = rows if step == 1 else np.arange(start, stop, step)
+    degrees = grid.sh_degrees[rows]
+    planes = np.zeros((3, sh_rest_count(grid.sh_degree), len(degrees)), np.float32)
     for degree in range(1, grid.sh_degree + 1):
-        chosen = grid.sh[degree - 1][:, _places(grid.sh_degrees, index, degree)]
-        chosen = chosen.reshape(3, 2 * degree + 1, chosen.shape[1])
-        planes[:, degree * degree - 1 : (degree + 1) ** 2 - 1, degrees >= degree] = _rgb(
-            chosen, grid.steps.colour(grid.steps.sh[degree - 1])
-        )
-    return planes.reshape(planes.shape[0] * planes.shape[1], len(index))
+        has = np.flatnonzero(degrees >= degree)
+        if isinstance(rows, slice):
+            first = int(np.count_nonzero(grid.sh_degrees[:start] >= degree))
+            chosen = grid.sh[degree - 1][:, first : first + len(has)]
+        else:
+            chosen = grid.sh[degree - 1][:, _places(grid.sh_degrees, np.arange(grid.count)[rows], degree)]
+        values = _rgb(chosen.reshape(3, 2 * degree + 1, len(has)), grid.steps.colour(grid.steps.sh[degree - 1]))
+        band = planes[:, degree * degree - 1 : (degree + 1) ** 2 - 1]
+        for colour, coefficients in zip(band, values, strict=True):
+            # Plane by plane: one list of places for all of them at once takes five times as long.
+            for plane, value in zip(colour, coefficients, strict=True):
+                plane[has] = value
+    return planes.reshape(planes.shape[0] * planes.shape[1], len(degrees))
 
 
 def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray) -> GridScene:

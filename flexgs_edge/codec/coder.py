@@ -27,6 +27,9 @@ REPEATS_MOST = 16
 UNIFORM = [Tables(np.full((1, 1 << bits), TOTAL >> bits)) for bits in range(9)]
 """Numbers of so many bits that are all equally likely."""
 
+_SHARED = 2
+"""Alphabets before those of the groups: of the octree, and of the repeats."""
+
 _Raw = tuple[int, np.ndarray]
 _Batch = tuple[int, np.ndarray, np.ndarray, list[_Raw]]
 """Alphabet, contexts, symbols, and raw batches behind them."""
@@ -81,10 +84,12 @@ class Model:
         """First slot of the table of every context, as `Decoder.get_at` takes it."""
         return [mapping.astype(np.intp) << PRECISION for mapping in self.mappings]
 
-    def to_bytes(self) -> bytes:
-        """The model section of a file."""
-        records = b"".join(group.to_bytes() for group in self.groups)
-        return records + encode_tables(self.mappings, self.levels)
+    def to_bytes(self, with_sh: bool = True) -> bytes:
+        """The model section of a file; without SH only to compare sizes."""
+        chosen = [i for i, group in enumerate(self.groups) if with_sh or not group.kind.sh]
+        records = b"".join(self.groups[i].to_bytes() for i in chosen)
+        alphabets = [0, 1, *(i + _SHARED for i in chosen)]
+        return records + encode_tables([self.mappings[i] for i in alphabets], [self.levels[i] for i in alphabets])
 
     @classmethod
     def from_bytes(cls, data: bytes, sh_degree: int, depth: int) -> Model:
@@ -165,6 +170,7 @@ class _CountPort:
         self.groups = groups
         shapes = [(octree.CONTEXTS, 256), (1, REPEATS_MOST), *((g.contexts, g.symbols) for g in groups)]
         self.counts = [np.zeros(shape, np.int64) for shape in shapes]
+        self.raw = np.zeros(len(shapes))
         self.batches: list[_Batch] = []
 
     def _add(self, alphabet: int, contexts: np.ndarray, symbols: np.ndarray, raw: list[_Raw]) -> None:
@@ -173,6 +179,7 @@ class _CountPort:
         place *= counts.shape[1]
         place += symbols
         counts += np.bincount(place, minlength=counts.size).reshape(counts.shape)
+        self.raw[alphabet] += sum(bits * len(values) for bits, values in raw)
         self.batches.append(
             (alphabet, contexts.astype(np.uint8, copy=False), symbols.astype(np.uint8, copy=False), raw)
         )
@@ -199,8 +206,10 @@ class _CountPort:
         fitted = self.groups[group]
         base, contexts = fitted.predict(known, rows, own)
         symbols, offset, escaped = split(codes, fitted, base)
-        raw = _raw(np.delete(offset, escaped), fitted.shift) + _raw(offset[escaped], 32)
-        self._add(group + 2, contexts, symbols, raw)
+        raw = _raw(offset[escaped], 32)
+        if fitted.shift:
+            raw = _raw(np.delete(offset, escaped), fitted.shift) + raw
+        self._add(group + _SHARED, contexts, symbols, raw)
         return codes
 
 
@@ -264,7 +273,7 @@ class _DecodePort:
     ) -> np.ndarray:
         fitted = self.model.groups[group]
         base, contexts = fitted.predict(known, rows, own)
-        symbols = self._get(group + 2, contexts)
+        symbols = self._get(group + _SHARED, contexts)
         offset = symbols.astype(np.float64)
         if fitted.shift:
             offset *= float(1 << fitted.shift)
@@ -272,9 +281,9 @@ class _DecodePort:
         count = len(escaped)
         if fitted.shift:
             plain = np.delete(np.arange(len(symbols)), escaped)
-            offset[plain] += self._raw(group + 2, len(plain), fitted.shift)
+            offset[plain] += self._raw(group + _SHARED, len(plain), fitted.shift)
         if count:
-            offset[escaped] = self._raw(group + 2, count, 32).astype(np.uint32).astype(np.int32)
+            offset[escaped] = self._raw(group + _SHARED, count, 32).astype(np.uint32).astype(np.int32)
         offset += base
         if len(offset) and not -CODE_LIMIT <= offset.min() <= offset.max() <= CODE_LIMIT:
             raise StreamError(f"{fitted.kind.name}: wanted codes within {CODE_LIMIT}")
@@ -311,13 +320,22 @@ def chunk_codes(grid: GridScene, cells: np.ndarray, chunk: Chunk) -> ChunkCodes:
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """A grid scene in memory as it will lie in a file."""
+    """A grid scene in memory as it will lie in a file; `bits` is the information in the symbols of each alphabet."""
 
     model: Model
     low: np.ndarray
     layers: list[int]
     chunks: list[Chunk]
     batches: list[list[_Batch]]
+    bits: np.ndarray
+
+    @property
+    def sh_bytes(self) -> float:
+        """What the SH cost: the information in their symbols (the rows' degrees among them), and their part of the model."""
+        if self.model.sh_degree == 0:
+            return 0.0
+        bits = sum(float(self.bits[i + _SHARED]) for i, group in enumerate(self.model.groups) if group.kind.sh)
+        return bits / 8 + len(self.model.to_bytes()) - len(self.model.to_bytes(with_sh=False))
 
     def streams(self) -> Iterator[bytes]:
         """The bytes of every chunk, made one by one."""
@@ -351,7 +369,9 @@ def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS) -> Encoded:
         for (_, counts), all_ in zip(merged, count.counts, strict=True)
     ]
     model = Model(grid.sh_degree, depth, groups, [mapping for mapping, _ in merged], levels, list(map(_tables, levels)))
-    return Encoded(model, low, layers, chunks, batches)
+    # Zero frequencies belong to zero counts.
+    costs = (float((n * (PRECISION - np.log2(np.maximum(t.freqs, 1)))).sum()) for (_, n), t in zip(merged, model.tables))
+    return Encoded(model, low, layers, chunks, batches, count.raw + np.array(list(costs)))
 
 
 def _walk(grid: GridScene, cells: np.ndarray, chunk: Chunk, depth: int, port: _FitPort | _CountPort) -> None:

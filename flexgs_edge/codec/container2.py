@@ -88,10 +88,20 @@ def write_grid(
 
 def coded_size(grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS) -> int:
     """Exact bytes of the file that `write_grid` makes of these arguments."""
+    return coded_parts(grid, settings, chunk_rows)[0]
+
+
+def coded_parts(grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS) -> tuple[int, float]:
+    """Exact bytes of the file that `write_grid` makes of these arguments, and how many of them the SH take.
+
+    The SH take the information in their symbols and in the degrees of the rows, and their groups' part of the model:
+    what coding the scene again without them would save, but for the header's and the lanes' bytes.
+    """
     encoded = encode_grid(grid, chunk_rows)
     model_bytes = len(encoded.model.to_bytes())
     header = _header(grid, encoded, model_bytes, settings, chunk_rows)
-    return header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes
+    size = header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes
+    return size, encoded.sh_bytes
 
 
 def trim_container(
@@ -360,6 +370,7 @@ def _checked(data: bytes) -> bytes:
 __all__ = [
     "GridContainer",
     "channel_bytes",
+    "coded_parts",
     "coded_size",
     "trim_container",
     "verify_grid",

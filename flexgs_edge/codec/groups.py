@@ -41,11 +41,14 @@ class GroupKind:
         Numbers that its prediction takes.
     residual : bool
         Whether symbols are differences from the prediction, or values.
+    sh : bool
+        Whether a scene without SH has none of it.
     """
 
     name: str
     features: int
     residual: bool
+    sh: bool
 
 
 @dataclass(frozen=True, eq=False)

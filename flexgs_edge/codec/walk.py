@@ -52,13 +52,16 @@ _RESIDUAL = ("scale", "opacity", "dc")
 
 def base_kinds() -> list[GroupKind]:
     """Groups of the base channels."""
-    return [GroupKind(name, _OWN + 3 * len(earlier), name.startswith(_RESIDUAL)) for name, earlier in _EARLIER.items()]
+    return [
+        GroupKind(name, _OWN + 3 * len(earlier), name.startswith(_RESIDUAL), name == "sh degree")
+        for name, earlier in _EARLIER.items()
+    ]
 
 
 def sh_kinds(sh_degree: int) -> list[GroupKind]:
     """Groups of SH: one for each degree and colour plane."""
     return [
-        GroupKind(f"sh {degree} {colour}", _OWN + 6 + 3 * plane, False)
+        GroupKind(f"sh {degree} {colour}", _OWN + 6 + 3 * plane, False, True)
         for degree in range(1, sh_degree + 1)
         for plane, colour in enumerate(COLOURS)
     ]
