@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+import educational_decoder2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -23,6 +25,7 @@ from flexgs_edge.codec import (
     write_grid,
 )
 from flexgs_edge.codec.container import write_container
+from flexgs_edge.codec.container2 import coded_parts
 from flexgs_edge.codec.source import FgsSource
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.grid import from_grid
@@ -185,6 +188,29 @@ def test_settings_that_json_cannot_hold(tmp_path: Path, value: object) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("count", "degree", "layers", "chunk_rows"),
+    [(0, 0, 1, 64), (1, 0, 1, 64), (300, 0, 2, 200), (300, 1, 1, 65536), (280, 2, 3, 128), (600, 3, 2, 400)],
+)
+def test_the_written_format(tmp_path: Path, count: int, degree: int, layers: int, chunk_rows: int) -> None:
+    """A decoder written from docs/format.md alone finds the same values, escapes and raw bits among them."""
+    path = tmp_path / "a.fgs"
+    grid = make_grid(count, degree, layers=layers)
+    rng = np.random.default_rng(0)
+    grid.dc[1] = rng.integers(-(2**13), 2**13, count)
+    grid.scale[0, :1] = 2**24
+    write_grid(path, grid, {}, chunk_rows=chunk_rows)
+    check_written_format(path)
+
+
+def check_written_format(path: Path) -> None:
+    header, values = educational_decoder2.decode(path.read_bytes())
+    source = GridSource(path)
+    assert header["settings"] == source.settings
+    for name, plane in source.read(slice(0, source.count), NAMES).items():
+        np.testing.assert_array_equal(values[name], plane, name)
+
+
 def regenerator() -> ModuleType:
     spec = importlib.util.spec_from_file_location("regenerate_v2", GOLDEN / "regenerate_v2.py")
     assert spec is not None and spec.loader is not None
@@ -204,3 +230,15 @@ def test_golden_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             assert plane.tobytes() == expected[name].tobytes()
     assert source.settings == module.SETTINGS
     assert source.container.header.layers == (200, 200)
+    check_written_format(GOLDEN / "v2" / "tiny.fgs")
+
+
+def test_the_share_of_sh_is_what_leaving_them_out_saves() -> None:
+    grid = make_grid(2000, 2)
+    bare = replace(
+        grid, sh_degree=0, steps=replace(grid.steps, sh=()), sh_degrees=np.zeros_like(grid.sh_degrees), sh=()
+    )
+    size, sh = coded_parts(grid, {})
+    assert size == coded_size(grid, {})
+    assert size - sh == pytest.approx(coded_size(bare, {}), rel=0.005)
+    assert coded_parts(bare, {}) == (coded_size(bare, {}), 0)
