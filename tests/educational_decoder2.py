@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 f32 = np.float32
-BASE = "scale x, scale y, scale z, opacity, dc Y, dc Co, dc Cg, sh degree, rotation x, rotation y, rotation z".split(", ")
 SCALES = ["scale x", "scale y", "scale z"]
 LISTED: dict[str, list[str]] = {
     "scale x": [],
@@ -30,6 +29,7 @@ LISTED: dict[str, list[str]] = {
     "rotation y": SCALES,
     "rotation z": SCALES,
 }
+BASE = list(LISTED)
 Table = list[int]  # frequencies
 
 
@@ -351,7 +351,9 @@ def decode(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         at += length
         cells, base, sh = read_chunk(chunk, rows, model, header["depth"], degree)
         for row in range(rows):
-            column = [f32(low + cell) * f32(steps["position"]) for low, cell in zip(header["low"], cells[row], strict=True)]
+            column = [
+                f32(low + cell) * f32(steps["position"]) for low, cell in zip(header["low"], cells[row], strict=True)
+            ]
             codes = {name: base[name][row] for name in BASE}
             column += colour(codes["dc Y"], codes["dc Co"], codes["dc Cg"], steps["dc"], steps["chroma"])
             rest = [
@@ -366,7 +368,14 @@ def decode(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             column += [np.sqrt(max(f32(0), f32(1) - ((x * x + y * y) + z * z))), x, y, z]
             columns.append(column)
     assert at == table
-    widths = {"means": 3, "sh_dc": 3, "sh_rest": 3 * ((degree + 1) ** 2 - 1), "opacity_logits": 1, "log_scales": 3, "quats": 4}
+    widths = {
+        "means": 3,
+        "sh_dc": 3,
+        "sh_rest": 3 * ((degree + 1) ** 2 - 1),
+        "opacity_logits": 1,
+        "log_scales": 3,
+        "quats": 4,
+    }
     planes = np.array(columns, f32).reshape(len(columns), sum(widths.values())).T
     cuts = np.cumsum(list(widths.values()))[:-1]
     return header, dict(zip(widths, np.split(planes, cuts), strict=True))

@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
-import educational_decoder2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import educational_decoder2
 from flexgs_edge.codec import (
     GridSource,
     channel_bytes,
@@ -25,11 +25,12 @@ from flexgs_edge.codec import (
     write_grid,
 )
 from flexgs_edge.codec.container import write_container
-from flexgs_edge.codec.container2 import coded_parts
+from flexgs_edge.codec.container2 import GridContainer, coded_parts
 from flexgs_edge.codec.source import FgsSource
 from flexgs_edge.errors import InputError, TargetError
-from flexgs_edge.grid import from_grid
-from flexgs_edge.scene import open_scene
+from flexgs_edge.grid import Steps, from_grid
+from flexgs_edge.pipeline.decompress import decompress
+from flexgs_edge.scene import check_scene, open_scene
 from flexgs_edge.scene.fields import FIELDS
 from grid_scenes import assert_same_grid, make_grid
 from quantized_scenes import make_scene, quantize_all
@@ -110,6 +111,41 @@ def test_only_touched_chunks_are_decoded(tmp_path: Path, monkeypatch: pytest.Mon
     source.read(slice(130, 131), ["sh_rest"])
     source.read(slice(131, 132), ["means"])
     assert decoded == [("chunk 2", True), ("chunk 2", False)]
+
+
+def test_a_scene_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From file to PLY: the check of values has nothing to find in a grid."""
+    path = tmp_path / "a.fgs"
+    write_grid(path, make_grid(300, 1), {}, chunk_rows=100)
+    decoded: list[str] = []
+    plain = GridContainer.decode
+
+    def counted(self, model, chunk, entry, base_only=False):  # type: ignore[no-untyped-def]
+        decoded.append(entry.section.name)
+        return plain(self, model, chunk, entry, base_only)
+
+    monkeypatch.setattr(GridContainer, "decode", counted)
+    decompress(path, tmp_path / "a.ply")
+    assert decoded == ["chunk 0", "chunk 1", "chunk 2"]
+
+
+@pytest.mark.parametrize(("step", "valid"), [(2.0**38, True), (2.0**70, False)])
+def test_the_largest_codes_are_valid_values(tmp_path: Path, step: float, valid: bool) -> None:
+    """A grid is taken unchecked only where every code gives a value that the check would pass."""
+    path = tmp_path / "a.fgs"
+    steps = Steps(*[2.0**80] * 5, (2.0**80,) * 4, 2.0**16)
+    grid = make_grid(20, 1)
+    for plane in (grid.position, grid.scale, grid.rotation, grid.opacity, grid.dc, *grid.sh):
+        plane[:] = 2**24
+    write_grid(path, replace(grid, steps=replace(steps, rotation=step, sh=steps.sh[:1])), {})
+    source = GridSource(path)
+    assert source.valid == valid
+    source.valid = False
+    if valid:
+        assert check_scene(source) is source
+    else:
+        with pytest.raises(InputError, match="quats of norm zero"), np.errstate(over="ignore"):
+            check_scene(source)
 
 
 def test_real_chunk_boundary(tmp_path: Path) -> None:

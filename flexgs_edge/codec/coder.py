@@ -370,7 +370,9 @@ def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS) -> Encoded:
     ]
     model = Model(grid.sh_degree, depth, groups, [mapping for mapping, _ in merged], levels, list(map(_tables, levels)))
     # Zero frequencies belong to zero counts.
-    costs = (float((n * (PRECISION - np.log2(np.maximum(t.freqs, 1)))).sum()) for (_, n), t in zip(merged, model.tables))
+    costs = (
+        float((n * (PRECISION - np.log2(np.maximum(t.freqs, 1)))).sum()) for (_, n), t in zip(merged, model.tables)
+    )
     return Encoded(model, low, layers, chunks, batches, count.raw + np.array(list(costs)))
 
 

@@ -92,7 +92,7 @@ def add_terms(before: Sums, weights: np.ndarray, terms: Sequence[Term]) -> Sums:
         for start in range(0, sums.shape[1], block):
             rows = slice(start, start + block)
             values = term.values[:, rows].astype(sums.dtype, copy=False)
-            sums[:, rows] += part * values if len(part.T) == 1 else part @ values
+            np.add(sums[:, rows], part * values if len(term.places) == 1 else part @ values, out=sums[:, rows])
     return Sums(sums, bound)
 
 

@@ -16,6 +16,9 @@ from flexgs_edge.codec.walk import ChunkCodes, base_kinds
 from flexgs_edge.grid import CODE_LIMIT, GridScene, from_grid
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
+_ROTATION_STEP_MOST = 2.0**38
+"""Three squares of this times 2^24 are finite in float32."""
+
 
 class GridSource(SceneSource):
     """A `.fgs` file of version 2 as a scene.
@@ -43,6 +46,9 @@ class GridSource(SceneSource):
         self.count, self.sh_degree = header.count, header.sh_degree
         self.sh_count = self.count if self.sh_degree else 0
         self.origin = np.array(header.origin, np.float64)
+        # Codes times steps are finite; only the squares of absurdly large rotations could leave float32. Checking the
+        # values would decode the file twice more.
+        self.valid = header.grid_steps.rotation <= _ROTATION_STEP_MOST
         self.settings: dict[str, Any] = header.settings
         self._model = self.container.read_model()
         self._entries = self.container.read_table()

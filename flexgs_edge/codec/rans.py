@@ -153,7 +153,11 @@ class Decoder:
         self._states = words[: 2 * lanes].view("<u4").astype(np.uint32)
         self._words = words.astype(np.uint32)
         self._at = 2 * lanes
-        self._move, self._low, self._empty = np.empty(lanes, np.uint32), np.empty(lanes, np.uint32), np.empty(lanes, bool)
+        self._move, self._low, self._empty = (
+            np.empty(lanes, np.uint32),
+            np.empty(lanes, np.uint32),
+            np.empty(lanes, bool),
+        )
         if (self._states < FLOOR).any():
             raise StreamError("stream: wanted states of at least 65536")
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from flexgs_edge.codec.contexts import ONE, REACH, VALUE_LIMIT, Pass, Plan, limited, neighbour_features, plan_passes
+from flexgs_edge.codec.contexts import ONE, REACH, VALUE_LIMIT, Plan, limited, neighbour_features, plan_passes
 from flexgs_edge.codec.features import Features, Term
 from flexgs_edge.codec.groups import GroupKind
 from flexgs_edge.codec.octree import unmorton, walk_octree
@@ -214,12 +214,10 @@ def _walk_sh(
             plan = plan_passes(position[:, rows], REACH[1], port.stride)
         # The same for all coefficients of the degree.
         steady = Features(3 + len(sources), len(rows))
-        steady.values[:3], steady.values[3:] = below, features.values[np.ix_(sources, rows)]
+        steady.values[:3], steady.values[3:] = below, features.values[sources][:, rows]
         steady.seal()
         extra = [Term(_NEAR, plan.near), Term((5, 6, 7, 8), steady, 3)]
-        fixed = [
-            port.known(group + plane, len(rows), [*extra, Term((4,), steady, plane)]) for plane in range(3)
-        ]
+        fixed = [port.known(group + plane, len(rows), [*extra, Term((4,), steady, plane)]) for plane in range(3)]
         band = np.zeros((3, 2 * degree + 1, len(rows)), np.int32)
         # Sums of Cg, Y, Co so far; then Y, |Y|, Co, |Co| of this coefficient.
         before = Features(7, len(rows))
