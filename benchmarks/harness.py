@@ -116,13 +116,17 @@ class Bench:
         self.add(label, values, unit, note)
 
 
-def parse(doc: str | None, repeats: int, scene: str = "fox") -> argparse.Namespace:
-    """The options that all benchmarks have."""
+def parse(
+    doc: str | None, repeats: int, scene: str = "fox", more: Sequence[tuple[str, dict[str, Any]]] = ()
+) -> argparse.Namespace:
+    """The options that all benchmarks have, and `more` of one: name and arguments of `add_argument`."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", choices=SCENES, default=scene, help="default: %(default)s")
     parser.add_argument("--device", help="as for flexgs-edge; default: the device that it would take")
     parser.add_argument("--repeats", type=int, default=repeats, help="default: %(default)s")
     parser.add_argument("--first-image", action="store_true", help=argparse.SUPPRESS)
+    for name, arguments in more:
+        parser.add_argument(name, **arguments)
     options = parser.parse_args()
     if not (SCENES[options.scene] / "point_cloud.ply").is_file():
         parser.error(f"no scene at {SCENES[options.scene]}: set FLEXGS_SCENES to the folder that holds `fox`")

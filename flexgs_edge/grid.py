@@ -7,7 +7,7 @@ machine gets the same bits.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -22,6 +22,7 @@ CODE_LIMIT = 1 << 24
 """Codes lie within +-this: float32 holds all of them exactly."""
 POSITION_BITS = 21
 """Cells along an axis of a scene as a power of two: three of them fill a 63-bit curve index."""
+_BLOCK_ROWS = 16384
 
 Planes = Mapping[str, np.ndarray]
 
@@ -211,7 +212,16 @@ def to_grid(
         )
     layers = np.zeros(count, np.uint8) if layer is None else _bytes("layer", layer, count, 255)
     order = np.lexsort((morton(cells), layers)).astype(np.int64)
-    quats, log_scales = canonical_axes(planes["quats"][:, order], planes["log_scales"][:, order])
+    scale, rotation, dc = (np.empty((3, count), np.int32) for _ in range(3))
+    opacity = np.empty(count, np.int32)
+    for part in _blocks(count):
+        rows = order[part]
+        quats, log_scales = canonical_axes(planes["quats"][:, rows], planes["log_scales"][:, rows])
+        scale[:, part] = _codes("log_scales", log_scales, steps.scale, rows)
+        rotation[:, part] = _codes("quats", quats[1:], steps.rotation, rows)
+        logits = planes["opacity_logits"].reshape(1, count)[:, rows]
+        opacity[part] = _codes("opacity_logits", logits, steps.opacity, rows)[0]
+        dc[:, part] = _colour_codes("sh_dc", planes["sh_dc"][:, None, rows], steps.colour(steps.dc), rows)[:, 0]
     degrees = degrees[order]
     grid = GridScene(
         count,
@@ -219,10 +229,10 @@ def to_grid(
         np.array(origin, np.float64).reshape(3),
         replace(steps, sh=steps.sh[:top]),
         position[:, order],
-        _codes("log_scales", log_scales, steps.scale, order),
-        _codes("quats", quats[1:], steps.rotation, order),
-        _codes("opacity_logits", planes["opacity_logits"].reshape(1, count)[:, order], steps.opacity, order)[0],
-        _colour_codes("sh_dc", planes["sh_dc"][:, None, order], steps.colour(steps.dc), order)[:, 0],
+        scale,
+        rotation,
+        opacity,
+        dc,
         degrees,
         tuple(_band_codes(planes["sh_rest"], degree, order[degrees >= degree], steps) for degree in range(1, top + 1)),
         layers[order],
@@ -258,16 +268,25 @@ def from_grid(
 
 def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:
     """[3 * K, n] f32, zero above each row's degree."""
-    index = np.arange(grid.count)[rows]
-    degrees = grid.sh_degrees[index]
-    planes = np.zeros((3, sh_rest_count(grid.sh_degree), len(index)), np.float32)
+    if isinstance(rows, slice):
+        start, stop, step = rows.indices(grid.count)
+        rows = rows if step == 1 else np.arange(start, stop, step)
+    degrees = grid.sh_degrees[rows]
+    planes = np.zeros((3, sh_rest_count(grid.sh_degree), len(degrees)), np.float32)
     for degree in range(1, grid.sh_degree + 1):
-        chosen = grid.sh[degree - 1][:, _places(grid.sh_degrees, index, degree)]
-        chosen = chosen.reshape(3, 2 * degree + 1, chosen.shape[1])
-        planes[:, degree * degree - 1 : (degree + 1) ** 2 - 1, degrees >= degree] = _rgb(
-            chosen, grid.steps.colour(grid.steps.sh[degree - 1])
-        )
-    return planes.reshape(planes.shape[0] * planes.shape[1], len(index))
+        has = np.flatnonzero(degrees >= degree)
+        if isinstance(rows, slice):
+            first = int(np.count_nonzero(grid.sh_degrees[:start] >= degree))
+            chosen = grid.sh[degree - 1][:, first : first + len(has)]
+        else:
+            chosen = grid.sh[degree - 1][:, _places(grid.sh_degrees, np.arange(grid.count)[rows], degree)]
+        values = _rgb(chosen.reshape(3, 2 * degree + 1, len(has)), grid.steps.colour(grid.steps.sh[degree - 1]))
+        band = planes[:, degree * degree - 1 : (degree + 1) ** 2 - 1]
+        for colour, coefficients in zip(band, values, strict=True):
+            # Plane by plane: one list of places for all of them at once takes five times as long.
+            for plane, value in zip(colour, coefficients, strict=True):
+                plane[has] = value
+    return planes.reshape(planes.shape[0] * planes.shape[1], len(degrees))
 
 
 def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray) -> GridScene:
@@ -338,8 +357,18 @@ def _colour_codes(name: str, rgb: np.ndarray, steps: np.ndarray, order: np.ndarr
 def _band_codes(sh_rest: np.ndarray, degree: int, rows: np.ndarray, steps: Steps) -> np.ndarray:
     """[3 * (2l + 1), n] codes of the coefficients of one SH degree."""
     band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
-    rgb = sh_rest.reshape(3, len(sh_rest) // 3, sh_rest.shape[1])[:, band][:, :, rows]
-    return _colour_codes("sh_rest", rgb, steps.colour(steps.sh[degree - 1]), rows).reshape(6 * degree + 3, len(rows))
+    rgb = sh_rest.reshape(3, len(sh_rest) // 3, sh_rest.shape[1])[:, band]
+    codes = np.empty((3, 2 * degree + 1, len(rows)), np.int32)
+    for part in _blocks(len(rows)):
+        chosen = rows[part]
+        codes[:, :, part] = _colour_codes("sh_rest", rgb[:, :, chosen], steps.colour(steps.sh[degree - 1]), chosen)
+    return codes.reshape(6 * degree + 3, len(rows))
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    """Parts of rows: their numbers in float64, several copies of them, are held for a part at a time."""
+    for start in range(0, count, _BLOCK_ROWS):
+        yield slice(start, min(start + _BLOCK_ROWS, count))
 
 
 def _values(codes: np.ndarray, step: float) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import educational_decoder2
 from flexgs_edge.codec import (
     GridSource,
     channel_bytes,
@@ -23,10 +25,12 @@ from flexgs_edge.codec import (
     write_grid,
 )
 from flexgs_edge.codec.container import write_container
+from flexgs_edge.codec.container2 import GridContainer, coded_parts
 from flexgs_edge.codec.source import FgsSource
 from flexgs_edge.errors import InputError, TargetError
-from flexgs_edge.grid import from_grid
-from flexgs_edge.scene import open_scene
+from flexgs_edge.grid import Steps, from_grid
+from flexgs_edge.pipeline.decompress import decompress
+from flexgs_edge.scene import check_scene, open_scene
 from flexgs_edge.scene.fields import FIELDS
 from grid_scenes import assert_same_grid, make_grid
 from quantized_scenes import make_scene, quantize_all
@@ -109,6 +113,41 @@ def test_only_touched_chunks_are_decoded(tmp_path: Path, monkeypatch: pytest.Mon
     assert decoded == [("chunk 2", True), ("chunk 2", False)]
 
 
+def test_a_scene_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From file to PLY: the check of values has nothing to find in a grid."""
+    path = tmp_path / "a.fgs"
+    write_grid(path, make_grid(300, 1), {}, chunk_rows=100)
+    decoded: list[str] = []
+    plain = GridContainer.decode
+
+    def counted(self, model, chunk, entry, base_only=False):  # type: ignore[no-untyped-def]
+        decoded.append(entry.section.name)
+        return plain(self, model, chunk, entry, base_only)
+
+    monkeypatch.setattr(GridContainer, "decode", counted)
+    decompress(path, tmp_path / "a.ply")
+    assert decoded == ["chunk 0", "chunk 1", "chunk 2"]
+
+
+@pytest.mark.parametrize(("step", "valid"), [(2.0**38, True), (2.0**70, False)])
+def test_the_largest_codes_are_valid_values(tmp_path: Path, step: float, valid: bool) -> None:
+    """A grid is taken unchecked only where every code gives a value that the check would pass."""
+    path = tmp_path / "a.fgs"
+    steps = Steps(*[2.0**80] * 5, (2.0**80,) * 4, 2.0**16)
+    grid = make_grid(20, 1)
+    for plane in (grid.position, grid.scale, grid.rotation, grid.opacity, grid.dc, *grid.sh):
+        plane[:] = 2**24
+    write_grid(path, replace(grid, steps=replace(steps, rotation=step, sh=steps.sh[:1])), {})
+    source = GridSource(path)
+    assert source.valid == valid
+    source.valid = False
+    if valid:
+        assert check_scene(source) is source
+    else:
+        with pytest.raises(InputError, match="quats of norm zero"), np.errstate(over="ignore"):
+            check_scene(source)
+
+
 def test_real_chunk_boundary(tmp_path: Path) -> None:
     path = tmp_path / "a.fgs"
     grid = make_grid(65536 + 9, 0)
@@ -185,6 +224,29 @@ def test_settings_that_json_cannot_hold(tmp_path: Path, value: object) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("count", "degree", "layers", "chunk_rows"),
+    [(0, 0, 1, 64), (1, 0, 1, 64), (300, 0, 2, 200), (300, 1, 1, 65536), (280, 2, 3, 128), (600, 3, 2, 400)],
+)
+def test_the_written_format(tmp_path: Path, count: int, degree: int, layers: int, chunk_rows: int) -> None:
+    """A decoder written from docs/format.md alone finds the same values, escapes and raw bits among them."""
+    path = tmp_path / "a.fgs"
+    grid = make_grid(count, degree, layers=layers)
+    rng = np.random.default_rng(0)
+    grid.dc[1] = rng.integers(-(2**13), 2**13, count)
+    grid.scale[0, :1] = 2**24
+    write_grid(path, grid, {}, chunk_rows=chunk_rows)
+    check_written_format(path)
+
+
+def check_written_format(path: Path) -> None:
+    header, values = educational_decoder2.decode(path.read_bytes())
+    source = GridSource(path)
+    assert header["settings"] == source.settings
+    for name, plane in source.read(slice(0, source.count), NAMES).items():
+        np.testing.assert_array_equal(values[name], plane, name)
+
+
 def regenerator() -> ModuleType:
     spec = importlib.util.spec_from_file_location("regenerate_v2", GOLDEN / "regenerate_v2.py")
     assert spec is not None and spec.loader is not None
@@ -204,3 +266,15 @@ def test_golden_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             assert plane.tobytes() == expected[name].tobytes()
     assert source.settings == module.SETTINGS
     assert source.container.header.layers == (200, 200)
+    check_written_format(GOLDEN / "v2" / "tiny.fgs")
+
+
+def test_the_share_of_sh_is_what_leaving_them_out_saves() -> None:
+    grid = make_grid(2000, 2)
+    bare = replace(
+        grid, sh_degree=0, steps=replace(grid.steps, sh=()), sh_degrees=np.zeros_like(grid.sh_degrees), sh=()
+    )
+    size, sh = coded_parts(grid, {})
+    assert size == coded_size(grid, {})
+    assert size - sh == pytest.approx(coded_size(bare, {}), rel=0.005)
+    assert coded_parts(bare, {}) == (coded_size(bare, {}), 0)

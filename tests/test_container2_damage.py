@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 import tracemalloc
 import zlib
@@ -13,7 +12,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fgs_damage import (
+    HEADERS_THAT_ARE_NONE,
+    check_every_flipped_bit,
+    check_every_truncation,
+    check_flags,
+    edit_header,
+    flip,
+    overwrite,
+    put,
+    reseal_section,
+    write_header,
+)
 from flexgs_edge.codec import GridSource, channel_bytes, read_header, trim_container, verify, write_grid
+from flexgs_edge.codec.container2 import GridContainer
 from flexgs_edge.errors import FormatError
 from flexgs_edge.scene.fields import FIELDS
 from grid_scenes import make_grid
@@ -28,82 +40,17 @@ def small(tmp_path: Path) -> Path:
     return path
 
 
-def reseal(data: bytearray) -> bytes:
-    """Correct file size, header crc and preamble crc after a change of the header."""
-    length = struct.unpack_from("<I", data, 24)[0]
-    struct.pack_into("<QII", data, 16, len(data), length, zlib.crc32(data[36 : 36 + length]))
-    struct.pack_into("<I", data, 32, zlib.crc32(data[:32]))
-    return bytes(data)
-
-
-def write_header(path: Path, text: bytes) -> None:
-    """Another header in the place of a file's own."""
-    data = path.read_bytes()
-    length = struct.unpack_from("<I", data, 24)[0]
-    changed = bytearray(data[:36] + text + data[36 + length :])
-    struct.pack_into("<I", changed, 24, len(text))
-    path.write_bytes(reseal(changed))
-
-
-def edit_header(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    length = struct.unpack_from("<I", path.read_bytes(), 24)[0]
-    record = json.loads(path.read_bytes()[36 : 36 + length])
-    change(record)
-    write_header(path, json.dumps(record).encode())
-
-
-def reseal_section(path: Path, name: str, change: Callable[[bytearray], object]) -> None:
-    """Change a section that ends in its own checksum, and correct that."""
-    section = next(section for section in verify(path) if section.name == name)
-    data = bytearray(path.read_bytes())
-    body = data[section.offset : section.offset + section.length - 4]
-    change(body)
-    data[section.offset : section.offset + section.length] = body + struct.pack("<I", zlib.crc32(body))
-    path.write_bytes(data)
-
-
 def test_every_flipped_bit_is_found(small: Path) -> None:
-    good = small.read_bytes()
-    missed = []
-    with open(small, "r+b", buffering=0) as file:
-        for at, byte in enumerate(good):
-            for bit in range(8):
-                file.seek(at)
-                file.write(bytes([byte ^ 1 << bit]))
-                try:
-                    verify(small)
-                    missed.append((at, bit))
-                except FormatError:
-                    pass
-            file.seek(at)
-            file.write(bytes([byte]))
-    assert missed == []
-    assert small.read_bytes() == good
-    verify(small)
+    check_every_flipped_bit(small)
 
 
 def test_every_truncation_is_found(small: Path) -> None:
-    good = small.read_bytes()
-    for length in range(len(good) - 1, -1, -1):
-        with open(small, "r+b") as file:
-            file.truncate(length)
-        with pytest.raises(FormatError, match=r"small\.fgs: byte \d+: .*wanted .*got"):
-            read_header(small)
-
-
-@pytest.mark.parametrize("tail", [b"\0", b"x" * 4096])
-def test_extra_bytes_are_found(small: Path, tail: bytes) -> None:
-    small.write_bytes(small.read_bytes() + tail)
-    with pytest.raises(FormatError, match=r"byte 16: file size: wanted .* truncated or extended"):
-        GridSource(small)
+    check_every_truncation(small, GridContainer)
 
 
 @pytest.mark.parametrize("damaged", ["model", "chunk 0", "chunk 1", "chunk table"])
 def test_damage_is_named_wherever_it_is_met(small: Path, tmp_path: Path, damaged: str) -> None:
-    good = verify(small)
-    data = bytearray(small.read_bytes())
-    data[next(section.offset for section in good if section.name == damaged)] ^= 0x80
-    small.write_bytes(data)
+    flip(small, damaged)
     uses: list[Callable[[], object]] = [
         lambda: verify(small),
         lambda: GridSource(small).grid(),
@@ -119,33 +66,15 @@ def test_damage_is_named_wherever_it_is_met(small: Path, tmp_path: Path, damaged
     assert bad == ({damaged, "chunks"} if damaged == "chunk table" else {damaged})
 
 
-def test_other_flags(small: Path) -> None:
-    data = bytearray(small.read_bytes())
-    struct.pack_into("<I", data, 12, 0x80000001)  # may be ignored
-    small.write_bytes(reseal(data))
-    verify(small)
-    struct.pack_into("<H", data, 10, 4)
-    small.write_bytes(reseal(data))
-    with pytest.raises(FormatError, match="byte 10: flags that must be understood: wanted 0, got 0x4"):
-        read_header(small)
+def test_flags_formats_and_versions(small: Path) -> None:
+    check_flags(small, GridContainer)
 
 
 @pytest.mark.parametrize("length", [1 << 21, 2**32 - 1])
 def test_header_lengths(small: Path, length: int) -> None:
-    data = bytearray(small.read_bytes())
-    struct.pack_into("<I", data, 24, length)
-    small.write_bytes(reseal(data))
+    overwrite(small, 24, "<I", length)
     with pytest.raises(FormatError, match="byte 24: header length"):
         read_header(small)
-
-
-def put(*keys: str, value: object) -> Callable[[dict[str, Any]], object]:
-    def change(record: dict[str, Any]) -> None:
-        for key in keys[:-1]:
-            record = record[key]
-        record[keys[-1]] = value
-
-    return change
 
 
 def claim(count: int, chunk_rows: int = 65536) -> Callable[[dict[str, Any]], object]:
@@ -200,16 +129,7 @@ def test_hostile_headers(small: Path, change: Callable[[dict[str, Any]], object]
     assert peak < 200_000
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (b"", "wanted JSON"),
-        (b"[]", "wanted an object"),
-        (b'{"count":1,"count":1}', "wanted each key once, got 'count' twice"),
-        (b"[" * 2000, "wanted JSON"),
-        (b'{"count":\xff}', "wanted JSON in ASCII"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), HEADERS_THAT_ARE_NONE)
 def test_headers_that_are_no_json_of_ours(small: Path, text: bytes, message: str) -> None:
     write_header(small, text)
     with pytest.raises(FormatError, match=message):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import struct
 import tracemalloc
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fgs_damage import (
+    HEADERS_THAT_ARE_NONE,
+    check_every_flipped_bit,
+    check_every_truncation,
+    check_flags,
+    edit_header,
+    flip,
+    overwrite,
+    put,
+    reseal_section,
+    write_header,
+)
 from flexgs_edge.bitspec import BitSpec
 from flexgs_edge.codec.container import read_header, verify, write_container
 from flexgs_edge.codec.source import FgsSource
@@ -31,69 +41,17 @@ def small(tmp_path: Path) -> Path:
     return path
 
 
-def reseal(data: bytearray) -> bytes:
-    """Correct file size, header crc and preamble crc after a change of the header."""
-    length = struct.unpack_from("<I", data, 24)[0]
-    struct.pack_into("<QII", data, 16, len(data), length, zlib.crc32(data[36 : 36 + length]))
-    struct.pack_into("<I", data, 32, zlib.crc32(data[:32]))
-    return bytes(data)
-
-
-def edit_header(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Change the JSON record of a file and seal it again."""
-    record = json.loads(path.read_bytes()[36 : 36 + 2048])
-    change(record)
-    write_header(path, json.dumps(record).encode())
-
-
-def write_header(path: Path, text: bytes) -> None:
-    data = bytearray(path.read_bytes())
-    assert len(text) <= 2048
-    data[36 : 36 + 2048] = text.ljust(2048)
-    path.write_bytes(reseal(data))
-
-
 def test_every_flipped_bit_is_found(small: Path) -> None:
-    good = small.read_bytes()
-    missed = []
-    with open(small, "r+b", buffering=0) as file:
-        for at, byte in enumerate(good):
-            for bit in range(8):
-                file.seek(at)
-                file.write(bytes([byte ^ 1 << bit]))
-                try:
-                    verify(small)
-                    missed.append((at, bit))
-                except FormatError:
-                    pass
-            file.seek(at)
-            file.write(bytes([byte]))
-    assert missed == []
-    assert small.read_bytes() == good
-    verify(small)
+    check_every_flipped_bit(small)
 
 
 def test_every_truncation_is_found(small: Path) -> None:
-    good = small.read_bytes()
-    for length in range(len(good) - 1, -1, -1):
-        with open(small, "r+b") as file:
-            file.truncate(length)
-        with pytest.raises(FormatError, match=r"small\.fgs: byte \d+: .*wanted .*got"):
-            FgsSource(small)
-
-
-@pytest.mark.parametrize("tail", [b"\0", b"x" * 4096])
-def test_extra_bytes_are_found(small: Path, tail: bytes) -> None:
-    small.write_bytes(small.read_bytes() + tail)
-    with pytest.raises(FormatError, match="byte 16: file size: wanted .* truncated or extended"):
-        FgsSource(small)
+    check_every_truncation(small, FgsSource)
 
 
 def test_damage_is_an_error_where_it_is_read(small: Path) -> None:
     sections = {section.name: section for section in verify(small)}
-    data = bytearray(small.read_bytes())
-    data[sections["chunk 0"].offset + 3] ^= 1
-    small.write_bytes(data)
+    flip(small, "chunk 0", 3, 1)
     source = FgsSource(small)
     for _ in range(2):
         with pytest.raises(FormatError, match=f"byte {sections['chunk 0'].offset}: chunk 0: checksum: wanted"):
@@ -106,9 +64,7 @@ def test_damage_is_an_error_where_it_is_read(small: Path) -> None:
 def test_verify_lists_the_damaged_sections(small: Path, damaged: str) -> None:
     good = verify(small)
     assert sum(section.length for section in good) == small.stat().st_size
-    data = bytearray(small.read_bytes())
-    data[next(section.offset for section in good if section.name == damaged)] ^= 0x80
-    small.write_bytes(data)
+    flip(small, damaged)
     with pytest.raises(FormatError, match=damaged):
         verify(small)
     bad = {section.name for section in verify(small, raise_errors=False) if not section.ok}
@@ -116,45 +72,15 @@ def test_verify_lists_the_damaged_sections(small: Path, damaged: str) -> None:
     assert bad == ({damaged, "chunk 0"} if damaged == "chunk table" else {damaged})
 
 
-@pytest.mark.parametrize(
-    ("offset", "layout", "value", "message"),
-    [
-        (0, "<B", 0x50, "byte 0: magic"),
-        (8, "<H", 2, "byte 8: version: wanted 1, got 2"),
-        (10, "<H", 4, "byte 10: flags that must be understood: wanted 0, got 0x4"),
-    ],
-)
-def test_other_formats_and_versions(small: Path, offset: int, layout: str, value: int, message: str) -> None:
-    data = bytearray(small.read_bytes())
-    struct.pack_into(layout, data, offset, value)
-    small.write_bytes(reseal(data))
-    with pytest.raises(FormatError, match=message):
-        FgsSource(small)
-
-
-def test_flags_that_may_be_ignored(small: Path) -> None:
-    data = bytearray(small.read_bytes())
-    struct.pack_into("<I", data, 12, 0x80000001)
-    small.write_bytes(reseal(data))
-    verify(small)
+def test_flags_formats_and_versions(small: Path) -> None:
+    check_flags(small, FgsSource)
 
 
 @pytest.mark.parametrize("length", [0, 1024, 2049, 3072, 1 << 21, 2**32 - 1024, 2**32 - 1])
 def test_header_lengths(small: Path, length: int) -> None:
-    data = bytearray(small.read_bytes())
-    struct.pack_into("<I", data, 24, length)
-    small.write_bytes(reseal(data))
+    overwrite(small, 24, "<I", length)
     with pytest.raises(FormatError, match="byte 24: header length"):
         FgsSource(small)
-
-
-def put(*keys: str, value: object) -> Callable[[dict[str, Any]], object]:
-    def change(record: dict[str, Any]) -> None:
-        for key in keys[:-1]:
-            record = record[key]
-        record[keys[-1]] = value
-
-    return change
 
 
 @pytest.mark.parametrize(
@@ -200,27 +126,14 @@ def test_hostile_headers(small: Path, change: Callable[[dict[str, Any]], object]
     if message.startswith("count: wanted .* got an integer of"):
         # Longer than the header's fixed block allows; 1000 digits are as absurd.
         change = put("count", value=10**1000)
-    edit_header(small, change)
+    edit_header(small, change, 2048)
     with pytest.raises(FormatError, match=message):
         read_header(small)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (b"", "wanted JSON"),
-        (b"[]", "wanted an object"),
-        (b"{", "wanted JSON"),
-        (b'{"count":1,"count":1}', "wanted each key once, got 'count' twice"),
-        (b'{"settings":{"a":1,"a":2}}', "wanted each key once, got 'a' twice"),
-        (b"[" * 2000, "wanted JSON"),
-        (b'{"count":\xff}', "wanted JSON in ASCII"),
-        (b'{"count":1}\0', "wanted JSON"),
-        (b'{"count":-Infinity}', "wanted finite numbers"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), HEADERS_THAT_ARE_NONE)
 def test_headers_that_are_no_json_of_ours(small: Path, text: bytes, message: str) -> None:
-    write_header(small, text)
+    write_header(small, text, 2048)
     with pytest.raises(FormatError, match=message):
         read_header(small)
 
@@ -230,23 +143,13 @@ def test_absurd_claims_allocate_nothing(small: Path) -> None:
         record.update(count=2**32 - 1, sh_count=2**32 - 1, sh_degree=4)
         record["groups"] = dict.fromkeys(record["groups"], 2**32 - 1)
 
-    edit_header(small, change)
+    edit_header(small, change, 2048)
     tracemalloc.start()
     with pytest.raises(FormatError, match="make a file of"):
         FgsSource(small)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 200_000
-
-
-def reseal_section(path: Path, name: str, change: Callable[[bytearray], object]) -> None:
-    """Change a section that ends in its own checksum, and correct that."""
-    section = next(section for section in verify(path) if section.name == name)
-    data = bytearray(path.read_bytes())
-    body = data[section.offset : section.offset + section.length - 4]
-    change(body)
-    data[section.offset : section.offset + section.length] = body + struct.pack("<I", zlib.crc32(body))
-    path.write_bytes(data)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

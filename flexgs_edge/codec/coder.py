@@ -7,27 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexgs_edge.codec import octree
-from flexgs_edge.codec.groups import Group, GroupKind, fit_group
-from flexgs_edge.codec.rans import TOTAL, Decoder, Encoder, StreamError, Tables, lane_count
-from flexgs_edge.codec.tables import decode_tables, encode_tables, from_levels, merge_contexts, to_levels
-from flexgs_edge.codec.walk import ChunkCodes, base_kinds, sh_kinds, walk_chunk
+from flexgs_edge.codec.groups import fit_group
+from flexgs_edge.codec.model import SHARED, Model, group_kinds, tables_of
+from flexgs_edge.codec.ports import UNIFORM, Batch, CountPort, DecodePort, FitPort
+from flexgs_edge.codec.rans import PRECISION, Decoder, Encoder, StreamError, lane_count
+from flexgs_edge.codec.tables import merge_contexts, to_levels
+from flexgs_edge.codec.walk import ChunkCodes, base_kinds, walk_chunk
 from flexgs_edge.errors import InputError
-from flexgs_edge.grid import CODE_LIMIT, POSITION_BITS, GridScene, morton
+from flexgs_edge.grid import POSITION_BITS, GridScene, morton
 
 CHUNK_ROWS = 65536
 SAMPLE_CHUNKS = 2
 """Chunks that the predictions are fitted to; tables count all of them."""
 SAMPLE_ROWS = 16384
 """About as many rows of each of them are fitted to: all rows cost four times the time for 0.01 bits a Gaussian."""
-REPEATS_MOST = 16
-"""Symbols of the repeats; the last is the escape."""
-UNIFORM = [Tables(np.full((1, 1 << bits), TOTAL >> bits)) for bits in range(9)]
-"""Numbers of so many bits that are all equally likely."""
-
-_Raw = tuple[int, np.ndarray]
-_Batch = tuple[int, np.ndarray, np.ndarray, list[_Raw]]
-"""Alphabet, contexts, symbols, and raw batches behind them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,196 +40,6 @@ def plan_chunks(layers: list[int], chunk_rows: int = CHUNK_ROWS) -> list[Chunk]:
             chunks.append(Chunk(layer, start, min(start + chunk_rows, at + count)))
         at += count
     return chunks
-
-
-@dataclass(frozen=True, eq=False)
-class Model:
-    """Everything that chunks are decoded with.
-
-    Parameters
-    ----------
-    sh_degree, depth : int
-        Of the scene and of its octree.
-    groups : list of Group
-        Base channels, then SH.
-    mappings : list of np.ndarray
-        The table of every context: of the octree, the repeats, then of the groups.
-    levels : list of np.ndarray
-        Levels of the tables, in the same order.
-    tables : list of Tables
-        The tables.
-    """
-
-    sh_degree: int
-    depth: int
-    groups: list[Group]
-    mappings: list[np.ndarray]
-    levels: list[np.ndarray]
-    tables: list[Tables]
-
-    def to_bytes(self) -> bytes:
-        """The model section of a file."""
-        records = b"".join(group.to_bytes() for group in self.groups)
-        return records + encode_tables(self.mappings, self.levels)
-
-    @classmethod
-    def from_bytes(cls, data: bytes, sh_degree: int, depth: int) -> Model:
-        """Inverse of `to_bytes`; raises `StreamError`."""
-        groups, at = [], 0
-        for kind in group_kinds(sh_degree):
-            group, at = Group.read(kind, data, at)
-            groups.append(group)
-        shapes = [(octree.CONTEXTS, 256), (1, REPEATS_MOST), *((g.contexts, g.symbols) for g in groups)]
-        pairs = decode_tables(data[at:], shapes)
-        levels = [level for _, level in pairs]
-        return cls(sh_degree, depth, groups, [mapping for mapping, _ in pairs], levels, list(map(_tables, levels)))
-
-
-def group_kinds(sh_degree: int) -> list[GroupKind]:
-    """All groups of a scene of this degree."""
-    return base_kinds() + sh_kinds(sh_degree)
-
-
-def _tables(levels: np.ndarray) -> Tables:
-    """Tables of an alphabet; one that nothing was counted for gets its first symbol, which costs nothing."""
-    if not levels.any(axis=1).all():
-        levels = levels.copy()
-        levels[~levels.any(axis=1), 0] = 1
-    return from_levels(levels)
-
-
-def split(codes: np.ndarray, group: Group, base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Symbols [m], which of them are escapes [m], and offsets [m] from the alphabet's lowest code."""
-    offset = codes.astype(np.int64) - base - group.low
-    symbols = offset >> group.shift
-    escaped = (symbols < 0) | (symbols >= group.symbols - 1)
-    return np.where(escaped, group.symbols - 1, symbols).astype(np.uint8), escaped, offset
-
-
-class _FitPort:
-    """Collects samples."""
-
-    def __init__(self, groups: int, stride: int) -> None:
-        self.stride = stride
-        self.samples: list[list[tuple[list[np.ndarray], np.ndarray]]] = [[] for _ in range(groups)]
-
-    def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
-        assert symbols is not None
-        return symbols
-
-    def repeats(self, codes: np.ndarray | None, cells: int, rows: int) -> np.ndarray:
-        assert codes is not None
-        return codes
-
-    def channel(self, group: int, features: list[np.ndarray], codes: np.ndarray | None) -> np.ndarray:
-        assert codes is not None
-        # The same share of every pass: the weights are to fit the last ones, which have most rows.
-        part = slice(None, None, self.stride)
-        self.samples[group].append(([feature[part].copy() for feature in features], codes[part].copy()))
-        return codes
-
-
-class _CountPort:
-    """Counts symbols by context, and keeps the batches."""
-
-    def __init__(self, groups: list[Group]) -> None:
-        self.groups = groups
-        shapes = [(octree.CONTEXTS, 256), (1, REPEATS_MOST), *((g.contexts, g.symbols) for g in groups)]
-        self.counts = [np.zeros(shape, np.int64) for shape in shapes]
-        self.batches: list[_Batch] = []
-
-    def _add(self, alphabet: int, contexts: np.ndarray, symbols: np.ndarray, raw: list[_Raw]) -> None:
-        counts = self.counts[alphabet]
-        place = contexts.astype(np.int64) * counts.shape[1] + symbols
-        counts += np.bincount(place, minlength=counts.size).reshape(counts.shape)
-        self.batches.append((alphabet, contexts.astype(np.uint8), symbols.astype(np.uint8), raw))
-
-    def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
-        assert symbols is not None
-        self._add(0, contexts, symbols, [])
-        return symbols
-
-    def repeats(self, codes: np.ndarray | None, cells: int, rows: int) -> np.ndarray:
-        assert codes is not None
-        symbols = np.minimum(codes, REPEATS_MOST - 1)
-        raw = _raw(codes[symbols == REPEATS_MOST - 1], 32)
-        self._add(1, np.zeros(cells, np.uint8), symbols, raw)
-        return codes
-
-    def channel(self, group: int, features: list[np.ndarray], codes: np.ndarray | None) -> np.ndarray:
-        assert codes is not None
-        fitted = self.groups[group]
-        base, contexts = fitted.predict(features)
-        symbols, escaped, offset = split(codes, fitted, base)
-        raw = _raw(offset[~escaped], fitted.shift) + _raw(offset[escaped], 32)
-        self._add(group + 2, contexts, symbols, raw)
-        return codes
-
-
-def _raw(values: np.ndarray, bits: int) -> list[_Raw]:
-    """The low `bits` of integers [m], at most 8 a batch, lowest first."""
-    if len(values) == 0:
-        return []
-    return [
-        (min(bits - at, 8), (values >> at & (1 << min(bits - at, 8)) - 1).astype(np.uint8)) for at in range(0, bits, 8)
-    ]
-
-
-class _DecodePort:
-    """Decodes batches, counting what each alphabet costs if asked."""
-
-    def __init__(self, model: Model, stream: Decoder, cost: np.ndarray | None = None) -> None:
-        self.model = model
-        self.stream = stream
-        self.cost = cost
-
-    def _get(self, alphabet: int, contexts: np.ndarray) -> np.ndarray:
-        rows = self.model.mappings[alphabet][contexts]
-        symbols = self.stream.get(self.model.tables[alphabet], rows)
-        if self.cost is not None:
-            self.cost[alphabet] += self.model.tables[alphabet].bits(rows, symbols)
-        return symbols
-
-    def _raw(self, alphabet: int, count: int, bits: int) -> np.ndarray:
-        values = np.zeros(count, np.int64)
-        if count == 0:
-            return values
-        for at in range(0, bits, 8):
-            part = self.stream.get(UNIFORM[min(bits - at, 8)], np.zeros(count, np.uint8))
-            values |= part.astype(np.int64) << at
-        if self.cost is not None:
-            self.cost[alphabet] += bits * count
-        return values
-
-    def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
-        occupied = self._get(0, contexts)
-        if not occupied.all():
-            raise StreamError("octree: wanted nodes with children, got one without")
-        return occupied
-
-    def repeats(self, codes: np.ndarray | None, cells: int, rows: int) -> np.ndarray:
-        symbols = self._get(1, np.zeros(cells, np.uint8)).astype(np.int64)
-        escaped = symbols == REPEATS_MOST - 1
-        symbols[escaped] = self._raw(1, int(escaped.sum()), 32)
-        if int(symbols.sum()) + cells != rows:
-            raise StreamError(f"repeats: wanted {rows - cells} in all, got {int(symbols.sum())}")
-        return symbols
-
-    def channel(self, group: int, features: list[np.ndarray], codes: np.ndarray | None) -> np.ndarray:
-        fitted = self.model.groups[group]
-        base, contexts = fitted.predict(features)
-        symbols = self._get(group + 2, contexts)
-        offset = symbols.astype(np.int64) << fitted.shift
-        escaped = symbols == fitted.symbols - 1
-        count = int(np.count_nonzero(escaped))
-        if fitted.shift:
-            offset[~escaped] |= self._raw(group + 2, len(symbols) - count, fitted.shift)
-        if count:
-            offset[escaped] = self._raw(group + 2, count, 32).astype(np.uint32).astype(np.int32)
-        offset += base + fitted.low
-        if offset.max(initial=0) > CODE_LIMIT or offset.min(initial=0) < -CODE_LIMIT:
-            raise StreamError(f"{fitted.kind.name}: wanted codes within {CODE_LIMIT}")
-        return offset
 
 
 def cells_of(grid: GridScene) -> tuple[np.ndarray, np.ndarray, int]:
@@ -269,13 +72,22 @@ def chunk_codes(grid: GridScene, cells: np.ndarray, chunk: Chunk) -> ChunkCodes:
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """A grid scene in memory as it will lie in a file."""
+    """A grid scene in memory as it will lie in a file; `bits` is the information in the symbols of each alphabet."""
 
     model: Model
     low: np.ndarray
     layers: list[int]
     chunks: list[Chunk]
-    batches: list[list[_Batch]]
+    batches: list[list[Batch]]
+    bits: np.ndarray
+
+    @property
+    def sh_bytes(self) -> float:
+        """What the SH cost: the information in their symbols (the rows' degrees among them), and their part of the model."""
+        if self.model.sh_degree == 0:
+            return 0.0
+        bits = sum(float(self.bits[i + SHARED]) for i, group in enumerate(self.model.groups) if group.kind.sh)
+        return bits / 8 + len(self.model.to_bytes()) - len(self.model.to_bytes(with_sh=False))
 
     def streams(self) -> Iterator[bytes]:
         """The bytes of every chunk, made one by one."""
@@ -292,12 +104,12 @@ def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS) -> Encoded:
     layers = np.bincount(grid.layer, minlength=1).tolist()
     chunks = plan_chunks(layers, chunk_rows)
     kinds = group_kinds(grid.sh_degree)
-    fit = _FitPort(len(kinds), max(min(grid.count, chunk_rows) // SAMPLE_ROWS, 1))
+    fit = FitPort(kinds, max(min(grid.count, chunk_rows) // SAMPLE_ROWS, 1))
     for i in sorted({len(chunks) * k // SAMPLE_CHUNKS for k in range(SAMPLE_CHUNKS)} if chunks else ()):
         _walk(grid, cells, chunks[i], depth, fit)
     groups = [fit_group(kind, samples) for kind, samples in zip(kinds, fit.samples, strict=True)]
     del fit
-    count = _CountPort(groups)
+    count = CountPort(groups)
     batches = []
     for chunk in chunks:
         _walk(grid, cells, chunk, depth, count)
@@ -308,16 +120,22 @@ def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS) -> Encoded:
         to_levels(counts if len(counts) else np.zeros((1, len(all_[0])), np.int64))
         for (_, counts), all_ in zip(merged, count.counts, strict=True)
     ]
-    model = Model(grid.sh_degree, depth, groups, [mapping for mapping, _ in merged], levels, list(map(_tables, levels)))
-    return Encoded(model, low, layers, chunks, batches)
+    model = Model(
+        grid.sh_degree, depth, groups, [mapping for mapping, _ in merged], levels, list(map(tables_of, levels))
+    )
+    # Zero frequencies belong to zero counts.
+    costs = (
+        float((n * (PRECISION - np.log2(np.maximum(t.freqs, 1)))).sum()) for (_, n), t in zip(merged, model.tables)
+    )
+    return Encoded(model, low, layers, chunks, batches, count.raw + np.array(list(costs)))
 
 
-def _walk(grid: GridScene, cells: np.ndarray, chunk: Chunk, depth: int, port: _FitPort | _CountPort) -> None:
+def _walk(grid: GridScene, cells: np.ndarray, chunk: Chunk, depth: int, port: FitPort | CountPort) -> None:
     codes = chunk_codes(grid, cells, chunk)
     walk_chunk(chunk.stop - chunk.start, depth, grid.sh_degree, port, codes, False)
 
 
-def encode_chunk(model: Model, rows: int, batches: list[_Batch]) -> bytes:
+def encode_chunk(model: Model, rows: int, batches: list[Batch]) -> bytes:
     """The stream of a chunk: at least a bit a row, so that a file's size bounds the rows that it can claim."""
     encoder = Encoder(lane_count(rows))
     for alphabet, contexts, symbols, raw in batches:
@@ -351,7 +169,7 @@ def decode_chunk(
         [alphabets] f64: bits of each alphabet are added to it.
     """
     stream = Decoder(data, lane_count(rows))
-    codes = walk_chunk(rows, model.depth, model.sh_degree, _DecodePort(model, stream, cost), None, base_only)
+    codes = walk_chunk(rows, model.depth, model.sh_degree, DecodePort(model, stream, cost), None, base_only)
     if not base_only:
         used = stream.finish()
         if any(data[used:]) or (len(data) > used and len(data) != least_bytes(rows)):

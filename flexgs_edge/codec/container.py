@@ -1,20 +1,11 @@
-"""Writing, opening and verifying `.fgs` files, version 1 (docs/format.md).
-
-Every byte lies under a checksum, or is compared with the one value it may have. Nothing is allocated on the word of
-the header before the sizes that it implies add up to the size of the file.
-"""
+"""Writing, opening and verifying `.fgs` files, version 1 (docs/format.md)."""
 
 from __future__ import annotations
 
 import os
-import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
-from typing import Any, BinaryIO
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -23,29 +14,21 @@ from flexgs_edge.codec.layout import (
     HEADER_MAX,
     HEADER_MIN,
     HEADER_STEP,
-    PREAMBLE_BYTES,
     Header,
-    HeaderError,
     Section,
     container_size,
     decode_header,
     encode_header,
     format_error,
 )
-from flexgs_edge.errors import FormatError, InputError
+from flexgs_edge.codec.sections import ChunkEntry, SectionFile, Verification, checked, preamble
 from flexgs_edge.quantize import SMALLEST_STEP, QuantizedScene
 from flexgs_edge.scene.atomic import atomic_write
 from flexgs_edge.scene.fields import FIELDS
 
 __all__ = ["Container", "Section", "container_size", "read_header", "verify", "write_container"]
 
-MAGIC = b"\x93FGS\r\n\x1a\n"
-"""A byte above 127, both line ends and a text stop: transfers that alter text break it at once (the idea of PNG)."""
 VERSION = 1
-_PREAMBLE = struct.Struct("<8sHHIQII")
-_U32 = struct.Struct("<I")
-_PIECE = 1 << 20
-"""Bytes read at a time when only a checksum is wanted."""
 
 Ranges = dict[str, tuple[np.ndarray, np.ndarray]]
 """(low, step) by field, each [channels, G] f32."""
@@ -74,7 +57,6 @@ def write_container(
     """
     header = Header.of_scene(quantized, settings)
     block = encode_header(header)
-    fixed = _PREAMBLE.pack(MAGIC, VERSION, 0, 0, header.file_size, len(block), zlib.crc32(block))
     tables = b"".join(
         part.astype("<f4", copy=False).tobytes()
         for field in FIELDS
@@ -82,7 +64,7 @@ def write_container(
     )
     entries = []
     with atomic_write(path, force) as file:
-        for part in (_checked(fixed), block, _checked(tables)):
+        for part in (preamble(VERSION, header.file_size, block), block, checked(tables)):
             file.write(part)
         for chunk in range(header.chunk_count):
             checksum = 0
@@ -93,7 +75,7 @@ def write_container(
                 checksum = zlib.crc32(plane, checksum)
                 file.write(plane)
             entries.append((header.chunk_bytes(chunk), checksum))
-        file.write(_checked(np.array(entries, "<u4").tobytes()))
+        file.write(checked(np.array(entries, "<u4").tobytes()))
         if file.tell() != header.file_size:
             raise AssertionError(f"wrote {file.tell()} bytes, the size model says {header.file_size}")
     return header.file_size
@@ -104,15 +86,7 @@ def read_header(path: str | os.PathLike[str]) -> Header:
     return Container(path).header
 
 
-@dataclass(frozen=True)
-class ChunkEntry:
-    """Where a chunk lies and its checksum."""
-
-    section: Section
-    checksum: int
-
-
-class Container:
+class Container(SectionFile):
     """A `.fgs` file whose header has been checked against the file's size.
 
     Parameters
@@ -128,15 +102,23 @@ class Container:
         When the file cannot be read at all.
     """
 
+    version = VERSION
+
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
-        with self._open() as file:
-            self.header = self._read_header(file)
+        super().__init__(path)
+        with self.open() as file:
+            size = os.fstat(file.fileno()).st_size
+
+            def wrong_size(header: Header) -> str:
+                whole = header.file_size
+                return "" if whole == size else f"its counts, bits and groups make a file of {whole}"
+
+            self.header = self._read_header(file, size, _wrong_length, decode_header, wrong_size)
 
     def read_ranges(self) -> Ranges:
         """The range tables of all fields, checked."""
-        with self._open() as file:
-            table = self._read_checked(file, self.header.tables)
+        with self.open() as file:
+            table = self.read_section(file, self.header.tables)
         numbers = np.frombuffer(table, "<f4").astype(np.float32, copy=False)
         ranges: Ranges = {}
         at = 0
@@ -152,8 +134,8 @@ class Container:
     def read_chunk_table(self) -> list[ChunkEntry]:
         """Place and checksum of every chunk, checked."""
         section = self.header.chunk_table
-        with self._open() as file:
-            table = np.frombuffer(self._read_checked(file, section), "<u4").reshape(-1, 2)
+        with self.open() as file:
+            table = np.frombuffer(self.read_section(file, section), "<u4").reshape(-1, 2)
         entries = []
         for i, (chunk, (length, checksum)) in enumerate(zip(self.header.chunks(), table.tolist(), strict=True)):
             if length != chunk.length:
@@ -162,96 +144,6 @@ class Container:
                 )
             entries.append(ChunkEntry(chunk, checksum))
         return entries
-
-    def read_chunk(self, entry: ChunkEntry) -> bytes:
-        """The planes of a chunk, checked."""
-        section = entry.section
-        with self._open() as file:
-            file.seek(section.offset)
-            data = self._read(file, section.length, section.name)
-        self._compare(section, entry.checksum, zlib.crc32(data))
-        return data
-
-    def check_chunk(self, entry: ChunkEntry) -> None:
-        """Check a chunk in pieces, without keeping it."""
-        left, checksum = entry.section.length, 0
-        with self._open() as file:
-            file.seek(entry.section.offset)
-            while left:
-                piece = self._read(file, min(left, _PIECE), entry.section.name)
-                checksum = zlib.crc32(piece, checksum)
-                left -= len(piece)
-        self._compare(entry.section, entry.checksum, checksum)
-
-    @contextmanager
-    def _open(self) -> Iterator[BinaryIO]:
-        try:
-            with open(self.path, "rb") as file:
-                yield file
-        except OSError as error:
-            raise InputError(f"{self.path}: cannot read it ({error.strerror})") from error
-
-    def _read(self, file: BinaryIO, length: int, name: str) -> bytes:
-        offset = file.tell()
-        data = file.read(length)
-        if len(data) != length:
-            raise format_error(
-                self.path, offset, f"{name}: wanted {length} bytes, got {len(data)}: the file is truncated"
-            )
-        return data
-
-    def _read_header(self, file: BinaryIO) -> Header:
-        size = os.fstat(file.fileno()).st_size
-        preamble = self._read(file, PREAMBLE_BYTES, "preamble")
-        magic, version, required, _, claimed, block_bytes, block_sum = _PREAMBLE.unpack_from(preamble)
-        if magic != MAGIC:
-            raise format_error(self.path, 0, f"magic: wanted {MAGIC!r}, got {magic!r}: not a .fgs file, or damaged")
-        if version != VERSION:
-            raise format_error(
-                self.path, 8, f"version: wanted {VERSION}, got {version}: a newer program wrote it, or it is damaged"
-            )
-        self._compare(Section("preamble", 0, 0), _U32.unpack_from(preamble, 32)[0], zlib.crc32(preamble[:32]))
-        if required:
-            raise format_error(
-                self.path, 10, f"flags that must be understood: wanted 0, got {required:#x}: a newer program wrote it"
-            )
-        if claimed != size:
-            raise format_error(self.path, 16, f"file size: wanted {claimed}, got {size}: truncated or extended")
-        room = min(HEADER_MAX, size - PREAMBLE_BYTES)
-        if block_bytes % HEADER_STEP or not HEADER_MIN <= block_bytes <= room:
-            raise format_error(
-                self.path,
-                24,
-                f"header length: wanted a multiple of {HEADER_STEP} from {HEADER_MIN} to {room}, got {block_bytes}",
-            )
-        block = self._read(file, block_bytes, "header")
-        self._compare(Section("header", PREAMBLE_BYTES, 0), block_sum, zlib.crc32(block))
-        try:
-            header = decode_header(block)
-        except HeaderError as error:
-            raise format_error(self.path, PREAMBLE_BYTES, f"header: {error}") from None
-        if header.file_size != size:
-            raise format_error(
-                self.path,
-                PREAMBLE_BYTES,
-                f"header: its counts, bits and groups make a file of {header.file_size} bytes, got {size}",
-            )
-        return header
-
-    def _read_checked(self, file: BinaryIO, section: Section) -> bytes:
-        """A section's bytes without the checksum at its end."""
-        file.seek(section.offset)
-        data = self._read(file, section.length, section.name)
-        self._compare(section, _U32.unpack_from(data, section.length - 4)[0], zlib.crc32(memoryview(data)[:-4]))
-        return data[:-4]
-
-    def _compare(self, section: Section, wanted: int, got: int) -> None:
-        if wanted != got:
-            raise format_error(
-                self.path,
-                section.offset,
-                f"{section.name}: checksum: wanted {wanted:08x}, got {got:08x}: the file is damaged",
-            )
 
     def _check_ranges(self, field: str, low: np.ndarray, step: np.ndarray, offset: int) -> None:
         """Every value that can come out must be finite; steps are zero or normal numbers."""
@@ -285,29 +177,14 @@ def verify(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Sect
     """
     container = Container(path)
     header = container.header
-    sections = [Section("preamble", 0, PREAMBLE_BYTES), Section("header", PREAMBLE_BYTES, header.block)]
-
-    def check(section: Section, test: Callable[[], object]) -> bool:
-        try:
-            test()
-        except FormatError:
-            if raise_errors:
-                raise
-            sections.append(replace(section, ok=False))
-            return False
-        sections.append(section)
-        return True
-
-    check(header.tables, container.read_ranges)
+    found = Verification(header.block, raise_errors)
+    found.check(header.tables, container.read_ranges)
     # Without the table there is nothing to compare the chunks with: they count as damaged.
-    if check(header.chunk_table, container.read_chunk_table):
-        for entry in container.read_chunk_table():
-            check(entry.section, partial(container.check_chunk, entry))
-    else:
-        sections += [replace(section, ok=False) for section in header.chunks()]
-    return sorted(sections, key=lambda section: section.offset)
+    return found.check_chunks(container, header.chunk_table, container.read_chunk_table, header.chunks())
 
 
-def _checked(data: bytes) -> bytes:
-    """Data with its checksum behind it."""
-    return data + _U32.pack(zlib.crc32(data))
+def _wrong_length(length: int, room: int) -> str:
+    most = min(HEADER_MAX, room)
+    if length % HEADER_STEP == 0 and HEADER_MIN <= length <= most:
+        return ""
+    return f"wanted a multiple of {HEADER_STEP} from {HEADER_MIN} to {most}"

@@ -1,19 +1,10 @@
-"""Writing, opening, cutting and verifying `.fgs` files, version 2 (docs/format.md).
-
-The skeleton of version 1: every byte lies under a checksum or is compared with the one value it may have, and nothing is
-allocated on the word of the header before its claims fit the size of the file.
-"""
+"""Writing, opening, cutting and verifying `.fgs` files, version 2 (docs/format.md)."""
 
 from __future__ import annotations
 
 import os
-import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
-from functools import partial
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -27,21 +18,17 @@ from flexgs_edge.codec.coder import (
     encode_grid,
     least_bytes,
 )
-from flexgs_edge.codec.container import MAGIC, ChunkEntry
-from flexgs_edge.codec.layout import PREAMBLE_BYTES, HeaderError, Section, format_error
+from flexgs_edge.codec.layout import PREAMBLE_BYTES, Section, format_error
 from flexgs_edge.codec.layout2 import HEADER_MOST, GridHeader, decode_header, encode_header
 from flexgs_edge.codec.octree import TooManyNodes
 from flexgs_edge.codec.rans import StreamError
+from flexgs_edge.codec.sections import ChunkEntry, SectionFile, Verification, checked, preamble
 from flexgs_edge.codec.walk import ChunkCodes
-from flexgs_edge.errors import FormatError, InputError, TargetError
+from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.grid import GridScene
 from flexgs_edge.scene.atomic import atomic_write
 
 VERSION = 2
-_PREAMBLE = struct.Struct("<8sHHIQII")
-_U32 = struct.Struct("<I")
-_PIECE = 1 << 20
-"""Bytes read at a time when only a checksum is wanted."""
 
 
 def write_grid(
@@ -78,7 +65,7 @@ def write_grid(
     with atomic_write(path, force) as file:
         file.seek(PREAMBLE_BYTES)
         file.write(encode_header(header))
-        file.write(_checked(model))
+        file.write(checked(model))
         entries = []
         for stream in encoded.streams():
             entries.append((len(stream), zlib.crc32(stream)))
@@ -88,10 +75,20 @@ def write_grid(
 
 def coded_size(grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS) -> int:
     """Exact bytes of the file that `write_grid` makes of these arguments."""
+    return coded_parts(grid, settings, chunk_rows)[0]
+
+
+def coded_parts(grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS) -> tuple[int, float]:
+    """Exact bytes of the file that `write_grid` makes of these arguments, and how many of them the SH take.
+
+    The SH take the information in their symbols and in the degrees of the rows, and their groups' part of the model:
+    what coding the scene again without them would save, but for the header's and the lanes' bytes.
+    """
     encoded = encode_grid(grid, chunk_rows)
     model_bytes = len(encoded.model.to_bytes())
     header = _header(grid, encoded, model_bytes, settings, chunk_rows)
-    return header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes
+    size = header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes
+    return size, encoded.sh_bytes
 
 
 def trim_container(
@@ -122,7 +119,7 @@ def trim_container(
     with container.open() as old, atomic_write(path, force) as file:
         file.seek(PREAMBLE_BYTES)
         file.write(encode_header(header))
-        file.write(container.read_section(old, container.header.model))
+        file.write(checked(container.read_section(old, container.header.model)))
         for entry in kept:
             container.copy_chunk(old, entry, file)
         return _finish(file, header, [(entry.section.length, entry.checksum) for entry in kept])
@@ -137,15 +134,15 @@ def _header(
 
 def _finish(file: BinaryIO, header: GridHeader, entries: Sequence[tuple[int, int]]) -> int:
     """Write the chunk table and, last, the preamble; returns the size of the file."""
-    file.write(_checked(np.array(entries, "<u4").tobytes()))
+    file.write(checked(np.array(entries, "<u4").tobytes()))
     size = file.tell()
     block = encode_header(header)
     file.seek(0)
-    file.write(_checked(_PREAMBLE.pack(MAGIC, VERSION, 0, 0, size, len(block), zlib.crc32(block))))
+    file.write(preamble(VERSION, size, block))
     return size
 
 
-class GridContainer:
+class GridContainer(SectionFile):
     """A version 2 file whose header has been checked against the file's size.
 
     Parameters
@@ -161,17 +158,24 @@ class GridContainer:
         When the file cannot be read at all.
     """
 
+    version = VERSION
+
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
+        super().__init__(path)
         with self.open() as file:
-            self.size = os.fstat(file.fileno()).st_size
-            self.header = self._read_header(file)
+            size = self.size = os.fstat(file.fileno()).st_size
+
+            def wrong_size(header: GridHeader) -> str:
+                least = header.least_size
+                return "" if least <= size else f"its counts make a file of at least {least}"
+
+            self.header = self._read_header(file, size, _wrong_length, decode_header, wrong_size)
 
     def read_model(self) -> Model:
         """The model, checked."""
         header = self.header
         with self.open() as file:
-            data = self.read_section(file, header.model)[:-4]
+            data = self.read_section(file, header.model)
         try:
             return Model.from_bytes(data, header.sh_degree, header.depth)
         except StreamError as error:
@@ -181,7 +185,7 @@ class GridContainer:
         """Place and checksum of every chunk, checked: they must fill the file."""
         section = self.header.table(self.size)
         with self.open() as file:
-            table = np.frombuffer(self.read_section(file, section)[:-4], "<u4").reshape(-1, 2)
+            table = np.frombuffer(self.read_section(file, section), "<u4").reshape(-1, 2)
         entries = []
         offset = self.header.model.offset + self.header.model.length
         for i, (chunk, (length, checksum)) in enumerate(zip(self.header.chunks(), table.tolist(), strict=True)):
@@ -208,131 +212,33 @@ class GridContainer:
         """Add the bits of every alphabet in a chunk to `cost`."""
         self._decode(model, chunk, entry, False, cost)
 
-    def check_chunk(self, entry: ChunkEntry) -> None:
-        """Check a chunk in pieces, without keeping it."""
-        with self.open() as file:
-            self.copy_chunk(file, entry, None)
-
-    def copy_chunk(self, file: BinaryIO, entry: ChunkEntry, out: BinaryIO | None) -> None:
-        """Copy a chunk in pieces, checking it."""
-        left, checksum = entry.section.length, 0
-        file.seek(entry.section.offset)
-        while left:
-            piece = self._read(file, min(left, _PIECE), entry.section.name)
-            checksum = zlib.crc32(piece, checksum)
-            left -= len(piece)
-            if out is not None:
-                out.write(piece)
-        self._compare(entry.section, entry.checksum, checksum)
-
-    def read_section(self, file: BinaryIO, section: Section) -> bytes:
-        """A section's bytes, its checksum at the end compared and kept."""
-        file.seek(section.offset)
-        data = self._read(file, section.length, section.name)
-        self._compare(section, _U32.unpack_from(data, section.length - 4)[0], zlib.crc32(memoryview(data)[:-4]))
-        return data
-
-    @contextmanager
-    def open(self) -> Iterator[BinaryIO]:
-        """The file for reading."""
-        with ExitStack() as stack:
-            try:
-                file = stack.enter_context(open(self.path, "rb"))
-            except OSError as error:
-                raise InputError(f"{self.path}: cannot read it ({error.strerror})") from error
-            yield file
-
     def _decode(
         self, model: Model, chunk: Chunk, entry: ChunkEntry, base_only: bool, cost: np.ndarray | None
     ) -> ChunkCodes:
         section = entry.section
-        with self.open() as file:
-            file.seek(section.offset)
-            data = self._read(file, section.length, section.name)
-        self._compare(section, entry.checksum, zlib.crc32(data))
+        data = self.read_chunk(entry)
         try:
             return decode_chunk(model, chunk.stop - chunk.start, data, base_only, cost)
         except (StreamError, TooManyNodes) as error:
             raise format_error(self.path, section.offset, f"{section.name}: {error}") from None
-
-    def _read(self, file: BinaryIO, length: int, name: str) -> bytes:
-        offset = file.tell()
-        data = file.read(length)
-        if len(data) != length:
-            raise format_error(
-                self.path, offset, f"{name}: wanted {length} bytes, got {len(data)}: the file is truncated"
-            )
-        return data
-
-    def _read_header(self, file: BinaryIO) -> GridHeader:
-        preamble = self._read(file, PREAMBLE_BYTES, "preamble")
-        magic, version, required, _, claimed, block_bytes, block_sum = _PREAMBLE.unpack_from(preamble)
-        if (magic, version) != (MAGIC, VERSION):
-            raise format_error(
-                self.path,
-                0,
-                f"magic and version: wanted {MAGIC!r}, {VERSION}, got {magic!r}, {version}: not such a file",
-            )
-        self._compare(Section("preamble", 0, 0), _U32.unpack_from(preamble, 32)[0], zlib.crc32(preamble[:32]))
-        if required:
-            raise format_error(
-                self.path, 10, f"flags that must be understood: wanted 0, got {required:#x}: a newer program wrote it"
-            )
-        if claimed != self.size:
-            raise format_error(self.path, 16, f"file size: wanted {claimed}, got {self.size}: truncated or extended")
-        room = min(HEADER_MOST, self.size - PREAMBLE_BYTES)
-        if block_bytes > room:
-            raise format_error(self.path, 24, f"header length: wanted at most {room}, got {block_bytes}")
-        block = self._read(file, block_bytes, "header")
-        self._compare(Section("header", PREAMBLE_BYTES, 0), block_sum, zlib.crc32(block))
-        try:
-            header = decode_header(block)
-        except HeaderError as error:
-            raise format_error(self.path, PREAMBLE_BYTES, f"header: {error}") from None
-        if header.least_size > self.size:
-            raise format_error(
-                self.path,
-                PREAMBLE_BYTES,
-                f"header: its counts make a file of at least {header.least_size} bytes, got {self.size}",
-            )
-        return header
-
-    def _compare(self, section: Section, wanted: int, got: int) -> None:
-        if wanted != got:
-            raise format_error(
-                self.path,
-                section.offset,
-                f"{section.name}: checksum: wanted {wanted:08x}, got {got:08x}: the file is damaged",
-            )
 
 
 def verify_grid(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Section]:
     """Check every byte of a version 2 file, reading it in pieces; see `container.verify`."""
     container = GridContainer(path)
     header = container.header
-    sections = [Section("preamble", 0, PREAMBLE_BYTES), Section("header", PREAMBLE_BYTES, header.block)]
-
-    def check(section: Section, test: Callable[[], object]) -> bool:
-        try:
-            test()
-        except FormatError:
-            if raise_errors:
-                raise
-            sections.append(replace(section, ok=False))
-            return False
-        sections.append(section)
-        return True
-
-    check(header.model, container.read_model)
+    found = Verification(header.block, raise_errors)
+    found.check(header.model, container.read_model)
+    # Without the table nothing says where a chunk ends.
     table = header.table(container.size)
-    if check(table, container.read_table):
-        for entry in container.read_table():
-            check(entry.section, partial(container.check_chunk, entry))
-    else:
-        # Without the table nothing says where a chunk ends.
-        start = header.model.offset + header.model.length
-        sections.append(Section("chunks", start, table.offset - start, ok=False))
-    return sorted(sections, key=lambda section: section.offset)
+    start = header.model.offset + header.model.length
+    chunks = [Section("chunks", start, table.offset - start)]
+    return found.check_chunks(container, table, container.read_table, chunks)
+
+
+def _wrong_length(length: int, room: int) -> str:
+    most = min(HEADER_MOST, room)
+    return "" if length <= most else f"wanted at most {most}"
 
 
 def channel_bytes(path: str | os.PathLike[str]) -> dict[str, float]:
@@ -352,14 +258,10 @@ def channel_bytes(path: str | os.PathLike[str]) -> dict[str, float]:
     return table
 
 
-def _checked(data: bytes) -> bytes:
-    """Data with its checksum behind it."""
-    return data + _U32.pack(zlib.crc32(data))
-
-
 __all__ = [
     "GridContainer",
     "channel_bytes",
+    "coded_parts",
     "coded_size",
     "trim_container",
     "verify_grid",

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flexgs_edge.codec.features import Features
+
 COARSE_ROWS = 256
 """The first pass has at most this many rows; they have no neighbours yet."""
 REACH = (4, 2)
@@ -34,53 +36,74 @@ class Pass:
         The rows decoded before.
     weights : np.ndarray or None
         [2 * reach, m] f32 weights of the neighbours, about 256 in all; None for the first pass.
-    near : np.ndarray or None
-        [m] f32: 256 * bits of the squared distance to the nearest neighbour.
+    stride : int
+        1, or so many rows of the pass for each one of `rows`.
     """
 
     rows: slice
     known: slice
     weights: np.ndarray | None
-    near: np.ndarray | None
+    stride: int = 1
 
 
-def plan_passes(position: np.ndarray, reach: int) -> list[Pass]:
-    """The passes over rows at `position` ([3, n] integer cells)."""
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """All passes, and for each row 256 * bits of the squared distance to its nearest neighbour (0 in the first pass)."""
+
+    passes: list[Pass]
+    near: Features
+
+
+def plan_passes(position: np.ndarray, reach: int, stride: int = 1) -> Plan:
+    """The passes over rows at `position` ([3, n] integer cells).
+
+    Parameters
+    ----------
+    position : np.ndarray
+        [3, n].
+    reach : int
+        Neighbours on each side.
+    stride : int, optional
+        One row in so many of every pass is wanted: a sample.
+    """
     count = position.shape[1]
+    near = Features(1, count)
     if count == 0:
-        return []
+        return Plan([], near)
     top = max((count - 1) // COARSE_ROWS, 0).bit_length()
     points = np.ascontiguousarray(position, np.float32)
-    passes = [Pass(slice(0, count, 1 << top), slice(0, 0), None, None)]
+    passes = [Pass(slice(0, count, stride << top), slice(0, 0), None, stride)]
     for k in range(top - 1, -1, -1):
-        rows, known = slice(1 << k, count, 2 << k), slice(0, count, 2 << k)
+        rows, known = slice(1 << k, count, (2 << k) * stride), slice(0, count, 2 << k)
         here = points[:, rows]
         squares = np.zeros((2 * reach, here.shape[1]), np.float32)
         for axis in range(3):
-            for square, there in zip(squares, _neighbours(points[axis, known], here.shape[1], reach), strict=True):
-                away = there - here[axis]
-                away *= away
-                square += away
-        near = np.frexp(squares.min(axis=0) + np.float32(1))[1].astype(np.float32) * ONE
+            away = _neighbours(points[axis, known], here.shape[1], reach, stride) - here[axis]
+            away *= away
+            squares += away
+        bits = np.frexp(squares.min(axis=0) + np.float32(1))[1]
+        near.values[0, rows] = bits * np.float32(ONE)
         squares += np.float32(1)
         np.divide(np.float32(1), squares, out=squares)
         total = squares[0].copy()
         for square in squares[1:]:
             total += square
-        factor = np.float32(ONE) / total
-        squares *= factor
-        passes.append(Pass(rows, known, np.rint(squares, out=squares), near))
-    return passes
+        squares *= np.float32(ONE) / total
+        passes.append(Pass(rows, known, np.rint(squares, out=squares), stride))
+    near.seal()
+    return Plan(passes, near)
 
 
-def _neighbours(known: np.ndarray, count: int, reach: int) -> list[np.ndarray]:
-    """Neighbours on both sides of each of `count` rows: row j lies between `known` j and j + 1; ends are repeated."""
+def _neighbours(known: np.ndarray, count: int, reach: int, stride: int) -> np.ndarray:
+    """[2 * reach, count] of both sides of `count` rows: row j lies between `known` j and j + 1; ends are repeated."""
     padded = np.concatenate([np.repeat(known[:1], reach - 1), known, np.repeat(known[-1:], reach)])
-    return [padded[i : i + count] for i in range(2 * reach)]
+    # Overlapping views of one array (as_strided takes ten times as long to make them).
+    step = padded.itemsize
+    return np.ndarray((2 * reach, count), padded.dtype, padded, 0, (step, stride * step))
 
 
-def neighbour_features(values: np.ndarray, step: Pass) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted mean, spread and distance of the neighbours of a pass, each [m] f32 in 1/256.
+def neighbour_features(values: np.ndarray, step: Pass) -> tuple[np.ndarray, ...]:
+    """Weighted mean and spread of the neighbours of a pass, each [m] f32 in 1/256; nothing in the first pass.
 
     Parameters
     ----------
@@ -90,36 +113,22 @@ def neighbour_features(values: np.ndarray, step: Pass) -> tuple[np.ndarray, np.n
         The pass.
     """
     if step.weights is None:
-        count = len(values[step.rows])
-        return np.zeros(count, np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
-    near = step.near
-    assert near is not None
-    there = _neighbours(values[step.known], len(near), len(step.weights) // 2)
-    mean = np.zeros_like(near)
-    for weight, value in zip(step.weights, there, strict=True):
-        mean += weight * value
-    middle = np.floor(mean * np.float32(1 / ONE) + np.float32(0.5))
-    spread = np.zeros_like(near)
-    for weight, value in zip(step.weights, there, strict=True):
-        away = value - middle
-        spread += weight * np.abs(away, out=away)
-    return mean, spread, near
-
-
-@dataclass(frozen=True, eq=False)
-class Known:
-    """A decoded channel as a source of features, each [n] f32 in 1/256: its values, and how far they are from the mean."""
-
-    value: np.ndarray
-    mean: np.ndarray
-
-    def features(self, rows: slice) -> list[np.ndarray]:
-        """Value, neighbours' mean, and distance from it."""
-        value, mean = self.value[rows], self.mean[rows]
-        return [value, mean, np.abs(value - mean)]
+        return ()
+    reach, count = len(step.weights) // 2, step.weights.shape[1]
+    there = _neighbours(values[step.known], count, reach, step.stride)
+    # All products and sums are integers that float32 holds: their order does not matter.
+    parts = step.weights * there
+    mean = np.add.reduce(parts, axis=0)
+    middle = mean * np.float32(1 / ONE)
+    middle += np.float32(0.5)
+    np.floor(middle, middle)
+    np.subtract(there, middle, parts)
+    np.abs(parts, parts)
+    parts *= step.weights
+    return mean, np.add.reduce(parts, axis=0)
 
 
 def limited(values: np.ndarray) -> np.ndarray:
     """Values [n] as f32 that predictions may use."""
-    kept: np.ndarray = np.clip(values, -VALUE_LIMIT, VALUE_LIMIT).astype(np.float32)
-    return kept
+    kept: np.ndarray = values.astype(np.float32)
+    return np.clip(kept, np.float32(-VALUE_LIMIT), np.float32(VALUE_LIMIT), out=kept)

@@ -11,9 +11,13 @@ import numpy as np
 from flexgs_edge.codec.coder import Chunk
 from flexgs_edge.codec.container2 import GridContainer
 from flexgs_edge.codec.octree import unmorton
+from flexgs_edge.codec.source import by_chunk
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds
 from flexgs_edge.grid import CODE_LIMIT, GridScene, from_grid
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
+
+_ROTATION_STEP_MOST = 2.0**38
+"""Three squares of this times 2^24 are finite in float32."""
 
 
 class GridSource(SceneSource):
@@ -42,6 +46,9 @@ class GridSource(SceneSource):
         self.count, self.sh_degree = header.count, header.sh_degree
         self.sh_count = self.count if self.sh_degree else 0
         self.origin = np.array(header.origin, np.float64)
+        # Codes times steps are finite; only the squares of absurdly large rotations could leave float32. Checking the
+        # values would decode the file twice more.
+        self.valid = header.grid_steps.rotation <= _ROTATION_STEP_MOST
         self.settings: dict[str, Any] = header.settings
         self._model = self.container.read_model()
         self._entries = self.container.read_table()
@@ -76,18 +83,13 @@ class GridSource(SceneSource):
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`; a chunk is decoded as a whole, without its SH where they are not asked for."""
         rows, planes = self.begin_read(rows, fields, out)
-        chosen = np.arange(rows.start, rows.stop) if isinstance(rows, slice) else rows
-        if len(chosen) == 0:
-            return planes
-        chunks = np.searchsorted(self._starts, chosen, side="right") - 1
-        starts = np.flatnonzero(np.diff(chunks, prepend=-1))
         base_only = "sh_rest" not in planes
-        for start, stop in zip(starts.tolist(), [*starts[1:].tolist(), len(chosen)], strict=True):
-            chunk = int(chunks[start])
-            part = self._part(chunk, base_only)
-            values = from_grid(part, chosen[start:stop] - self._chunks[chunk].start, fields)
+        for chunk, wanted, place in by_chunk(rows, self._starts):
+            first = self._chunks[chunk].start
+            here = slice(wanted.start - first, wanted.stop - first) if isinstance(wanted, slice) else wanted - first
+            values = from_grid(self._part(chunk, base_only), here, fields)
             for field, plane in planes.items():
-                plane[:, start:stop] = values[field]
+                plane[:, place] = values[field]
         return planes
 
     def _part(self, chunk: int, base_only: bool) -> GridScene:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from flexgs_edge.codec.features import Sums, Term, add_own, add_terms, constant
 from flexgs_edge.codec.rans import StreamError
 from flexgs_edge.codec.tables import CONTEXTS_MOST, SYMBOLS_MOST
 
@@ -39,11 +41,14 @@ class GroupKind:
         Numbers that its prediction takes.
     residual : bool
         Whether symbols are differences from the prediction, or values.
+    sh : bool
+        Whether a scene without SH has none of it.
     """
 
     name: str
     features: int
     residual: bool
+    sh: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,21 +86,40 @@ class Group:
         means = 2 if self.kind.residual else len(self.cuts[0]) + 1
         return means * (len(self.cuts[1]) + 1)
 
-    def predict(self, features: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """What to subtract from the codes [m] i64 (0 for values), and contexts [m] u8."""
-        matrix = np.empty((len(features) + 1, len(features[0])))
-        for row, feature in zip(matrix, features, strict=False):
-            row[:] = feature
-        matrix[-1] = 256
-        # Integers below 2^53: exact in any order of summation.
-        mean, error = self.weights.astype(np.float64) @ matrix
-        spread = _bucket(np.floor(error * (1 / 1024)), self.cuts[1])
-        if self.kind.residual:
-            whole = np.floor(mean * (1 / 65536) + 0.5)
-            side = (mean >= whole * 65536).astype(np.uint8)
-            return whole.astype(np.int64) + self.centre, side * np.uint8(len(self.cuts[1]) + 1) + spread
-        place = _bucket(np.floor(mean * (1 / 4096)), self.cuts[0]) * np.uint8(len(self.cuts[1]) + 1) + spread
-        return np.zeros(1, np.int64), place
+    def known(self, terms: Sequence[Term], count: int, before: Sums | None = None) -> Sums:
+        """The part of the prediction of `count` rows that features known for all of them make, added to a part before."""
+        weights = self.weights.astype(np.float64)
+        return add_terms(constant(256 * weights[:, -1], count) if before is None else before, weights, terms)
+
+    def predict(self, known: Sums, rows: slice, own: Sequence[np.ndarray]) -> tuple[np.ndarray | float, np.ndarray]:
+        """What to subtract from the codes ([m] f32 or f64, or one number), and contexts [m] u8.
+
+        Parameters
+        ----------
+        known : Sums
+            From `known`, of all rows.
+        rows : slice
+            The rows.
+        own : sequence of np.ndarray
+            Mean and spread of their neighbours, [m] f32 each; none in the first pass.
+        """
+        mean, error = add_own(known, rows, self.weights[:, :2].astype(np.float64), own)
+        # A threshold that float32 rounds lies beyond every sum that it holds.
+        spread = _bucket(error, [1024.0 * cut for cut in self.cuts[1].tolist()])
+        levels = np.uint8(len(self.cuts[1]) + 1)
+        start = float(self.centre * self.kind.residual + self.low)
+        if not self.kind.residual:
+            place = _bucket(mean, [4096.0 * cut for cut in self.cuts[0].tolist()])
+            place *= levels
+            place += spread
+            return start, place
+        whole = mean * mean.dtype.type(1 / 65536)
+        whole += mean.dtype.type(0.5)
+        np.floor(whole, whole)
+        side = (mean >= whole * mean.dtype.type(65536)).view(np.uint8)
+        side *= levels
+        side += spread
+        return whole.astype(np.float64) + start, side
 
     def to_bytes(self) -> bytes:
         """The record of the file."""
@@ -128,11 +152,12 @@ class Group:
         return group, end
 
 
-def _bucket(values: np.ndarray, cuts: np.ndarray) -> np.ndarray:
+def _bucket(values: np.ndarray, cuts: Sequence[float]) -> np.ndarray:
     """[m] u8: how many of the cuts are at most the value."""
-    result = np.zeros(len(values), np.uint8)
+    result, beyond = np.zeros(len(values), np.uint8), np.empty(len(values), bool)
     for cut in cuts:
-        result += values >= cut
+        np.greater_equal(values, values.dtype.type(cut), beyond)
+        result += beyond.view(np.uint8)
     return result
 
 

@@ -17,6 +17,9 @@ FLOOR = 1 << 16
 """Smallest state between symbols, and the first state of every lane."""
 LANES_MOST = 512
 
+_LOW, _SHIFT, _WORD = np.uint32(TOTAL - 1), np.uint32(PRECISION), np.uint32(16)
+_FLOOR = np.uint32(FLOOR)
+
 
 def lane_count(rows: int) -> int:
     """Lanes of a stream for `rows` rows: a power of two, one for at least 128 rows (4 bytes each, below 0.5 %).
@@ -47,9 +50,10 @@ class Tables:
         self.size = self.freqs.shape[1]
         starts = np.zeros_like(self.freqs)
         np.cumsum(self.freqs[:, :-1], axis=1, out=starts[:, 1:])
-        self.flat_freqs = self.freqs.reshape(-1)
-        self.flat_starts = starts.reshape(-1)
+        self.entries = ((self.freqs << _SHIFT) | starts).reshape(-1)
+        """[t * a] u32: frequency and start of every symbol, 0 where the frequency is."""
         self._slots: np.ndarray | None = None
+        self._moves: np.ndarray | None = None
 
     @property
     def slots(self) -> np.ndarray:
@@ -57,12 +61,22 @@ class Tables:
         if self._slots is None:
             kind = np.uint8 if self.size <= 256 else np.uint16
             symbols = np.tile(np.arange(self.size, dtype=kind), len(self.freqs))
-            self._slots = np.repeat(symbols, self.flat_freqs)
+            self._slots = np.repeat(symbols, self.freqs.reshape(-1))
         return self._slots
+
+    @property
+    def moves(self) -> np.ndarray:
+        """[t * 2^14] u32: frequency, and place in its symbol, of every slot: one look-up a step of the decoder."""
+        if self._moves is None:
+            freqs = self.freqs.reshape(-1)
+            moves = np.repeat((freqs << _SHIFT) - (self.entries & _LOW), freqs)
+            moves.reshape(-1, TOTAL)[:] += np.arange(TOTAL, dtype=np.uint32)
+            self._moves = moves
+        return self._moves
 
     def bits(self, tables: np.ndarray, symbols: np.ndarray) -> float:
         """Information of symbols in bits (floating point, for reports only)."""
-        return float((PRECISION - np.log2(self.flat_freqs[tables.astype(np.int64) * self.size + symbols])).sum())
+        return float((PRECISION - np.log2(self.freqs[tables, symbols])).sum())
 
 
 class Encoder:
@@ -76,33 +90,46 @@ class Encoder:
 
     def __init__(self, lanes: int) -> None:
         self.lanes = lanes
-        self._batches: list[tuple[np.ndarray, np.ndarray]] = []
+        self._batches: list[np.ndarray] = []
 
     def put(self, tables: Tables, rows: np.ndarray, symbols: np.ndarray) -> None:
         """Add a batch: `symbols` [m], each coded by row `rows` [m] of `tables`. Zero frequencies are the caller's bug."""
-        place = rows.astype(np.int64) * tables.size + symbols
-        freqs = tables.flat_freqs[place]
-        if not freqs.all():
+        place = rows.astype(np.intp)
+        place *= tables.size
+        place += symbols
+        entries = tables.entries.take(place)
+        if not entries.all():
             raise AssertionError("a symbol without a frequency")
-        self._batches.append((freqs, tables.flat_starts[place].astype(np.uint32)))
+        self._batches.append(entries)
 
     def finish(self) -> bytes:
         """The stream: the states of all lanes as u32, then words as u16."""
-        states = np.full(self.lanes, FLOOR, np.uint64)
+        # Doubles hold states exactly, and their division is a vector instruction: a state and a frequency differ too
+        # much from 2^53 for a quotient to be rounded up to the next integer.
+        states = np.full(self.lanes, float(FLOOR))
+        quotient, full = np.empty(self.lanes), np.empty(self.lanes, bool)
         words = []
-        shift = np.uint64(PRECISION)
-        for freqs, starts in reversed(self._batches):
-            wide, begin = freqs.astype(np.uint64), starts.astype(np.uint64)
-            limit = wide << np.uint64(32 - PRECISION)
+        for entries in reversed(self._batches):
+            freqs = (entries >> _SHIFT).astype(np.float64)
+            starts = (entries & _LOW).astype(np.float64)
+            limits, others = freqs * float(1 << 32 - PRECISION), TOTAL - freqs
             for at in range((len(freqs) - 1) // self.lanes * self.lanes, -1, -self.lanes):
                 part = slice(at, at + self.lanes)
-                state, freq = states[: len(wide[part])], wide[part]
-                full = state >= limit[part]
-                words.append(state[full].astype("<u2"))  # the low 16 bits
-                state >>= full.astype(np.uint64) << np.uint64(4)
-                quotient = state // freq
-                state += quotient * ((np.uint64(1) << shift) - freq)
-                state += begin[part]
+                freq = freqs[part]
+                size = len(freq)
+                state, count, over = states[:size], quotient[:size], full[:size]
+                np.greater_equal(state, limits[part], over)
+                places = over.nonzero()[0]
+                if len(places):
+                    large = state.take(places).astype(np.uint32)
+                    words.append(large.astype("<u2"))  # the low 16 bits
+                    large >>= _WORD
+                    state[places] = large
+                np.divide(state, freq, count)
+                np.floor(count, count)
+                np.multiply(count, others[part], count)
+                np.add(state, count, state)
+                np.add(state, starts[part], state)
         words.append(states.astype("<u4").view("<u2"))
         return np.concatenate(words[::-1]).tobytes()
 
@@ -124,37 +151,54 @@ class Decoder:
         words = np.frombuffer(data, "<u2")
         self.lanes = lanes
         self._states = words[: 2 * lanes].view("<u4").astype(np.uint32)
-        self._words = words
+        self._words = words.astype(np.uint32)
         self._at = 2 * lanes
+        self._move, self._low, self._empty = (
+            np.empty(lanes, np.uint32),
+            np.empty(lanes, np.uint32),
+            np.empty(lanes, bool),
+        )
         if (self._states < FLOOR).any():
             raise StreamError("stream: wanted states of at least 65536")
 
     def get(self, tables: Tables, rows: np.ndarray) -> np.ndarray:
         """[m] symbols of the next batch (u8 or u16), each coded by row `rows` [m] of `tables`."""
-        slots = tables.slots
-        out = np.empty(len(rows), slots.dtype)
-        base = rows.astype(np.int64)
-        first = base << PRECISION
-        base *= tables.size
-        for at in range(0, len(rows), self.lanes):
-            part = slice(at, min(at + self.lanes, len(rows)))
-            state = self._states[: part.stop - at]
-            low = state & np.uint32(TOTAL - 1)
-            symbols = slots.take(first[part] + low)
-            out[part] = symbols
-            place = base[part] + symbols
-            state >>= np.uint32(PRECISION)
-            state *= tables.flat_freqs.take(place)
-            low -= tables.flat_starts.take(place)
-            state += low
-            empty = (state < FLOOR).nonzero()[0]
-            if len(empty):
-                words = self._words[self._at : self._at + len(empty)]
-                if len(words) < len(empty):
+        first = rows.astype(np.intp)
+        first <<= PRECISION
+        return self.get_at(tables, first)
+
+    def get_at(self, tables: Tables, first: np.ndarray) -> np.ndarray:
+        """As `get`, with the first slot of each row: row * 2^14 ([m] intp, overwritten)."""
+        # Few calls on whole arrays: 512 numbers take a quarter of what NumPy takes to be called.
+        take, move, low, empty = tables.moves.take, self._move, self._low, self._empty
+        words, begin = self._words, self._at
+        for at in range(0, len(first), self.lanes):
+            slot = first[at : at + self.lanes]
+            if len(slot) == self.lanes:
+                state = self._states
+            else:
+                state, move, low, empty = (array[: len(slot)] for array in (self._states, move, low, empty))
+            np.bitwise_and(state, _LOW, low)
+            np.add(slot, low, slot)
+            take(slot, None, move, "clip")
+            np.right_shift(state, _SHIFT, state)
+            np.bitwise_and(move, _LOW, low)
+            np.right_shift(move, _SHIFT, move)
+            np.multiply(state, move, state)
+            np.add(state, low, state)
+            np.less(state, _FLOOR, empty)
+            places = empty.nonzero()[0]
+            if len(places):
+                end = begin + len(places)
+                if end > len(words):
                     raise StreamError("stream: wanted more words, got its end")
-                self._at += len(empty)
-                state[empty] = (state[empty] << np.uint32(16)) | words
-        return out
+                filled = state.take(places)
+                filled <<= _WORD
+                filled |= words[begin:end]
+                state[places] = filled
+                begin = end
+        self._at = begin
+        return tables.slots.take(first)
 
     def finish(self) -> int:
         """Bytes read; raises `StreamError` unless every lane is back in its first state."""

@@ -31,7 +31,7 @@ class CodedSource(SceneSource):
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`; a chunk whose rows are sparse is dequantized from the first to the last of them."""
         rows, planes = self.begin_read(rows, fields, out)
-        for chunk, wanted, place in _by_chunk(rows):
+        for chunk, wanted, place in by_chunk(rows, np.arange(0, self.count, CHUNK_ROWS)):
             first, arrays = self._chunk(chunk)
             for field, plane in planes.items():
                 _fill(arrays[field], first, wanted, plane[:, place])
@@ -137,20 +137,35 @@ class FgsSource(CodedSource):
         return QuantizedArray(header.bits.of(field), header.rows(field), self.width(field), low, step, planes)
 
 
-def _by_chunk(rows: Rows) -> Iterator[tuple[int, Rows, slice]]:
-    """(chunk, rows in it, their place in the output) of a slice or a sorted list."""
+def by_chunk(rows: Rows, starts: np.ndarray) -> Iterator[tuple[int, Rows, slice]]:
+    """Cut a slice or a sorted list of rows at the chunks.
+
+    Parameters
+    ----------
+    rows : slice or np.ndarray
+        As `SceneSource.begin_read` gives them.
+    starts : np.ndarray
+        [c] i64: first row of every chunk.
+
+    Yields
+    ------
+    tuple
+        The chunk, the rows in it, and their place in the output.
+    """
     if isinstance(rows, slice):
-        for chunk in range(rows.start // CHUNK_ROWS, -(-rows.stop // CHUNK_ROWS)):
-            start, stop = max(rows.start, chunk * CHUNK_ROWS), min(rows.stop, (chunk + 1) * CHUNK_ROWS)
-            if start < stop:
-                yield chunk, slice(start, stop), slice(start - rows.start, stop - rows.start)
+        at = rows.start
+        while at < rows.stop:
+            chunk = int(np.searchsorted(starts, at, side="right")) - 1
+            stop = min(rows.stop, int(starts[chunk + 1])) if chunk + 1 < len(starts) else rows.stop
+            yield chunk, slice(at, stop), slice(at - rows.start, stop - rows.start)
+            at = stop
         return
     # Runs of equal chunks, not bins: a list that is not sorted only costs more reading.
     if len(rows) == 0:
         return
-    chunks = rows // CHUNK_ROWS
-    starts = np.flatnonzero(np.diff(chunks, prepend=-1))
-    for start, stop in zip(starts.tolist(), [*starts[1:].tolist(), len(rows)], strict=True):
+    chunks = np.searchsorted(starts, rows, side="right") - 1
+    cuts = np.flatnonzero(np.diff(chunks, prepend=-1))
+    for start, stop in zip(cuts.tolist(), [*cuts[1:].tolist(), len(rows)], strict=True):
         yield int(chunks[start]), rows[start:stop], slice(start, stop)
 
 

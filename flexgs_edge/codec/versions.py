@@ -9,6 +9,7 @@ from flexgs_edge.codec import container, container2
 from flexgs_edge.codec.grid_source import GridSource
 from flexgs_edge.codec.layout import Header, Section
 from flexgs_edge.codec.layout2 import GridHeader
+from flexgs_edge.codec.sections import MAGIC
 from flexgs_edge.codec.source import FgsSource
 from flexgs_edge.errors import InputError
 
@@ -20,7 +21,7 @@ def file_version(path: str | os.PathLike[str]) -> int:
             start = file.read(10)
     except OSError as error:
         raise InputError(f"{path}: cannot read it ({error.strerror})") from error
-    return 2 if start == container.MAGIC + struct.pack("<H", container2.VERSION) else 1
+    return 2 if start == MAGIC + struct.pack("<H", container2.VERSION) else 1
 
 
 def open_fgs(path: str | os.PathLike[str]) -> FgsSource | GridSource:

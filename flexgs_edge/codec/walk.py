@@ -7,20 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from flexgs_edge.codec.contexts import (
-    ONE,
-    REACH,
-    VALUE_LIMIT,
-    Known,
-    Pass,
-    limited,
-    neighbour_features,
-    plan_passes,
-)
+from flexgs_edge.codec.contexts import ONE, REACH, VALUE_LIMIT, Plan, limited, neighbour_features, plan_passes
+from flexgs_edge.codec.features import Features, Term
 from flexgs_edge.codec.groups import GroupKind
 from flexgs_edge.codec.octree import unmorton, walk_octree
 from flexgs_edge.codec.rans import StreamError
@@ -29,6 +21,8 @@ AXES = ("x", "y", "z")
 COLOURS = ("Y", "Co", "Cg")
 _OWN = 3
 """Features from the channel's own neighbours: mean, spread, distance."""
+_NEAR = (2,)
+"""Place of the distance among the weights."""
 
 _SCALES = ("scale x", "scale y", "scale z")
 _EARLIER: dict[str, tuple[str, ...]] = {
@@ -45,19 +39,29 @@ _EARLIER: dict[str, tuple[str, ...]] = {
     "rotation z": _SCALES,
 }
 """Base channels in order, and the earlier channels that each is predicted from. Each pays at least 0.01 bits."""
+_SOURCES = ("scale x", "scale y", "scale z", "opacity", "dc Y", "dc Co", "dc Cg")
+"""Channels that others are predicted from: three features each (value, neighbours' mean, distance), in this order."""
+_SH_SOURCES = ("opacity", *_SCALES)
+"""Rotations say little of the SH; opacity and colour say how much a row's light changes."""
+_SH_BEFORE = ((3,), (11, 3, 9, 10), (3, 13, 14, 9, 10, 11, 12))
+"""Places of the weights of |sums| of Cg, Y, Co before, and Y, |Y|, Co, |Co| of this coefficient; of Y, Co and Cg, which
+begin at the second, second and first of them."""
 _RESIDUAL = ("scale", "opacity", "dc")
 """Channels whose symbols are residuals: predictable and without edges. The others gain from tables of their values."""
 
 
 def base_kinds() -> list[GroupKind]:
     """Groups of the base channels."""
-    return [GroupKind(name, _OWN + 3 * len(earlier), name.startswith(_RESIDUAL)) for name, earlier in _EARLIER.items()]
+    return [
+        GroupKind(name, _OWN + 3 * len(earlier), name.startswith(_RESIDUAL), name == "sh degree")
+        for name, earlier in _EARLIER.items()
+    ]
 
 
 def sh_kinds(sh_degree: int) -> list[GroupKind]:
     """Groups of SH: one for each degree and colour plane."""
     return [
-        GroupKind(f"sh {degree} {colour}", _OWN + 6 + 3 * plane, False)
+        GroupKind(f"sh {degree} {colour}", _OWN + 6 + 3 * plane, False, True)
         for degree in range(1, sh_degree + 1)
         for plane, colour in enumerate(COLOURS)
     ]
@@ -73,7 +77,10 @@ class ChunkCodes:
 
 
 class Port(Protocol):
-    """Codes batches; `codes` are None when decoding."""
+    """Codes batches; `codes` are None when decoding. What `known` gives is the port's own."""
+
+    stride: int
+    """One row in so many of each pass is coded."""
 
     def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
         """Octree bytes."""
@@ -81,8 +88,13 @@ class Port(Protocol):
     def repeats(self, codes: np.ndarray | None, cells: int, rows: int) -> np.ndarray:
         """Rows beyond the first in every cell."""
 
-    def channel(self, group: int, features: list[np.ndarray], codes: np.ndarray | None) -> np.ndarray:
-        """Codes [m] of a group, predicted from features (each [m] f32 in 1/256)."""
+    def known(self, group: int, count: int, terms: list[Term], before: Any = None) -> Any:
+        """Take features of a group that are known for all `count` rows, beside those of `before`."""
+
+    def channel(
+        self, group: int, known: Any, rows: slice, own: tuple[np.ndarray, ...], codes: np.ndarray | None
+    ) -> np.ndarray:
+        """Codes [m] of some rows, predicted from what is known and from `own`: mean and spread of their neighbours."""
 
 
 def walk_chunk(
@@ -112,31 +124,61 @@ def walk_chunk(
     """
     cells = _walk_positions(rows, depth, port, codes)
     position = unmorton(cells)
-    passes = plan_passes(position, REACH[0])
-    known: dict[str, Known] = {}
+    plan = plan_passes(position, REACH[0], port.stride)
+    features = Features(3 * len(_SOURCES), rows)
     base: dict[str, np.ndarray] = {}
     for group, (name, earlier) in enumerate(_EARLIER.items()):
         if name == "sh degree" and sh_degree == 0:
             base[name] = np.zeros(rows, np.int32)
             continue
+        terms = [Term(_NEAR, plan.near)]
+        if earlier:
+            first = min(map(_SOURCES.index, earlier))
+            order = sorted(earlier, key=_SOURCES.index)
+            places = [_OWN + 3 * earlier.index(e) + part for e in order for part in range(3)]
+            terms.append(Term(places, features, 3 * first))
+        mean = features.values[3 * _SOURCES.index(name) + 1] if name in _SOURCES else None
+        known = port.known(group, rows, terms)
         source = None if codes is None else codes.base[name]
-        values = np.zeros(rows, np.float32)
-        mean = np.zeros(rows, np.float32)
-        result = np.zeros(rows, np.int32)
-        for step in passes:
-            own = neighbour_features(values, step)
-            features = [*own, *(part for e in earlier for part in known[e].features(step.rows))]
-            result[step.rows] = port.channel(group, features, None if source is None else source[step.rows])
-            values[step.rows] = limited(result[step.rows])
-            # The first pass has no neighbours: as a feature of later channels its mean is its value.
-            mean[step.rows] = values[step.rows] * ONE if step.weights is None else own[0]
+        result, values = _walk_channel(group, known, port, plan, rows, source, mean)
         if name == "sh degree" and (result.min(initial=0) < 0 or result.max(initial=0) > sh_degree):
             raise StreamError(f"sh degree: wanted 0 to {sh_degree}, got {result.min()} to {result.max()}")
         base[name] = result
-        known[name] = Known(values * ONE, mean)
+        if mean is not None:
+            at = 3 * _SOURCES.index(name)
+            value, _, away = features.values[at : at + 3]
+            np.multiply(values, np.float32(ONE), value)
+            np.abs(np.subtract(value, mean, away), away)
+            features.seal(at, at + 3)
     if base_only:
         return ChunkCodes(cells, base, ())
-    return ChunkCodes(cells, base, tuple(_walk_sh(position, base, known, sh_degree, port, codes)))
+    return ChunkCodes(cells, base, tuple(_walk_sh(position, base, features, sh_degree, port, codes)))
+
+
+def _walk_channel(
+    group: int,
+    known: Any,
+    port: Port,
+    plan: Plan,
+    rows: int,
+    source: np.ndarray | None,
+    mean: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Codes [rows] i32 and values [rows] f32 of one channel; the neighbours' means are written into `mean`."""
+    if source is None:
+        result, values = np.empty(rows, np.int32), np.empty(rows, np.float32)
+    else:
+        result, values = source, limited(source)
+    for step in plan.passes:
+        own = neighbour_features(values, step)
+        batch = port.channel(group, known, step.rows, own, None if source is None else source[step.rows])
+        if source is None:
+            result[step.rows] = batch
+            values[step.rows] = limited(batch)
+        if mean is not None:
+            # The first pass has no neighbours: as a feature of later channels its mean is its value.
+            mean[step.rows] = own[0] if own else values[step.rows] * np.float32(ONE)
+    return result, values
 
 
 def _walk_positions(rows: int, depth: int, port: Port, codes: ChunkCodes | None) -> np.ndarray:
@@ -153,7 +195,7 @@ def _walk_positions(rows: int, depth: int, port: Port, codes: ChunkCodes | None)
 def _walk_sh(
     position: np.ndarray,
     base: dict[str, np.ndarray],
-    known: dict[str, Known],
+    features: Features,
     sh_degree: int,
     port: Port,
     codes: ChunkCodes | None,
@@ -163,38 +205,37 @@ def _walk_sh(
     rows = np.arange(len(degrees))
     below = np.zeros((3, len(rows)), np.float32)
     group = len(_EARLIER)
-    passes: list[Pass] = []
+    plan = Plan([], Features(1, 0))
+    sources = [3 * _SOURCES.index(name) for name in _SH_SOURCES]
     for degree in range(1, sh_degree + 1):
         keep = degrees[rows] >= degree
         below, rows = below[:, keep], rows[keep]
         if degree == 1 or not keep.all():
-            passes = plan_passes(position[:, rows], REACH[1])
-        # Rotations and scales say little; opacity and colour say how much a row's light changes.
-        extra = [known[name].value[rows] for name in ("opacity", "scale x", "scale y", "scale z")]
+            plan = plan_passes(position[:, rows], REACH[1], port.stride)
+        # The same for all coefficients of the degree.
+        steady = Features(3 + len(sources), len(rows))
+        steady.values[:3], steady.values[3:] = below, features.values[sources][:, rows]
+        steady.seal()
+        extra = [Term(_NEAR, plan.near), Term((5, 6, 7, 8), steady, 3)]
+        fixed = [port.known(group + plane, len(rows), [*extra, Term((4,), steady, plane)]) for plane in range(3)]
         band = np.zeros((3, 2 * degree + 1, len(rows)), np.int32)
-        sums = np.zeros((3, len(rows)), np.float32)
+        # Sums of Cg, Y, Co so far; then Y, |Y|, Co, |Co| of this coefficient.
+        before = Features(7, len(rows))
         for k in range(2 * degree + 1):
-            planes: list[np.ndarray] = []
+            last = np.zeros(0, np.float32)
             for plane in range(3):
-                values = np.zeros(len(rows), np.float32)
+                term = Term(_SH_BEFORE[plane], before, 0 if plane == 2 else 1)
+                known = port.known(group + plane, len(rows), [term], fixed[plane])
                 source = None if codes is None else codes.sh[degree - 1][plane * (2 * degree + 1) + k]
-                others = sums[0] if plane else sums[1] + sums[2]
-                mine = [sums[plane], below[plane], *extra]
-                for earlier in planes:
-                    mine += [earlier, np.abs(earlier)]
-                if plane:
-                    mine.append(others)
-                if plane == 2:
-                    mine.append(sums[1])
-                for step in passes:
-                    features = [*neighbour_features(values, step), *(part[step.rows] for part in mine)]
-                    batch = port.channel(group + plane, features, None if source is None else source[step.rows])
-                    band[plane, k, step.rows] = batch
-                    values[step.rows] = limited(batch)
-                values *= ONE
-                planes.append(values)
-            for plane in range(3):
-                sums[plane] += np.abs(planes[plane])
-        below = np.minimum(sums, np.float32(VALUE_LIMIT * ONE))
+                band[plane, k], last = _walk_channel(group + plane, known, port, plan, len(rows), source)
+                last *= np.float32(ONE)
+                if plane < 2:
+                    before.values[3 + 2 * plane] = last
+                    np.abs(last, before.values[4 + 2 * plane])
+                    before.seal(3 + 2 * plane, 5 + 2 * plane)
+            before.values[0] += np.abs(last, last)
+            before.values[1:3] += before.values[4::2]
+            before.seal(0, 3)
+        below = np.minimum(before.values[[1, 2, 0]], np.float32(VALUE_LIMIT * ONE))
         group += 3
         yield band.reshape(6 * degree + 3, len(rows))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from flexgs_edge.best.path import PrunePath
 from flexgs_edge.best.search import EFFORTS, RateResult, RateSearch, RateStep
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
-from flexgs_edge.codec.container2 import coded_size
+from flexgs_edge.codec.container2 import coded_parts
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.grid import GridScene
 from flexgs_edge.pipeline.judge import Judge, measurement_of
@@ -123,18 +122,14 @@ def alive(logits: np.ndarray) -> np.ndarray:
 def size_and_bits(grid: GridScene) -> tuple[int, BitModel]:
     """Exact bytes of a grid's file, and what its Gaussians cost.
 
-    The base is known from a second coding without SH; the rest is shared among the SH coefficients.
+    The bytes of the SH are shared among their coefficients; the rest among the rows.
     """
-    size = coded_size(grid, {}) + SETTINGS_MOST
-    if grid.sh_degree == 0:
-        return size, BitModel(8 * size / max(grid.count, 1), ())
-    bare = replace(
-        grid, sh_degree=0, steps=replace(grid.steps, sh=()), sh_degrees=np.zeros_like(grid.sh_degrees), sh=()
-    )
-    base = coded_size(bare, {}) + SETTINGS_MOST
+    size, sh = coded_parts(grid, {})
+    size += SETTINGS_MOST
+    base = size - sh
     rows = [int(np.count_nonzero(grid.sh_degrees >= level)) for level in range(1, grid.sh_degree + 1)]
     values = sum((2 * level + 1) * count for level, count in enumerate(rows, start=1))
-    each = 8 * (size - base) / max(values, 1)
+    each = 8 * sh / max(values, 1)
     return size, BitModel(
         8 * base / max(grid.count, 1), tuple((2 * level + 1) * each for level in range(1, grid.sh_degree + 1))
     )

@@ -57,6 +57,8 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
     """
     if source.count == 0:
         raise InputError(f"{source.name}: the scene is empty: it has no Gaussians")
+    if source.valid:
+        return source
     faults = _Faults()
     keep = np.ones(source.count if drop_invalid else 0, bool)
     flat, smallest = 0, np.float32(np.inf)

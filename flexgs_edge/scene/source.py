@@ -38,6 +38,8 @@ class SceneSource(ABC):
         [3] f64, world: what was taken from the positions.
     notes : tuple of str
         What the reader left out or changed, for the summary.
+    valid : bool
+        No row can be one that `check_scene` refuses, so that it need not read them.
     """
 
     name: str
@@ -46,6 +48,7 @@ class SceneSource(ABC):
     sh_count: int
     origin: np.ndarray
     notes: tuple[str, ...] = ()
+    valid: bool = False
 
     @abstractmethod
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:

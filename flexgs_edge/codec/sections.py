@@ -1,0 +1,206 @@
+"""What files of both versions share: a preamble, sections that end in their checksum, and chunks that a table describes.
+
+Every byte lies under a checksum, or is compared with the one value it may have. Nothing is allocated on the word of
+the header before the sizes that it implies fit the size of the file.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO, TypeVar
+
+from flexgs_edge.codec.layout import PREAMBLE_BYTES, HeaderError, Section, format_error
+from flexgs_edge.errors import FormatError, InputError
+
+MAGIC = b"\x93FGS\r\n\x1a\n"
+"""A byte above 127, both line ends and a text stop: transfers that alter text break it at once (the idea of PNG)."""
+_PREAMBLE = struct.Struct("<8sHHIQII")
+_U32 = struct.Struct("<I")
+_PIECE = 1 << 20
+"""Bytes read at a time when only a checksum is wanted."""
+
+_Header = TypeVar("_Header")
+
+
+@dataclass(frozen=True)
+class ChunkEntry:
+    """Where a chunk lies and its checksum."""
+
+    section: Section
+    checksum: int
+
+
+def checked(data: bytes) -> bytes:
+    """Data with its checksum behind it."""
+    return data + _U32.pack(zlib.crc32(data))
+
+
+def preamble(version: int, size: int, block: bytes) -> bytes:
+    """The preamble of a file of `size` bytes whose header is `block`."""
+    return checked(_PREAMBLE.pack(MAGIC, version, 0, 0, size, len(block), zlib.crc32(block)))
+
+
+class SectionFile:
+    """A `.fgs` file of one version.
+
+    Parameters
+    ----------
+    path : path
+        The file; opened for each read, never held.
+    """
+
+    version: int
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+
+    @contextmanager
+    def open(self) -> Iterator[BinaryIO]:
+        """The file for reading."""
+        with ExitStack() as stack:
+            try:
+                file = stack.enter_context(open(self.path, "rb"))
+            except OSError as error:
+                raise InputError(f"{self.path}: cannot read it ({error.strerror})") from error
+            yield file
+
+    def read_section(self, file: BinaryIO, section: Section) -> bytes:
+        """A section's bytes without the checksum at its end, which is compared."""
+        file.seek(section.offset)
+        data = self._read(file, section.length, section.name)
+        self._compare(section, _U32.unpack_from(data, section.length - 4)[0], zlib.crc32(memoryview(data)[:-4]))
+        return data[:-4]
+
+    def read_chunk(self, entry: ChunkEntry) -> bytes:
+        """The bytes of a chunk, checked."""
+        section = entry.section
+        with self.open() as file:
+            file.seek(section.offset)
+            data = self._read(file, section.length, section.name)
+        self._compare(section, entry.checksum, zlib.crc32(data))
+        return data
+
+    def check_chunk(self, entry: ChunkEntry) -> None:
+        """Check a chunk in pieces, without keeping it."""
+        with self.open() as file:
+            self.copy_chunk(file, entry, None)
+
+    def copy_chunk(self, file: BinaryIO, entry: ChunkEntry, out: BinaryIO | None) -> None:
+        """Copy a chunk in pieces, checking it."""
+        left, checksum = entry.section.length, 0
+        file.seek(entry.section.offset)
+        while left:
+            piece = self._read(file, min(left, _PIECE), entry.section.name)
+            checksum = zlib.crc32(piece, checksum)
+            left -= len(piece)
+            if out is not None:
+                out.write(piece)
+        self._compare(entry.section, entry.checksum, checksum)
+
+    def _read_header(
+        self,
+        file: BinaryIO,
+        size: int,
+        wrong_length: Callable[[int, int], str],
+        decode: Callable[[bytes], _Header],
+        wrong_size: Callable[[_Header], str],
+    ) -> _Header:
+        """The checked header of a file of `size` bytes.
+
+        Parameters
+        ----------
+        wrong_length : callable
+            What is wrong with a header's length, given the room for it ("" for nothing).
+        decode : callable
+            Header from its bytes; raises `HeaderError`.
+        wrong_size : callable
+            What size the header makes, where it is not the file's ("" where it is).
+        """
+        start = self._read(file, PREAMBLE_BYTES, "preamble")
+        magic, version, required, _, claimed, block_bytes, block_sum = _PREAMBLE.unpack_from(start)
+        if magic != MAGIC:
+            raise self._error(0, f"magic: wanted {MAGIC!r}, got {magic!r}: not a .fgs file, or damaged")
+        if version != self.version:
+            raise self._error(
+                8, f"version: wanted {self.version}, got {version}: another program wrote it, or it is damaged"
+            )
+        self._compare(Section("preamble", 0, 0), _U32.unpack_from(start, 32)[0], zlib.crc32(start[:32]))
+        if required:
+            raise self._error(
+                10, f"flags that must be understood: wanted 0, got {required:#x}: a newer program wrote it"
+            )
+        if claimed != size:
+            raise self._error(16, f"file size: wanted {claimed}, got {size}: truncated or extended")
+        if wrong := wrong_length(block_bytes, size - PREAMBLE_BYTES):
+            raise self._error(24, f"header length: {wrong}, got {block_bytes}")
+        block = self._read(file, block_bytes, "header")
+        self._compare(Section("header", PREAMBLE_BYTES, 0), block_sum, zlib.crc32(block))
+        try:
+            header = decode(block)
+        except HeaderError as error:
+            raise self._error(PREAMBLE_BYTES, f"header: {error}") from None
+        if wrong := wrong_size(header):
+            raise self._error(PREAMBLE_BYTES, f"header: {wrong} bytes, got {size}")
+        return header
+
+    def _read(self, file: BinaryIO, length: int, name: str) -> bytes:
+        offset = file.tell()
+        data = file.read(length)
+        if len(data) != length:
+            raise self._error(offset, f"{name}: wanted {length} bytes, got {len(data)}: the file is truncated")
+        return data
+
+    def _compare(self, section: Section, wanted: int, got: int) -> None:
+        if wanted != got:
+            raise self._error(
+                section.offset, f"{section.name}: checksum: wanted {wanted:08x}, got {got:08x}: the file is damaged"
+            )
+
+    def _error(self, offset: int, message: str) -> FormatError:
+        return format_error(self.path, offset, message)
+
+
+class Verification:
+    """Sections of a file, each tested in turn.
+
+    Parameters
+    ----------
+    block : int
+        Bytes of the header, which has been read.
+    raise_errors : bool
+        False: damage is reported as `ok=False`.
+    """
+
+    def __init__(self, block: int, raise_errors: bool) -> None:
+        self.raise_errors = raise_errors
+        self._sections = [Section("preamble", 0, PREAMBLE_BYTES), Section("header", PREAMBLE_BYTES, block)]
+
+    def check(self, section: Section, test: Callable[[], object]) -> bool:
+        """Note a section, and whether `test` passes."""
+        try:
+            test()
+        except FormatError:
+            if self.raise_errors:
+                raise
+            self._sections.append(replace(section, ok=False))
+            return False
+        self._sections.append(section)
+        return True
+
+    def check_chunks(
+        self, file: SectionFile, table: Section, read: Callable[[], list[ChunkEntry]], unknown: Iterable[Section]
+    ) -> list[Section]:
+        """Test the chunk table and the chunks (`unknown` without it); returns all sections in the order of the file."""
+        if self.check(table, read):
+            for entry in read():
+                self.check(entry.section, partial(file.check_chunk, entry))
+        else:
+            self._sections += [replace(section, ok=False) for section in unknown]
+        return sorted(self._sections, key=lambda section: section.offset)
