@@ -302,7 +302,8 @@ def test_pictures_are_taken_from_the_budget(project: Path) -> None:
     from flexgs_edge.pipeline.inputs import companions_of, find_views
     from flexgs_edge.pipeline.options import ViewOptions
 
-    views = find_views(ViewOptions(background=(0.0, 0.0, 0.0)), companions_of(project))
+    source = open_scene(project / "point_cloud.ply")
+    views = find_views(ViewOptions(background=(0.0, 0.0, 0.0)), companions_of(project), source)
     assert views is not None
     budget = MemoryBudget(WIDTH * HEIGHT * 4 * 5)
     Reporter(project / "page", False).reserve(budget, views, views.train)

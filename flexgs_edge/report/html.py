@@ -10,15 +10,18 @@ from html import escape
 from flexgs_edge._version import __version__
 
 _STYLE = """
-    words = text(caption)
-    return f'<figure><img src="{data_uri(data, kind)}" alt="{words}"><figcaption>{words}</figcaption></figure>'
+:root { color-scheme: light dark; --ink: #1d2329; --paper: #ffffff; --soft: #5b6670; --line: #d7dde2;
+  --band: #f4f6f8; --mark: #0b63c5; --warm: #b4530a; }
 @media (prefers-color-scheme: dark) {
   :root { --ink: #e6eaee; --paper: #14181c; --soft: #9aa6b1; --line: #313a42; --band: #1c2228; --mark: #6fb1ff;
   --warm: #f0a35e; }
 }
 * { box-sizing: border-box; }
-    words = text(caption)
-    return f'<figure><img src="{data_uri(data, kind)}" alt="{words}"><figcaption>{words}</figcaption></figure>'
+body { margin: 0 auto; max-width: 64rem; padding: 1rem; font: 1rem/1.5 system-ui, sans-serif; color: var(--ink);
+  background: var(--paper); overflow-wrap: anywhere; }
+h1 { font-size: 1.5rem; line-height: 1.25; } h2 { font-size: 1.2rem; margin-top: 2rem; }
+a { color: var(--mark); }
+:focus-visible { outline: 2px solid var(--mark); outline-offset: 2px; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .25rem .6rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
