@@ -23,6 +23,7 @@ from flexgs_edge.pipeline.options import ViewOptions
 from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace
 from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.render.perceptual import Lpips
 from flexgs_edge.report.result import EvaluateResult
 
 
@@ -32,6 +33,7 @@ def evaluate(
     options: ViewOptions | None = None,
     base_psnr: float = DEFAULT_BASE_PSNR,
     progress: Progress = SILENT,
+    lpips: bool = False,
     **words: Any,
 ) -> EvaluateResult:
     """Measure what a scene lost against another one.
@@ -46,6 +48,8 @@ def evaluate(
         What the command line would say; `holdout=0` evaluates every view, otherwise the held-out views.
     base_psnr : float
         PSNR of the original that the modelled drop starts from, dB.
+    lpips : bool
+        Measure LPIPS as well (extra `lpips`).
     **words
         Single options by the names of `ViewOptions`.
     """
@@ -67,12 +71,17 @@ def evaluate(
     with ExitStack() as stack:
         workspace = stack.enter_context(Workspace(options, budget, clock))
         renderer = workspace.renderer
+        distance: Lpips | None = None
+        if lpips:  # before any drawing: packages or weights may be missing
+            with clock.stage("lpips"):
+                distance = Lpips(budget, max(camera.width * camera.height for camera in views.of(indices)))
+            stack.callback(distance.close)
         judge = Judge(renderer, reference.source, views, indices, budget, True, base_psnr)
         stack.callback(judge.close)
         with clock.stage("references"), renderer.load(reference.source) as original:
             judge.prepare(original, progress)
         with clock.stage("measure"), renderer.load(scene.source) as compressed:
-            quality = judge.compare(compressed, with_ssim=True, progress=progress)
+            quality = judge.compare(compressed, with_ssim=True, progress=progress, lpips=distance)
         return EvaluateResult(
             scene=scene_info(scene),
             reference=scene_info(reference),

@@ -331,7 +331,7 @@ def step_json(step: Step) -> dict[str, Any]:
 
 
 def quality_json(quality: Quality) -> dict[str, Any]:
-    """Means, the worst view, and every view; null where images are identical or there is no photo."""
+    """Means, the worst view, and every view; null where images are identical, there is no photo, or nothing was measured."""
     worst = quality.worst
     return {
         "drop": _rounded(quality.drop),
@@ -343,6 +343,9 @@ def quality_json(quality: Quality) -> dict[str, Any]:
         "ssim": _rounded(quality.ssim_photo, 5),
         "original_ssim": _rounded(quality.original_ssim, 5),
         "ssim_fidelity": _rounded(quality.ssim_original, 5),
+        "lpips": _rounded(quality.lpips_photo, 5),
+        "original_lpips": _rounded(quality.original_lpips, 5),
+        "lpips_fidelity": _rounded(quality.lpips_original, 5),
         "identical_views": quality.identical,
         "worst": _view_json(worst) if worst else None,
         "views": [_view_json(view) for view in quality.views],
@@ -359,6 +362,9 @@ def _view_json(view: ViewQuality) -> dict[str, Any]:
         "ssim": _rounded(view.ssim_photo, 5),
         "original_ssim": _rounded(view.original_ssim, 5),
         "ssim_fidelity": _rounded(view.ssim_original, 5),
+        "lpips": _rounded(view.lpips_photo, 5),
+        "original_lpips": _rounded(view.original_lpips, 5),
+        "lpips_fidelity": _rounded(view.lpips_original, 5),
         "mse": view.error,
     }
 
