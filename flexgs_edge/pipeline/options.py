@@ -18,7 +18,15 @@ METHODS = ("best", "paper")
 SELECTS = ("test", "train")
 UNSEEN = ("keep", "drop")
 DEFAULT_MAX_DROP = 1.0
-PAPER_ONLY = {"prune_rate": None, "sh_rate": None, "score": "gs", "save_scores": None, "bits": "paper", "groups": None}
+PAPER_ONLY = {
+    "prune_rate": None,
+    "sh_rate": None,
+    "score": "gs",
+    "save_scores": None,
+    "score_cache": None,
+    "bits": "paper",
+    "groups": None,
+}
 """Options that only `--method paper` knows, with their defaults."""
 
 
@@ -85,6 +93,8 @@ class CompressOptions(ViewOptions):
         `gs`, `meson`, or a .npy/.npz file with one number a Gaussian.
     save_scores : str, optional
         Write the scores here (.npy).
+    score_cache : str, optional
+        Keep the scores here, and take them from here when they are of the same scene, poses and score.
     max_drop, min_fidelity : float, optional
         Quality targets, dB.
     max_size : int, optional
@@ -117,6 +127,7 @@ class CompressOptions(ViewOptions):
     select: str = "test"
     score: str = "gs"
     save_scores: str | None = None
+    score_cache: str | None = None
     max_drop: float | None = None
     min_fidelity: float | None = None
     max_size: int | None = None
@@ -154,6 +165,8 @@ class CompressOptions(ViewOptions):
                 raise InputError(
                     f"--{name.replace('_', '-')} belongs to --method paper: leave it out, or ask for that method"
                 )
+        if self.score_cache is not None and self.score not in ("gs", "meson"):
+            raise InputError(f"--score-cache keeps scores that are computed: leave it out with --score {self.score}")
         self._check_targets()
         self.bit_spec()
 

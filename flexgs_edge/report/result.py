@@ -131,6 +131,10 @@ class CompressResult:
         `held-out`, `training` or `none`.
     scores_saved : str or None
         File of scores written.
+    score_cache : str or None
+        File that keeps the scores between runs.
+    scores_reused : bool
+        Whether they were taken from it.
     run : RunInfo
         Times, memory, device.
     """
@@ -158,6 +162,8 @@ class CompressResult:
     quality: Quality | None
     quality_views: str
     scores_saved: str | None
+    score_cache: str | None
+    scores_reused: bool
     run: RunInfo
 
     @property
@@ -200,6 +206,8 @@ class CompressResult:
             "quality": quality_json(self.quality) if self.quality else None,
             "quality_views": self.quality_views,
             "scores_saved": self.scores_saved,
+            "score_cache": self.score_cache,
+            "scores_reused": self.scores_reused,
             "run": self.run.to_json(),
         }
 

@@ -46,6 +46,10 @@ def compress_text(result: CompressResult) -> str:
         lines += _quality_lines(result.quality, f"{decoded}, {len(result.quality.views)} {result.quality_views} views")
     if result.scores_saved:
         lines.append(_line("scores", f"saved to {result.scores_saved}"))
+    if result.score_cache:
+        lines.append(
+            _line("scores", f"{'reused from' if result.scores_reused else 'made anew, kept in'} {result.score_cache}")
+        )
     return _text([*lines, *_run_lines(result.run)])
 
 
