@@ -19,7 +19,7 @@ from flexgs_edge.scene import PlySource, write_ply
 from tiny_project import make_project
 
 VIEWS = 9
-FAST = ("--resolution", "120", "--prune-rate", "0.3", "--sh-rate", "0.4")
+FAST = ("--method", "paper", "--resolution", "120", "--prune-rate", "0.3", "--sh-rate", "0.4")
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_what_is_given_is_not_added(repository: Path, machine: dict[str, str], t
         "4",
     )
     done = call(
-        repository, machine, tmp_path, "scene/point_cloud.ply", *given, *FAST[2:], OCL_ICD_VENDORS=str(tmp_path / "no")
+        repository, machine, tmp_path, "scene/point_cloud.ply", *given, *FAST, OCL_ICD_VENDORS=str(tmp_path / "no")
     )
     assert done.returncode == 0, done.stderr
     assert "memory limit: 1GiB, as given" in done.stderr and "NumPy twins, as asked for" in done.stderr

@@ -23,7 +23,7 @@ FIELDS = ("means", "log_scales", "quats", "opacity_logits")
 
 
 def fingerprint(source: SceneSource, cameras: Sequence[Camera], kind: str, near: float, extent: str) -> str:
-    """A digest of everything that scores depend on (a second a GB of scene).
+    """A digest of everything that scores depend on; reads the scene once, without its colours.
 
     Parameters
     ----------
