@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""Shows by pip's own resolver that every runtime dependency has a wheel for aarch64 Linux.
+"""Shows by pip's own resolver that every runtime dependency, and what the extras add, has a wheel for aarch64 Linux.
 
     deploy/check-aarch64.py [3.10 3.11 3.12]     needs pip and the package index, installs nothing
 
-Takes the dependencies of setup.cfg, with the versions of constraints.txt. pip evaluates markers such as
+Takes the dependencies of setup.cfg, with the versions of constraints.txt, and the extras but for those of developers and for
+`lpips`: pip fetches whole wheels to look at them, and torch's are gigabytes. pip evaluates markers such as
 `python_version < "3.11"` for the Python that runs it, and may miss what an index does not say about the Python that a package
 requires: both are checked here for the Python asked for.
 Exit code 0: all resolve; 1: some do not.
@@ -30,6 +31,8 @@ except ImportError:  # pip has a copy of its own
 
 ROOT = Path(__file__).resolve().parents[1]
 VERSIONS = ("3.10", "3.11", "3.12")
+LEFT_OUT = ("test", "dev", "lpips")
+"""Extras that are not checked; see above."""
 # What glibc 2.31 runs and newer ones too: Ubuntu 20.04 of JetPack 5 has 2.31, 22.04 of JetPack 6 has 2.35.
 PLATFORMS = (
     "manylinux2014_aarch64",
@@ -67,10 +70,12 @@ def plain(requirement: Requirement) -> str:
 
 
 def runtime_requirements() -> list[Requirement]:
-    """`install_requires` of setup.cfg."""
+    """`install_requires` of setup.cfg, and the extras that users may install on a board."""
     settings = configparser.ConfigParser()
     settings.read(ROOT / "setup.cfg")
-    return [Requirement(line) for line in settings["options"]["install_requires"].split("\n") if line.strip()]
+    lists = [settings["options"]["install_requires"]]
+    lists += [text for name, text in settings["options.extras_require"].items() if name not in LEFT_OUT]
+    return [Requirement(line) for text in lists for line in text.split("\n") if line.strip()]
 
 
 def constraints(version: str) -> list[str]:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import re
 import resource
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from flexgs_edge.errors import BudgetError, InputError
 
@@ -72,16 +74,43 @@ def current_rss() -> int:
         return peak_rss()
 
 
-def available_memory() -> int:
-    """Memory that the machine could give now, in bytes (1 GiB where it cannot tell)."""
+def available_memory(proc: str | Path = "/proc", groups: str | Path = "/sys/fs/cgroup") -> int:
+    """Memory that the machine could give now, in bytes (1 GiB where it cannot tell).
+
+    A control group (a container, a service) with a limit gives what is left of its own: no error comes beyond it, the
+    kernel kills the process.
+    """
+    free = 2**30
+    with suppress(OSError):
+        for line in (Path(proc) / "meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                free = int(line.split()[1]) * 1024
+    return max(min([free, *_left_in_groups(Path(proc), Path(groups))]), 0)
+
+
+def _left_in_groups(proc: Path, groups: Path) -> Iterator[int]:
+    """Bytes that each memory limit above this process leaves, in both versions of the kernel's interface."""
     try:
-        with open("/proc/meminfo") as meminfo:
-            for line in meminfo:
-                if line.startswith("MemAvailable:"):
-                    return int(line.split()[1]) * 1024
+        lines = (proc / "self" / "cgroup").read_text().splitlines()
     except OSError:
-        pass
-    return 2**30
+        return
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers == "":
+            place, most, used, cache = groups, "memory.max", "memory.current", "inactive_file"
+        elif "memory" in controllers.split(","):
+            place, most = groups / "memory", "memory.limit_in_bytes"
+            used, cache = "memory.usage_in_bytes", "total_inactive_file"
+        else:
+            continue
+        # From inside a container the path may be the host's: the folders that are there count, from the top down.
+        for part in ("", *(part for part in path.split("/") if part not in ("", ".."))):
+            place = place / part
+            with suppress(OSError, ValueError):  # ValueError: the word "max"
+                limit = int((place / most).read_text())
+                stat = dict(line.split() for line in (place / "memory.stat").read_text().splitlines())
+                # Files read once are counted as used, and given up first.
+                yield limit - int((place / used).read_text()) + int(stat.get(cache, 0))
 
 
 @dataclass

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -143,3 +145,46 @@ def test_default_limit() -> None:
     assert budget.used >= 2**20
     assert 0.5 * available_memory() <= budget.free <= available_memory()
     assert MemoryBudget.from_limit(10**9).limit == 10**9
+
+
+MIB = 2**20
+
+
+def machine(folder: Path, group: str, **limits: dict[str, tuple[object, int, int]]) -> tuple[Path, Path]:
+    """A /proc with 1000 MiB free, and control groups: path -> (limit, used, files that can be given up), in MiB."""
+    (folder / "proc" / "self").mkdir(parents=True)
+    (folder / "proc" / "meminfo").write_text("MemTotal: 4096000 kB\nMemAvailable: 1024000 kB\n")
+    (folder / "proc" / "self" / "cgroup").write_text(group)
+    for version, places in limits.items():
+        names = ("memory.max", "memory.current", "") if version == "v2" else V1
+        for place, (most, used, files) in places.items():
+            path = folder / "groups" / ("" if version == "v2" else "memory") / place
+            path.mkdir(parents=True, exist_ok=True)
+            (path / names[0]).write_text(f"{most * MIB if isinstance(most, int) else most}\n")
+            (path / names[1]).write_text(f"{used * MIB}\n")
+            (path / "memory.stat").write_text(f"anon 5\n{names[2]}inactive_file {files * MIB}\n")
+    return folder / "proc", folder / "groups"
+
+
+V1 = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_")
+
+
+@pytest.mark.parametrize(
+    ("group", "limits", "expected"),
+    [
+        ("0::/\n", {}, 1000),
+        ("0::/a/b\n", {"v2": {"a": (700, 300, 100), "a/b": ("max", 200, 0)}}, 500),
+        ("0::/a\n", {"v2": {"a": (5000, 300, 0)}}, 1000),
+        # A container that sees its own group at the top, under the path that the host has for it.
+        ("0::/docker/12ab\n", {"v2": {"": (400, 100, 0)}}, 300),
+        ("0::/../x\n", {"v2": {"": (400, 100, 50)}}, 350),
+        ("5:cpu,memory:/m\n1:name=systemd:/s\n", {"v1": {"": (9 * 10**9, 10, 0), "m": (800, 300, 100)}}, 600),
+        ("0::/full\n", {"v2": {"full": (100, 150, 0)}}, 0),
+    ],
+)
+def test_memory_of_a_container(tmp_path: Path, group: str, limits: Any, expected: int) -> None:
+    assert available_memory(*machine(tmp_path, group, **limits)) == expected * MIB
+
+
+def test_memory_where_nothing_can_be_read(tmp_path: Path) -> None:
+    assert available_memory(tmp_path, tmp_path) == 2**30

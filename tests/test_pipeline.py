@@ -93,6 +93,7 @@ def test_json_has_every_documented_key_and_no_infinity(done: tuple[Path, Compres
     }  # fmt: skip
     assert set(record["quality"]) == {
         "drop", "fidelity", "modelled_drop", "base_psnr", "psnr", "original_psnr", "ssim", "original_ssim", "ssim_fidelity",
+        "lpips", "original_lpips", "lpips_fidelity",
         "identical_views", "worst", "views",
     }  # fmt: skip
     assert set(record["run"]) == {

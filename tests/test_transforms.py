@@ -15,8 +15,7 @@ from PIL import Image
 from camera_files import colmap_records, transforms_of, write_colmap, write_inria, write_transforms
 from flexgs_edge.cameras import Camera, Photos, read_cameras, read_transforms
 from flexgs_edge.errors import FormatError, InputError
-from kernel_fixtures import draw, open_form
-from synthetic import look_from, make_camera, random_scene
+from synthetic import look_from, make_camera
 
 # A camera at (1, 2, 3) that looks along the world's x, its image's top towards z (OpenGL: columns right, up, backwards).
 MATRIX = [[0.0, 0.0, -1.0, 1.0], [-1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
@@ -69,21 +68,9 @@ def test_one_scene_in_every_format(tmp_path: Path) -> None:
     write_transforms(tmp_path / "nerf" / "transforms.json", written)
     write_colmap(tmp_path / "text", *colmap_records(written), text=True)
     write_colmap(tmp_path / "binary", *colmap_records(written))
-    scene = random_scene(200, seed=5, degree=1)
-    backend = open_form("numpy")
-    truth = [draw(backend, scene, camera) for camera in written]
     for kind in ("inria", "nerf", "text", "binary"):
-        read = read_cameras(tmp_path / kind)
-        for ours, theirs in zip(read, written, strict=True):
+        for ours, theirs in zip(read_cameras(tmp_path / kind), written, strict=True):
             assert_same(ours, theirs)
-        for camera, expected in zip(read, truth):
-            # Poses to 1e-12 round to the same float32 numbers but for a last bit here and there.
-            error = np.mean(np.square(draw(backend, scene, camera) - expected))
-            assert error < 1e-10, f"{kind}: {-10 * math.log10(error):.1f} dB"
-    # The two forms of COLMAP keep every digit: same bits.
-    for binary, text in zip(read_cameras(tmp_path / "binary"), read_cameras(tmp_path / "text")):
-        np.testing.assert_array_equal(binary.rotation, text.rotation)
-        np.testing.assert_array_equal(draw(backend, scene, binary), draw(backend, scene, text))
 
 
 @pytest.mark.parametrize("rows", [3, 4])

@@ -101,6 +101,12 @@ from flexgs_edge.cli import words
 )
 @words.option(
     "Method",
+    "--score-cache",
+    metavar="FILE",
+    help="Keep the scores in FILE; a later run takes them if scene, poses and score are the same, else makes them anew.",
+)
+@words.option(
+    "Method",
     "--prune-rate",
     metavar="P",
     type=float,
@@ -162,8 +168,8 @@ def command(input: str, output: str | None, json_path: str | None, quiet: bool, 
           a model folder with photos elsewhere
       flexgs-edge compress point_cloud.ply -o scene.fgs --max-size 8MB
           the best that fits
-      flexgs-edge compress point_cloud.ply -o a.fgs --save-scores s.npy
-      flexgs-edge compress point_cloud.ply -o b.fgs --score s.npy --max-drop 2
+      flexgs-edge compress point_cloud.ply -o a.fgs --score-cache s.npz
+      flexgs-edge compress point_cloud.ply -o b.fgs --score-cache s.npz --max-drop 2
           score once, then try another target
       flexgs-edge compress point_cloud.ply -o scene.fgs --prune-rate 0.3 --sh-rate 0.4
           fixed rates, no search

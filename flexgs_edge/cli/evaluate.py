@@ -14,6 +14,12 @@ from flexgs_edge.cli import words
 @words.option(
     "Quality", "--against", metavar="REF", required=True, help="The original: a .ply, a .fgs or a model folder."
 )
+@words.option(
+    "Quality",
+    "--lpips",
+    is_flag=True,
+    help="Also measure LPIPS (AlexNet), about 3 s a megapixel: needs flexgs-edge[lpips] and AlexNet's weights, 244 MB.",
+)
 @words.base_psnr_option
 @words.report_option
 @words.cameras_option
@@ -29,6 +35,7 @@ from flexgs_edge.cli import words
 def command(
     input: str,
     against: str,
+    lpips: bool,
     base_psnr: float,
     report: str | None,
     force: bool,
@@ -38,9 +45,9 @@ def command(
 ) -> None:
     """Measure what a scene lost against another one, view by view, mean and worst.
 
-    Fidelity is the PSNR (and SSIM) between the two scenes' renders. With photos, drop is the PSNR against the photos
-    that was lost on the way from REF to INPUT, in dB. Cameras and photos beside REF are used unless given, else those
-    beside INPUT. The held-out views are measured; all views with --holdout 0.
+    Fidelity is the PSNR (with SSIM, and LPIPS if asked for) between the two scenes' renders. With photos, drop is the PSNR
+    against the photos that was lost on the way from REF to INPUT, in dB. Cameras and photos beside REF are used unless
+    given, else those beside INPUT. The held-out views are measured; all views with --holdout 0.
 
     \b
     Examples:
@@ -49,11 +56,12 @@ def command(
       flexgs-edge evaluate scene.fgs --against point_cloud.ply --holdout 0 --json quality.json
       flexgs-edge evaluate scene.fgs --against point_cloud.ply --report page
           figures and pictures in page/index.html
+      flexgs-edge evaluate scene.fgs --against point_cloud.ply --lpips
     """
     progress = words.start(quiet, json_path, force, report)
     from flexgs_edge.pipeline.evaluate import evaluate
     from flexgs_edge.pipeline.options import ViewOptions
     from flexgs_edge.report.summary import evaluate_text
 
-    result = evaluate(input, against, ViewOptions(**options), base_psnr, progress, report, force)
+    result = evaluate(input, against, ViewOptions(**options), base_psnr, progress, report, force, lpips)
     words.emit(evaluate_text(result), result.to_json(), json_path, force)

@@ -36,7 +36,7 @@ from flexgs_edge.render import DeviceScene
 from flexgs_edge.render.quality import Quality, error_for_drop
 from flexgs_edge.report.result import CompressResult
 from flexgs_edge.scene import MemorySource, SceneSource, check_writable
-from flexgs_edge.score import load_scores, save_scores, score_scene
+from flexgs_edge.score import ScoreCache, fingerprint, load_scores, save_scores, score_scene
 from flexgs_edge.sensitivity import ALLOWED_DROP, Sensitivity, search_bits
 
 LOG = logging.getLogger("flexgs_edge")
@@ -110,6 +110,8 @@ def compress(
 def _check_outputs(output: str | Path | None, options: CompressOptions) -> Path | None:
     if options.save_scores is not None:
         check_writable(options.save_scores, options.force)
+    if options.score_cache is not None:
+        check_writable(options.score_cache, force=True)
     if options.dry_run:
         return None
     if output is None:
@@ -141,14 +143,22 @@ class _Job:
         self.source = scene.source
         self.groups = options.bit_spec()[1]
         self.sensitivity: list[Sensitivity] = []
+        self.scores_reused = False
 
     def run(self, output: Path | None, scores: np.ndarray | None) -> CompressResult:
         """The whole job; `scores` come from a file, or are computed."""
         decide, report = self._judges()
         if self.options.method == "best":
             return self._run_best(output, decide, report)
+        cache = self._score_cache()
+        if cache is not None:
+            scores = cache.load(self.source.count)
+            self.scores_reused = scores is not None
+            LOG.info("scores %s %s", "reused from" if self.scores_reused else "will be kept in", cache.path)
         if self.workspace is not None:
             scores = self._look_at_original(decide, report, scores)
+        if cache is not None and scores is not None and not self.scores_reused:
+            cache.save(scores)
         if self.options.save_scores is not None and scores is not None:
             save_scores(self.options.save_scores, scores, self.options.force)
         order = np.arange(self.source.count) if scores is None else order_from_scores(scores)
@@ -169,6 +179,17 @@ class _Job:
         with evaluator.quantized(choice) as quantized:
             quality = self._write(output, quantized, search, report)
         return self._result(output, evaluator.size(choice), choice, quantized, search, quality)
+
+    def _score_cache(self) -> ScoreCache | None:
+        """The file of kept scores, for what is scored in this run."""
+        options = self.options
+        if options.score_cache is None or not self.plan.computes_scores:
+            return None
+        assert self.views is not None and options.near is not None and options.extent is not None
+        with self.clock.stage("fingerprint"):
+            cameras = self.views.of(self.views.train)
+            key = fingerprint(self.source, cameras, options.score, options.near, options.extent)
+        return ScoreCache(options.score_cache, key)
 
     def _run_best(self, output: Path | None, decide: Judge | None, report: Judge | None) -> CompressResult:
         """The job by measured costs: see `flexgs_edge.pipeline.best`."""
@@ -245,7 +266,7 @@ class _Job:
                 report.prepare(device_scene, self.progress)
                 if decide is not report:
                     decide.prepare(device_scene, self.progress)
-            if self.plan.computes_scores:
+            if self.plan.computes_scores and scores is None:
                 cameras = self.views.of(self.views.train)
                 LOG.info("scoring %d Gaussians over %d training poses", self.source.count, len(cameras))
                 with self.clock.stage("score"):
@@ -363,6 +384,8 @@ class _Job:
             quality=quality,
             quality_views=plan.kind_of(plan.report, self.views),
             scores_saved=options.save_scores,
+            score_cache=options.score_cache if plan.computes_scores else None,
+            scores_reused=self.scores_reused,
             run=run_info(self.budget, self.clock, self.workspace),
         )
 

@@ -24,6 +24,7 @@ from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.pipeline.report import Reporter
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace
 from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.render.perceptual import Lpips
 from flexgs_edge.report.result import EvaluateResult
 
 
@@ -35,6 +36,7 @@ def evaluate(
     progress: Progress = SILENT,
     report: str | Path | None = None,
     force: bool = False,
+    lpips: bool = False,
     **words: Any,
 ) -> EvaluateResult:
     """Measure what a scene lost against another one.
@@ -53,6 +55,8 @@ def evaluate(
         Folder for a page about the run (index.html) and its record (result.json).
     force : bool
         Overwrite the files of an earlier report.
+    lpips : bool
+        Measure LPIPS as well (extra `lpips`).
     **words
         Single options by the names of `ViewOptions`.
     """
@@ -79,12 +83,17 @@ def evaluate(
         if reporter is not None:
             reporter.reserve(budget, views, indices)
         renderer = workspace.renderer
+        distance: Lpips | None = None
+        if lpips:  # before any drawing: packages or weights may be missing
+            with clock.stage("lpips"):
+                distance = Lpips(budget, max(camera.width * camera.height for camera in views.of(indices)))
+            stack.callback(distance.close)
         judge = Judge(renderer, reference.source, views, indices, budget, True, base_psnr)
         stack.callback(judge.close)
         with clock.stage("references"), renderer.load(reference.source) as original:
             judge.prepare(original, progress)
         with clock.stage("measure"), renderer.load(scene.source) as compressed:
-            quality = judge.compare(compressed, with_ssim=True, progress=progress)
+            quality = judge.compare(compressed, with_ssim=True, progress=progress, lpips=distance)
             if reporter is not None:
                 reporter.look(judge, compressed, quality, clock, progress)
         result = EvaluateResult(

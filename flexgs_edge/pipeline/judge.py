@@ -12,7 +12,7 @@ from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.pipeline.inputs import Views
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import DeviceScene, Renderer
-from flexgs_edge.render.quality import Quality, ViewQuality, compare_view, mse
+from flexgs_edge.render.quality import Distance, Quality, ViewQuality, compare_view, mse
 from flexgs_edge.scene import SceneSource
 
 SHARE = 4
@@ -107,13 +107,20 @@ class Judge:
         """Reference renders held in memory."""
         return sum(kind == "original" for kind, _ in self._kept)
 
-    def compare(self, scene: DeviceScene, with_ssim: bool = False, progress: Progress = SILENT) -> Quality:
-        """Quality of `scene` over the views (about 0.3 s a megapixel and pair more with SSIM)."""
+    def compare(
+        self,
+        scene: DeviceScene,
+        with_ssim: bool = False,
+        progress: Progress = SILENT,
+        lpips: Distance | None = None,
+    ) -> Quality:
+        """Quality of `scene` over the views (about 0.3 s a megapixel and pair more with SSIM, 3 s with LPIPS)."""
         found: list[ViewQuality] = []
         for i, camera in enumerate(progress.track(self.cameras, "comparing views", len(self.cameras))):
             image = self.renderer.render(scene, camera)
             error = self._original_error[i] if self.photos is not None else None
-            found.append(compare_view(camera.name, image, self._original(i), self._photo(i), error, with_ssim))
+            references = self._original(i), self._photo(i)
+            found.append(compare_view(camera.name, image, *references, error, with_ssim, lpips))
         return Quality(tuple(found), self.base_psnr)
 
     def images(self, scene: DeviceScene, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:

@@ -23,7 +23,15 @@ METHODS = ("best", "paper")
 SELECTS = ("test", "train")
 LAYERS_MOST = 4
 DEFAULT_MAX_DROP = 1.0
-PAPER_ONLY = {"prune_rate": None, "sh_rate": None, "score": "gs", "save_scores": None, "bits": "paper", "groups": None}
+PAPER_ONLY = {
+    "prune_rate": None,
+    "sh_rate": None,
+    "score": "gs",
+    "save_scores": None,
+    "score_cache": None,
+    "bits": "paper",
+    "groups": None,
+}
 """Options that only `--method paper` knows, with their defaults."""
 
 
@@ -96,6 +104,8 @@ class CompressOptions(ViewOptions):
         `gs`, `meson`, or a .npy/.npz file with one number a Gaussian.
     save_scores : str, optional
         Write the scores here (.npy).
+    score_cache : str, optional
+        Keep the scores here, and take them from here when they are of the same scene, poses and score.
     max_drop, min_fidelity : float, optional
         Quality targets, dB.
     max_size : int, optional
@@ -132,6 +142,7 @@ class CompressOptions(ViewOptions):
     select: str = "test"
     score: str = "gs"
     save_scores: str | None = None
+    score_cache: str | None = None
     max_drop: float | None = None
     min_fidelity: float | None = None
     max_size: int | None = None
@@ -174,6 +185,8 @@ class CompressOptions(ViewOptions):
             raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
         if self.layers > 1 and self.method != "best":
             raise InputError(f"--layers {self.layers}: only --method best writes layered files")
+        if self.score_cache is not None and self.score not in ("gs", "meson"):
+            raise InputError(f"--score-cache keeps scores that are computed: leave it out with --score {self.score}")
         self._check_targets()
         self.bit_spec()
         _ = self.unseen_share

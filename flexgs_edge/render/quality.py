@@ -7,7 +7,7 @@ channels. Identical images have no PSNR: it is `None` here and null in JSON, nev
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,8 @@ ROWS = 128
 """Image rows per step of the squared error: bounds the float64 copies to a few MB whatever the picture's height."""
 SSIM_WINDOW = 11
 """Side of scikit-image's Gaussian window at sigma 1.5, and so the smallest picture that has an SSIM."""
+Distance = Callable[[np.ndarray, np.ndarray], float | None]
+"""A distance of two [H, W, 3] images; `None` where there is none."""
 MSE_FLOOR = 1e-12
 """Errors below this (120 dB, beyond float32 renders) count as this much where two PSNRs are subtracted."""
 
@@ -135,6 +137,8 @@ class ViewQuality:
         Mean squared error of this render and of the original's render against the photo; `None` without a photo.
     ssim_original, ssim_photo, original_ssim : float or None
         SSIM against the original's render, against the photo, and of the original against the photo.
+    lpips_original, lpips_photo, original_lpips : float or None
+        LPIPS of the same three pairs; `None` unless it was asked for.
     """
 
     name: str
@@ -144,6 +148,9 @@ class ViewQuality:
     ssim_original: float | None = None
     ssim_photo: float | None = None
     original_ssim: float | None = None
+    lpips_original: float | None = None
+    lpips_photo: float | None = None
+    original_lpips: float | None = None
 
     @property
     def fidelity(self) -> float | None:
@@ -244,6 +251,21 @@ class Quality:
         return sorted(range(len(losses)), key=lambda index: -losses[index])
 
     @property
+    def lpips_original(self) -> float | None:
+        """Mean LPIPS against the original's renders."""
+        return self._mean("lpips_original")
+
+    @property
+    def lpips_photo(self) -> float | None:
+        """Mean LPIPS against the photos."""
+        return self._mean("lpips_photo")
+
+    @property
+    def original_lpips(self) -> float | None:
+        """Mean LPIPS of the original against the photos."""
+        return self._mean("original_lpips")
+
+    @property
     def worst(self) -> ViewQuality | None:
         """The view with the largest drop (with photos) or the lowest fidelity (without); `None` without views."""
         return self.views[self.by_loss[0]] if self.views else None
@@ -256,6 +278,7 @@ def compare_view(
     photo: np.ndarray | None = None,
     original_error: float | None = None,
     with_ssim: bool = False,
+    lpips: Distance | None = None,
 ) -> ViewQuality:
     """Figures of one render.
 
@@ -271,6 +294,8 @@ def compare_view(
         Mean squared error of `original` against `photo`, if it is known already.
     with_ssim : bool
         Also measure SSIM (about 0.3 s a megapixel).
+    lpips : callable, optional
+        Also measure this distance of two images (about 3 s a megapixel for LPIPS).
     """
     if photo is not None and original_error is None:
         original_error = mse(original, photo)
@@ -282,6 +307,9 @@ def compare_view(
         ssim_original=ssim(image, original) if with_ssim else None,
         ssim_photo=ssim(image, photo) if with_ssim and photo is not None else None,
         original_ssim=ssim(original, photo) if with_ssim and photo is not None else None,
+        lpips_original=lpips(image, original) if lpips else None,
+        lpips_photo=lpips(image, photo) if lpips and photo is not None else None,
+        original_lpips=lpips(original, photo) if lpips and photo is not None else None,
     )
 
 

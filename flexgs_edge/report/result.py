@@ -132,6 +132,10 @@ class CompressResult:
         `held-out`, `training` or `none`.
     scores_saved : str or None
         File of scores written.
+    score_cache : str or None
+        File that keeps the scores between runs.
+    scores_reused : bool
+        Whether they were taken from it.
     run : RunInfo
         Times, memory, device.
     """
@@ -159,6 +163,8 @@ class CompressResult:
     quality: Quality | None
     quality_views: str
     scores_saved: str | None
+    score_cache: str | None
+    scores_reused: bool
     run: RunInfo
 
     @property
@@ -201,6 +207,8 @@ class CompressResult:
             "quality": quality_json(self.quality) if self.quality else None,
             "quality_views": self.quality_views,
             "scores_saved": self.scores_saved,
+            "score_cache": self.score_cache,
+            "scores_reused": self.scores_reused,
             "run": self.run.to_json(),
         }
 
@@ -337,7 +345,7 @@ def step_json(step: Step) -> dict[str, Any]:
 
 
 def quality_json(quality: Quality) -> dict[str, Any]:
-    """Means, the worst view, and every view; null where images are identical or there is no photo."""
+    """Means, the worst view, and every view; null where images are identical, there is no photo, or nothing was measured."""
     worst = quality.worst
     return {
         "drop": _rounded(quality.drop),
@@ -349,6 +357,9 @@ def quality_json(quality: Quality) -> dict[str, Any]:
         "ssim": _rounded(quality.ssim_photo, 5),
         "original_ssim": _rounded(quality.original_ssim, 5),
         "ssim_fidelity": _rounded(quality.ssim_original, 5),
+        "lpips": _rounded(quality.lpips_photo, 5),
+        "original_lpips": _rounded(quality.original_lpips, 5),
+        "lpips_fidelity": _rounded(quality.lpips_original, 5),
         "identical_views": quality.identical,
         "worst": _view_json(worst) if worst else None,
         "views": [_view_json(view) for view in quality.views],
@@ -365,6 +376,9 @@ def _view_json(view: ViewQuality) -> dict[str, Any]:
         "ssim": _rounded(view.ssim_photo, 5),
         "original_ssim": _rounded(view.original_ssim, 5),
         "ssim_fidelity": _rounded(view.ssim_original, 5),
+        "lpips": _rounded(view.lpips_photo, 5),
+        "original_lpips": _rounded(view.original_lpips, 5),
+        "lpips_fidelity": _rounded(view.lpips_original, 5),
         "mse": view.error,
     }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 from flexgs_edge.budget import format_mib, format_size
 from flexgs_edge.render.quality import Quality, ViewQuality
@@ -46,6 +46,10 @@ def compress_text(result: CompressResult) -> str:
         lines += _quality_lines(result.quality, f"{decoded}, {len(result.quality.views)} {result.quality_views} views")
     if result.scores_saved:
         lines.append(_line("scores", f"saved to {result.scores_saved}"))
+    if result.score_cache:
+        lines.append(
+            _line("scores", f"{'reused from' if result.scores_reused else 'made anew, kept in'} {result.score_cache}")
+        )
     return _text([*lines, *_run_lines(result.run)])
 
 
@@ -91,8 +95,13 @@ def evaluate_text(result: EvaluateResult) -> str:
     return _text([*lines, "", *_run_lines(result.run)])
 
 
-def _view_table(views: Iterable[ViewQuality]) -> list[str]:
-    rows = [("view", "fidelity", "SSIM to ref.", "drop", "PSNR", "of original", "SSIM", "of original")]
+def _view_table(views: Sequence[ViewQuality]) -> list[str]:
+    rows: list[tuple[str, ...]] = [
+        ("view", "fidelity", "SSIM to ref.", "drop", "PSNR", "of original", "SSIM", "of original")
+    ]
+    with_lpips = any(view.lpips_original is not None for view in views)
+    if with_lpips:
+        rows[0] += ("LPIPS to ref.", "LPIPS", "of original")
     for view in views:
         photo = view.photo_error is not None
         rows.append(
@@ -107,6 +116,8 @@ def _view_table(views: Iterable[ViewQuality]) -> list[str]:
                 _similar(view.original_ssim),
             )
         )
+        if with_lpips:
+            rows[-1] += tuple(map(_similar, (view.lpips_original, view.lpips_photo, view.original_lpips)))
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return [
         "  ".join(
@@ -166,25 +177,29 @@ def _view_lines(views: ViewsInfo | None) -> list[str]:
 def _quality_lines(quality: Quality, where: str) -> list[str]:
     lines = []
     if quality.drop is not None:
-        ssim = (
+        similar = (
             ""
             if quality.ssim_photo is None
             else f", SSIM {_similar(quality.original_ssim)} -> {_similar(quality.ssim_photo)}"
         )
+        if quality.lpips_photo is not None:
+            similar += f", LPIPS {_similar(quality.original_lpips)} -> {_similar(quality.lpips_photo)}"
         lines.append(
             _line(
                 "drop",
                 f"{_decibel(quality.drop)} dB against the photos: PSNR {_decibel(quality.original_psnr)} -> "
-                f"{_decibel(quality.psnr)} dB{ssim} (mean, {where})",
+                f"{_decibel(quality.psnr)} dB{similar} (mean, {where})",
             )
         )
     identical = f", {quality.identical} views identical" if quality.identical and quality.fidelity is not None else ""
     unit = "" if quality.fidelity is None else " dB"
-    ssim = "" if quality.ssim_original is None else f", SSIM {_similar(quality.ssim_original)}"
+    similar = "" if quality.ssim_original is None else f", SSIM {_similar(quality.ssim_original)}"
+    if quality.lpips_original is not None:
+        similar += f", LPIPS {_similar(quality.lpips_original)}"
     lines.append(
         _line(
             "fidelity",
-            f"{_decibel(quality.fidelity)}{unit} against the original's renders{identical}{ssim}; modelled drop "
+            f"{_decibel(quality.fidelity)}{unit} against the original's renders{identical}{similar}; modelled drop "
             f"{quality.modelled_drop:.3f} dB from a base of {quality.base_psnr:g} dB (mean, {where})",
         )
     )
