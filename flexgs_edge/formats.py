@@ -34,6 +34,7 @@ from flexgs_edge.scene import (
     register_reader,
     write_ply,
 )
+from flexgs_edge.spz import refine_sh
 
 CONVERTER = "gaussforge"
 OPACITY_LIMIT = 7.0
@@ -57,8 +58,18 @@ class Format:
     sorted : bool
         Rows must come in an order in which neighbours are near each other: each 256 share a range, and the converter does
         not sort (unsorted, positions of the sample were 7 times worse).
+    shuffled : bool
+        The converter sorts rows by itself.
     probed : bool
         The converter may write SH in another order than it reads them (see `_sh_places`).
+    finer_sh : bool
+        SH are written again, with a finer step than the converter's (see `flexgs_edge.spz`).
+    one_degree : bool
+        Bytes fall with the SH degree of the whole scene only: SH that are zero take as much as any.
+    row_bytes : float
+        What a Gaussian of SH degree 3 takes, about (fox and the sample): where searches start.
+    sh_bytes : float
+        SH's part of it.
     """
 
     suffix: str
@@ -66,16 +77,24 @@ class Format:
     reach: float = float("inf")
     max_degree: int = 3
     sorted: bool = False
+    shuffled: bool = False
     probed: bool = False
+    finer_sh: bool = False
+    one_degree: bool = False
+    row_bytes: float = 20.0
+    sh_bytes: float = 5.0
 
 
 FORMATS: dict[str, Format] = {
     format.suffix: format
     for format in (
         # Positions are 24-bit numbers with 12 bits behind the point.
-        Format(".spz", "spz", reach=2.0**11 - 2.0**-12),
-        Format(".sog", "sog"),
-        Format(".compressed.ply", "compressed.ply", sorted=True, probed=True),
+        Format(".spz", "spz", reach=2.0**11 - 2.0**-12, finer_sh=True, row_bytes=22.0, sh_bytes=5.5),
+        Format(".sog", "sog", shuffled=True, row_bytes=39.7, sh_bytes=27.4),
+        # 16 bytes, 45 of SH, and 72 a chunk of 256.
+        Format(
+            ".compressed.ply", "compressed.ply", sorted=True, probed=True, one_degree=True, row_bytes=61.3, sh_bytes=45.0
+        ),
     )
 }
 
@@ -171,11 +190,47 @@ def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: b
         plain, finished = Path(folder) / "scene.ply", Path(folder) / f"scene{format.suffix}"
         if format.probed and source.sh_degree:
             world.sh_places = _sh_places(format, source.sh_degree)
-        write_ply(plain, world.select(_near_order(world)) if format.sorted else world)
+        write_ply(plain, world.select(near_order(world)) if format.sorted else world)
         _convert(path, plain, "ply", finished, format.name)
+        if format.finer_sh and source.sh_degree:
+            coded = finished.rename(Path(folder) / "coded")
+            refine_sh(coded, world, finished)
         os.replace(finished, target)
     far = bool(np.any(source.origin != 0))
     return ("positions rounded to float32: the scene is far from zero",) if far else ()
+
+
+def read_geometry(folder: Path, source: SceneSource, format: Format) -> tuple[SceneSource, np.ndarray]:
+    """What `write_foreign` would make of a scene's geometry, and which row of `source` each of its rows was.
+
+    A file without SH, which takes no clustering; positions, scales, rotations and opacities are the same with SH.
+
+    Parameters
+    ----------
+    folder : Path
+        For the file, which is removed.
+
+    Returns
+    -------
+    tuple
+        A source of SH degree 0 (its colours mean nothing), and [N] i64 rows.
+    """
+    path = folder / f"geometry{format.suffix}"
+    write_foreign(path, _LabelSource(source), force=True)
+    try:
+        found = read_foreign(path)
+        if format.sorted:
+            return found, near_order(_WorldSource(source))
+        if not format.shuffled:
+            return found, np.arange(source.count)
+        colours = found.read(slice(0, found.count), ["sh_dc"])["sh_dc"].astype(np.float64)
+        digits = np.rint(_LabelSource.decode(colours)).astype(np.int64)
+        rows = digits[0] + 256 * digits[1] + 65536 * digits[2]
+        if not np.array_equal(np.sort(rows), np.arange(source.count)):
+            raise InputError(f"this version of {CONVERTER} does not keep colours in {format.suffix}; use --no-refit")
+        return found, rows
+    finally:
+        path.unlink()
 
 
 def _required(path: str | os.PathLike[str]) -> Format:
@@ -198,7 +253,7 @@ def _check_reach(path: str | os.PathLike[str], source: SceneSource, format: Form
             )
 
 
-def _near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
+def near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
     """[N] i64: rows along a Morton curve through the scene's box."""
     means = np.concatenate([source.read(rows, ["means"])["means"] for rows in source.chunks(chunk_rows)], axis=1)
     # By rank along each axis: a few far rows do not squeeze the rest into one cell.
@@ -287,6 +342,35 @@ class _WorldSource(_WrappedSource):
             planes["quats"][...] = normalize_quats(planes["quats"])
         if "means" in planes and np.any(self.parent.origin != 0):
             planes["means"][...] = planes["means"].astype(np.float64) + self.parent.origin[:, None]
+        return planes
+
+
+class _LabelSource(_WrappedSource):
+    """A scene without SH whose colours spell the row's number, in three digits of 256.
+
+    Formats of 8 bits and codebooks of 256 entries keep them (`.sog`: within .03 of a digit).
+    """
+
+    def __init__(self, parent: SceneSource) -> None:
+        super().__init__(parent, parent.name, parent.origin)
+        if parent.count > 2**24:
+            raise InputError(f"{parent.name}: more than 2^24 Gaussians; use --no-refit for this format")
+        self.sh_degree = self.sh_count = 0
+
+    @staticmethod
+    def decode(colours: np.ndarray) -> np.ndarray:
+        """Digits from colour coefficients: the range of 8-bit formats, 0 to 1 of (.15 c + .5)."""
+        return (colours * 0.15 + 0.5) * 255
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`."""
+        rows, planes = self.begin_read(rows, fields, out)
+        inner = [name for name in fields if name not in ("sh_dc", "sh_rest")]
+        self.parent.read(rows, inner, planes)
+        if "sh_dc" in planes:
+            ids = np.arange(self.count)[rows]
+            digits = np.stack([ids % 256, ids // 256 % 256, ids // 65536])
+            planes["sh_dc"][...] = (digits / 255 - 0.5) / 0.15
         return planes
 
 
