@@ -41,6 +41,10 @@ OPACITY_LIMIT = 7.0
 """Logits of opacity 0 and 1, which 8-bit formats store and no logit reaches: half of a 8-bit step from either end is 6.2."""
 
 
+CONVERTER_MEMORY = 20 * 2**20
+"""Bytes of the converter's process before it has read anything."""
+
+
 @dataclass(frozen=True)
 class Format:
     """A format of the converter.
@@ -70,6 +74,8 @@ class Format:
         What a Gaussian of SH degree 3 takes, about (fox and the sample): where searches start.
     sh_bytes : float
         SH's part of it.
+    memory : int
+        Bytes a Gaussian that the converter holds at most (measured on fox and the sample).
     """
 
     suffix: str
@@ -83,6 +89,7 @@ class Format:
     one_degree: bool = False
     row_bytes: float = 20.0
     sh_bytes: float = 5.0
+    memory: int = 1024
 
 
 FORMATS: dict[str, Format] = {
@@ -90,10 +97,16 @@ FORMATS: dict[str, Format] = {
     for format in (
         # Positions are 24-bit numbers with 12 bits behind the point.
         Format(".spz", "spz", reach=2.0**11 - 2.0**-12, finer_sh=True, row_bytes=22.0, sh_bytes=5.5),
-        Format(".sog", "sog", shuffled=True, row_bytes=39.7, sh_bytes=27.4),
+        Format(".sog", "sog", shuffled=True, row_bytes=39.7, sh_bytes=27.4, memory=2048),
         # 16 bytes, 45 of SH, and 72 a chunk of 256.
         Format(
-            ".compressed.ply", "compressed.ply", sorted=True, probed=True, one_degree=True, row_bytes=61.3, sh_bytes=45.0
+            ".compressed.ply",
+            "compressed.ply",
+            sorted=True,
+            probed=True,
+            one_degree=True,
+            row_bytes=61.3,
+            sh_bytes=45.0,
         ),
     )
 }
@@ -121,6 +134,11 @@ def format_of(path: str | os.PathLike[str]) -> Format | None:
     """The format that a file name asks for, or None."""
     name = Path(path).name.lower()
     return next((format for suffix, format in FORMATS.items() if name.endswith(suffix)), None)
+
+
+def converter_bytes(format: Format, count: int) -> int:
+    """Memory that the converter's process needs for `count` Gaussians."""
+    return CONVERTER_MEMORY + format.memory * count
 
 
 def check_converter(path: str | os.PathLike[str]) -> None:

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from flexgs_edge.adapt import Measurement, Target
+from flexgs_edge.adapt.line import CLOSE, next_point
 from flexgs_edge.best.choice import BitModel, choose, drop_bands
 from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
 from flexgs_edge.best.steps import Slopes, choose_steps, holdable, probe_slopes
@@ -21,6 +24,10 @@ from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps, from_grid, recolour, to_grid
 from flexgs_edge.refit import refit_colours
+from flexgs_edge.score.removal import RemovalCosts
+
+Product = TypeVar("Product")
+"""What a step makes: a grid, or a finished file."""
 
 PRUNED_PART = 0.45
 """Part of the allowed loss that pruning alone has used up when a whole result meets the target (fox .45, the sample .55): where
@@ -32,14 +39,8 @@ SIZE_SLOPE = -0.45
 FINE_COLOUR = 2.0**-8
 """Colour steps before the refit, as a share of the final ones: only geometry shall move."""
 MOST_ROUNDS = 24
-CLOSE = 0.03
-"""Excess (log of loss over limit) that counts as close enough below the target: about 1.5 % of the bytes."""
 EXTRA_STEPS = 3
 """Steps beyond the effort's own while nothing close to the target holds."""
-AIM = -0.01
-"""Excess that steps aim at."""
-NEAREST = 0.1
-"""A new step keeps this share of the interval between its neighbours away from both: curves are not quite smooth."""
 LARGEST_STRIDE = 1.2
 """Largest change of the log of the multiplier between two steps."""
 
@@ -106,67 +107,88 @@ class RateStep:
 
 
 @dataclass(frozen=True)
-class RateResult:
-    """The answer of a search: the grid to write and the way to it."""
+class RateResult(Generic[Product]):
+    """The answer of a search: what to write and the way to it."""
 
-    grid: GridScene
+    product: Product
     chosen: RateStep
     reached: bool
     steps: tuple[RateStep, ...]
 
 
-class RateSearch:
+class MultiplierSearch(ABC, Generic[Product]):
     """Searches the multiplier whose whole result meets a target with the fewest bytes.
 
     Parameters
     ----------
     path : PrunePath
-    size_of : callable
-        Exact bytes of a grid's file, and the coder's bit model.
     measure : callable
-        Quality of a grid's decoded planes.
+        Quality of planes without quantization, where the search starts.
+    effort : Effort
+    keep_unseen : bool
+        Keep Gaussians that no pose sees.
+    on_step : callable, optional
+        Called after each step.
     """
 
     def __init__(
         self,
         path: PrunePath,
-        size_of: Callable[[GridScene], tuple[int, BitModel]],
         measure: Callable[[dict[str, np.ndarray]], Measurement],
         effort: Effort,
         keep_unseen: bool = True,
-        refit: bool = True,
         on_step: Callable[[RateStep], None] | None = None,
     ) -> None:
-        self.path, self.size_of, self.measure = path, size_of, measure
-        self.effort, self.keep_unseen, self.refit, self.on_step = effort, keep_unseen, refit, on_step
+        self.path, self.measure, self.effort = path, measure, effort
+        self.keep_unseen, self.on_step = keep_unseen, on_step
         self.bits = BitModel()
-        self._slopes: dict[int, Slopes] = {}
 
-    def run(self, target: Target, best_effort: bool = False) -> RateResult:
+    @abstractmethod
+    def _calibrate(self, multiplier: float) -> None:
+        """Ask what Gaussians cost near the answer. Once: or every step would search another function."""
+
+    @abstractmethod
+    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, Product]:
+        """The whole result at a multiplier, measured."""
+
+    def discard(self, product: Product) -> None:
+        """Let go of what is not the best any more."""
+        return
+
+    def choose(self, costs: RemovalCosts, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
+        """Which rows to keep ([n] bool), and their SH degrees."""
+        return choose(costs, self.bits, multiplier, self.keep_unseen)
+
+    def run(self, target: Target, best_effort: bool = False) -> RateResult[Product]:
         """Search; raises `TargetError` with the closest point when nothing holds and `best_effort` is not set."""
         steps: list[RateStep] = []
-        best: tuple[RateStep, GridScene] | None = None
+        best: tuple[RateStep, Product] | None = None
         multiplier = self._start(target)
         self._calibrate(multiplier)
         for count in range(self.effort.steps + EXTRA_STEPS):
-            step, grid = self._whole(multiplier, target)
+            step, product = self._whole(multiplier, target)
             steps.append(step)
             if self.on_step:
                 self.on_step(step)
-            if best is None or _better(step, best[0], target):
-                best = (step, grid)
+            if best is None:
+                best = (step, product)
+            elif _better(step, best[0], target):
+                self.discard(best[1])
+                best = (step, product)
+            else:
+                self.discard(product)
             enough = best[0].holds and best[0].excess > -CLOSE
             if (count + 1 >= self.effort.steps and enough) or step.multiplier < 1e-30:
                 break
             multiplier = _next_multiplier(steps, target)
         assert best is not None
-        chosen, grid = best
+        chosen, product = best
         if not chosen.holds and not best_effort:
             raise TargetError(
                 f"{target.describe()} is out of reach; the closest point has {target.report(chosen.size, chosen.measurement)}"
                 " (--best-effort writes it)"
             )
-        return RateResult(grid, chosen, chosen.holds, tuple(steps))
+        return RateResult(product, chosen, chosen.holds, tuple(steps))
 
     def _start(self, target: Target) -> float:
         """Walk down until pruning alone has used up its part of the target; the multiplier at that cut."""
@@ -198,10 +220,45 @@ class RateSearch:
             if index == len(self.path.snapshots):
                 self.path.descend(self.effort.keep)
             snapshot = self.path.snapshots[index]
-            keep, degrees = choose(snapshot.costs, self.bits, multiplier, self.keep_unseen)
+            keep, degrees = self.choose(snapshot.costs, multiplier)
             if keep.mean() >= self.effort.keep or snapshot.count < 16:
                 break
         return index, keep, degrees
+
+    def kept(self, multiplier: float) -> tuple[int, dict[str, np.ndarray], np.ndarray, np.ndarray]:
+        """What a multiplier keeps: the snapshot asked, planes with SH dropped, SH degrees ([n] u8), and squared weights."""
+        index, keep, degrees = self._snapshot(multiplier)
+        snapshot = self.path.snapshots[index]
+        rows = np.flatnonzero(keep)
+        planes = drop_bands(take_rows(snapshot.planes, rows), degrees[rows], snapshot.costs.sh_mean[:, :, rows], SH_C0)
+        return index, planes, degrees[rows], snapshot.costs.weight2[rows]
+
+
+class RateSearch(MultiplierSearch[GridScene]):
+    """The search for the grid that is coded in container version 2.
+
+    Parameters
+    ----------
+    path : PrunePath
+    size_of : callable
+        Exact bytes of a grid's file, and the coder's bit model.
+    measure : callable
+        Quality of a grid's decoded planes.
+    """
+
+    def __init__(
+        self,
+        path: PrunePath,
+        size_of: Callable[[GridScene], tuple[int, BitModel]],
+        measure: Callable[[dict[str, np.ndarray]], Measurement],
+        effort: Effort,
+        keep_unseen: bool = True,
+        refit: bool = True,
+        on_step: Callable[[RateStep], None] | None = None,
+    ) -> None:
+        super().__init__(path, measure, effort, keep_unseen, on_step)
+        self.size_of, self.refit = size_of, refit
+        self._slopes: dict[int, Slopes] = {}
 
     def _calibrate(self, multiplier: float) -> None:
         """Ask the coder what Gaussians cost near the answer. Once: or every step would search another function."""
@@ -210,11 +267,8 @@ class RateSearch:
 
     def _choice(self, multiplier: float) -> tuple[dict[str, np.ndarray], np.ndarray, Steps]:
         """Planes of the Gaussians that this multiplier keeps, their SH degrees, and the grid steps."""
-        index, keep, degrees = self._snapshot(multiplier)
+        index, planes, degrees, weight2 = self.kept(multiplier)
         snapshot = self.path.snapshots[index]
-        rows = np.flatnonzero(keep)
-        degrees, weight2 = degrees[rows], snapshot.costs.weight2[rows]
-        planes = drop_bands(take_rows(snapshot.planes, rows), degrees, snapshot.costs.sh_mean[:, :, rows], SH_C0)
         if index not in self._slopes:
             self._slopes[index] = probe_slopes(self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras)
         steps = choose_steps(self._slopes[index], weight2, degrees, len(snapshot.costs.sh), multiplier)
@@ -270,23 +324,6 @@ def _better(step: RateStep, other: RateStep, target: Target) -> bool:
 
 
 def _next_multiplier(steps: Sequence[RateStep], target: Target) -> float:
-    """Where the excess is expected to be just below zero: false position in the logs, kept away from points already asked."""
+    """Where the excess is expected to be just below zero, in the log of the multiplier."""
     slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
-    points = sorted((math.log(s.multiplier), s.excess) for s in steps)
-    if slope < 0:
-        points.reverse()
-    # In the order of rising excess: the last point that holds before the first one that misses.
-    first_miss = next((i for i, (_, excess) in enumerate(points) if excess > 0), len(points))
-    if 0 < first_miss < len(points):
-        (low, below), (high, above) = points[first_miss - 1], points[first_miss]
-        part = (AIM - below) / (above - below)
-        return math.exp(low + (high - low) * min(max(part, NEAREST), 1 - NEAREST))
-    edge, excess = points[-1] if first_miss else points[0]
-    most = LARGEST_STRIDE
-    if len(points) > 1:
-        # The slope between the two points nearest to the target, kept within reason.
-        (low, below), (high, above) = points[-2:] if first_miss else points[:2]
-        measured = (above - below) / (high - low) if high != low else slope
-        slope *= min(max(measured / slope, 0.2), 3.0)
-        most = 2 * LARGEST_STRIDE
-    return math.exp(edge + max(-most, min(most, (AIM - excess) / slope)))
+    return math.exp(next_point([(math.log(s.multiplier), s.excess) for s in steps], slope, LARGEST_STRIDE))

@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from flexgs_edge.adapt import Measurement, SearchResult, Step, Target
 from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.path import PrunePath
-from flexgs_edge.best.search import EFFORTS, RateResult, RateSearch, RateStep
+from flexgs_edge.best.search import EFFORTS, MultiplierSearch, Product, RateResult, RateSearch, RateStep
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
 from flexgs_edge.codec.container2 import coded_size
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.grid import GridScene
+from flexgs_edge.pipeline.foreign import FileMaker, WrittenFile
+from flexgs_edge.pipeline.foreign_best import FileSearch
 from flexgs_edge.pipeline.judge import Judge, measurement_of
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.workspace import Stopwatch
@@ -36,7 +39,27 @@ SETTINGS_MOST = 1536
 """Bytes that the settings in the header take at most: the search counts them before they are known."""
 
 
+Measure = Callable[[dict[str, np.ndarray]], Measurement]
+Report = Callable[[RateStep], None]
+SearchMaker = Callable[[PrunePath, Measure, Report], MultiplierSearch[Product]]
+
+
+def grid_search(options: CompressOptions) -> SearchMaker[GridScene]:
+    """Searches for the grid of a `.fgs`."""
+    plan, keep_unseen = EFFORTS[options.effort], options.unseen == "keep"
+    return lambda path, measure, report: RateSearch(
+        path, size_and_bits, measure, plan, keep_unseen, options.refit, report
+    )
+
+
+def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[WrittenFile]:
+    """Searches for a file of another program's format."""
+    plan, keep_unseen = EFFORTS[options.effort], options.unseen == "keep"
+    return lambda path, measure, report: FileSearch(path, files, measure, plan, keep_unseen, options.refit, report)
+
+
 def search_best(
+    make: SearchMaker[Product],
     renderer: Renderer,
     source: SceneSource,
     cameras: list[Camera],
@@ -47,11 +70,13 @@ def search_best(
     clock: Stopwatch,
     on_step: Callable[[Step], None] | None = None,
     progress: Progress = SILENT,
-) -> tuple[GridScene, SearchResult]:
-    """The grid to write, and the steps that led to it.
+) -> tuple[Product, SearchResult]:
+    """What to write, and the steps that led to it.
 
     Parameters
     ----------
+    make : callable
+        `grid_search` or `file_search`.
     source : SceneSource
         A checked scene; held in memory as a whole.
     cameras : list of Camera
@@ -87,9 +112,8 @@ def search_best(
                     if on_step:
                         on_step(as_step(step, source.count))
 
-                search = RateSearch(path, size_and_bits, measure, plan, options.unseen == "keep", options.refit, report)
-                found = search.run(target, options.best_effort)
-        return found.grid, _as_search(found, source.count)
+                found = make(path, measure, report).run(target, options.best_effort)
+        return found.product, _as_search(found, source.count)
     finally:
         budget.give(size)
 
@@ -132,6 +156,6 @@ def as_step(step: RateStep, count: int) -> Step:
     )
 
 
-def _as_search(found: RateResult, count: int) -> SearchResult:
+def _as_search(found: RateResult[Any], count: int) -> SearchResult:
     steps = tuple(as_step(step, count) for step in found.steps)
     return SearchResult(steps[found.steps.index(found.chosen)], found.reached, steps)
