@@ -77,6 +77,7 @@ def search_line(
         Points of this line measured before.
     """
     by_size = target.limit_bytes is not None
+    gentler = 1 if by_size else -1  # in thousandths, towards points that hold
     found = {step.choice.prune: step for step in known}
     rate = start
     for count in range(steps):
@@ -89,6 +90,8 @@ def search_line(
                 # The last chance: the gentlest point of a quality, the smallest file of a size.
                 rate = MAX_PRUNE if by_size else 0
         rate = max(0, min(MAX_PRUNE, rate))
+        if rate in found and not found[rate].holds:
+            rate = max(0, min(MAX_PRUNE, rate + gentler))
         if rate in found:
             break
         found[rate] = measure(rate)
@@ -112,4 +115,5 @@ def _position(prune: int, by_size: bool) -> float:
 
 
 def _rate(position: float, by_size: bool) -> int:
-    return round(1000 * (1 - math.exp(-max(position, 0.0)))) if by_size else round(1000 * position)
+    """Rounded towards points that hold."""
+    return math.ceil(1000 * (1 - math.exp(-max(position, 0.0)))) if by_size else math.floor(1000 * position)

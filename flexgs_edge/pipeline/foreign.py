@@ -215,6 +215,7 @@ class _PrunedFiles:
         keeps_sh = np.zeros(self.source.count, bool)
         keeps_sh[with_sh] = True
         rows = np.sort(np.concatenate([with_sh, without]))
+        # Along a curve bytes repeat: 4 to 7 % of .spz.
         rows = rows[near_order(self.source.select(rows))]
         file = self.files.make(TrimmedSource(self.source.select(rows), keeps_sh[rows], degree if with_sh.size else 0))
         excess = 0.0 if self.target is None else self.target.excess(file.size, file.measurement)
