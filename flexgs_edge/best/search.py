@@ -142,6 +142,8 @@ class MultiplierSearch(ABC, Generic[Product]):
         self.path, self.measure, self.effort = path, measure, effort
         self.keep_unseen, self.on_step = keep_unseen, on_step
         self.bits = BitModel()
+        self.settled = 0.0
+        """Excess below the target that ends the search whatever the effort; 0: all steps are taken."""
 
     @abstractmethod
     def _calibrate(self, multiplier: float) -> None:
@@ -178,7 +180,8 @@ class MultiplierSearch(ABC, Generic[Product]):
             else:
                 self.discard(product)
             enough = best[0].holds and best[0].excess > -CLOSE
-            if (count + 1 >= self.effort.steps and enough) or step.multiplier < 1e-30:
+            settled = best[0].holds and best[0].excess > -self.settled
+            if (count + 1 >= self.effort.steps and enough) or settled or step.multiplier < 1e-30:
                 break
             multiplier = _next_multiplier(steps, target)
         assert best is not None

@@ -55,7 +55,7 @@ class WrittenFile:
     size : int
         Bytes.
     count, sh_count : int
-        Gaussians, and of these with SH that are not zero.
+        Gaussians, and of these with SH as they went in (codebooks of `.sog` have no exact zero).
     sh_degree : int
     measurement : Measurement or None
         Quality of the decoded file (`None` without views).
@@ -122,7 +122,7 @@ class FileMaker:
         if self._renderer is not None and self._judge is not None:
             with self._renderer.load(found) as scene:
                 measurement = measurement_of(self._judge.compare(scene))
-        sh_count = int(np.count_nonzero(nonzero_sh(found)))
+        sh_count = int(np.count_nonzero(nonzero_sh(source))) if found.sh_degree else 0
         return WrittenFile(path, path.stat().st_size, found.count, sh_count, found.sh_degree, measurement)
 
     def write(self, source: SceneSource) -> tuple[Path, SceneSource]:

@@ -18,6 +18,9 @@ from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.score.removal import RemovalCosts
 
+SETTLED = 0.01
+"""Excess below the target that is close enough: steps that write files are dear, and this is half a percent of the bytes."""
+
 
 class FileSearch(MultiplierSearch[WrittenFile]):
     """The search for a file; see `MultiplierSearch`.
@@ -41,7 +44,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         on_step: Callable[[RateStep], None] | None = None,
     ) -> None:
         super().__init__(path, measure, effort, keep_unseen, on_step)
-        self.files, self.refit = files, refit
+        self.files, self.refit, self.settled = files, refit, SETTLED
         self.bits = bit_model(files.format, len(path.snapshots[0].costs.sh))
 
     def choose(self, costs: RemovalCosts, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
