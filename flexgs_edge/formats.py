@@ -218,37 +218,11 @@ def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: b
     return ("positions rounded to float32: the scene is far from zero",) if far else ()
 
 
-def read_geometry(folder: Path, source: SceneSource, format: Format) -> tuple[SceneSource, np.ndarray]:
-    """What `write_foreign` would make of a scene's geometry, and which row of `source` each of its rows was.
-
-    A file without SH, which takes no clustering; positions, scales, rotations and opacities are the same with SH.
-
-    Parameters
-    ----------
-    folder : Path
-        For the file, which is removed.
-
-    Returns
-    -------
-    tuple
-        A source of SH degree 0 (its colours mean nothing), and [N] i64 rows.
-    """
-    path = folder / f"geometry{format.suffix}"
-    write_foreign(path, _LabelSource(source), force=True)
-    try:
-        found = read_foreign(path)
-        if format.sorted:
-            return found, near_order(_WorldSource(source))
-        if not format.shuffled:
-            return found, np.arange(source.count)
-        colours = found.read(slice(0, found.count), ["sh_dc"])["sh_dc"].astype(np.float64)
-        digits = np.rint(_LabelSource.decode(colours)).astype(np.int64)
-        rows = digits[0] + 256 * digits[1] + 65536 * digits[2]
-        if not np.array_equal(np.sort(rows), np.arange(source.count)):
-            raise InputError(f"this version of {CONVERTER} does not keep colours in {format.suffix}; use --no-refit")
-        return found, rows
-    finally:
-        path.unlink()
+def written_order(source: SceneSource, format: Format) -> np.ndarray | None:
+    """[N] i64: the rows of `source` in the order of the file that `write_foreign` makes; None where the converter sorts."""
+    if format.shuffled:
+        return None
+    return near_order(_WorldSource(source)) if format.sorted else np.arange(source.count)
 
 
 def _required(path: str | os.PathLike[str]) -> Format:
@@ -360,35 +334,6 @@ class _WorldSource(_WrappedSource):
             planes["quats"][...] = normalize_quats(planes["quats"])
         if "means" in planes and np.any(self.parent.origin != 0):
             planes["means"][...] = planes["means"].astype(np.float64) + self.parent.origin[:, None]
-        return planes
-
-
-class _LabelSource(_WrappedSource):
-    """A scene without SH whose colours spell the row's number, in three digits of 256.
-
-    Formats of 8 bits and codebooks of 256 entries keep them (`.sog`: within .03 of a digit).
-    """
-
-    def __init__(self, parent: SceneSource) -> None:
-        super().__init__(parent, parent.name, parent.origin)
-        if parent.count > 2**24:
-            raise InputError(f"{parent.name}: more than 2^24 Gaussians; use --no-refit for this format")
-        self.sh_degree = self.sh_count = 0
-
-    @staticmethod
-    def decode(colours: np.ndarray) -> np.ndarray:
-        """Digits from colour coefficients: the range of 8-bit formats, 0 to 1 of (.15 c + .5)."""
-        return (colours * 0.15 + 0.5) * 255
-
-    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`."""
-        rows, planes = self.begin_read(rows, fields, out)
-        inner = [name for name in fields if name not in ("sh_dc", "sh_rest")]
-        self.parent.read(rows, inner, planes)
-        if "sh_dc" in planes:
-            ids = np.arange(self.count)[rows]
-            digits = np.stack([ids % 256, ids // 256 % 256, ids // 65536])
-            planes["sh_dc"][...] = (digits / 255 - 0.5) / 0.15
         return planes
 
 

@@ -14,11 +14,12 @@ import pytest
 from flexgs_edge import cli, formats
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.errors import BudgetError, InputError, TargetError
-from flexgs_edge.formats import FORMATS, near_order, read_foreign, read_geometry, write_foreign
+from flexgs_edge.formats import FORMATS, near_order, read_foreign, write_foreign
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.decompress import decompress
 from flexgs_edge.pipeline.evaluate import evaluate
 from flexgs_edge.pipeline.foreign import TrimmedSource
+from flexgs_edge.pipeline.geometry import read_geometry
 from flexgs_edge.pipeline.info import info
 from flexgs_edge.report.result import CompressResult
 from flexgs_edge.report.summary import compress_text

@@ -18,7 +18,7 @@ from flexgs_edge.cameras import Camera
 from flexgs_edge.codec.container2 import coded_size
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.grid import GridScene
-from flexgs_edge.pipeline.foreign import FileMaker, WrittenFile
+from flexgs_edge.pipeline.foreign import FileMaker, WrittenFile, search_pruned_files
 from flexgs_edge.pipeline.foreign_best import FileSearch
 from flexgs_edge.pipeline.judge import Judge, measurement_of
 from flexgs_edge.pipeline.options import CompressOptions
@@ -116,6 +116,31 @@ def search_best(
         return found.product, _as_search(found, source.count)
     finally:
         budget.give(size)
+
+
+def search_files(
+    files: FileMaker,
+    order: np.ndarray | None,
+    renderer: Renderer | None,
+    source: SceneSource,
+    cameras: list[Camera],
+    judge: Judge | None,
+    target: Target | None,
+    options: CompressOptions,
+    budget: MemoryBudget,
+    clock: Stopwatch,
+    on_step: Callable[[Step], None] | None = None,
+    progress: Progress = SILENT,
+) -> tuple[WrittenFile, SearchResult]:
+    """A file of another program's format: in rank order ([N] i64, least important row first), or by measured costs (None)."""
+    if order is not None:
+        with clock.stage("search"):
+            return search_pruned_files(files, source, order, target, options, on_step)
+    assert renderer is not None and judge is not None and target is not None
+    make = file_search(options, files)
+    return search_best(
+        make, renderer, source, cameras, judge, target, options, budget, clock, on_step=on_step, progress=progress
+    )
 
 
 def alive(logits: np.ndarray) -> np.ndarray:

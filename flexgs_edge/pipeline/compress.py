@@ -21,9 +21,9 @@ from flexgs_edge.codec.container import write_container
 from flexgs_edge.errors import InputError
 from flexgs_edge.formats import FORMATS, Format, read_foreign
 from flexgs_edge.grid import GridScene, from_grid
-from flexgs_edge.pipeline.best import file_search, grid_search, search_best
+from flexgs_edge.pipeline.best import grid_search, search_best, search_files
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
-from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish, search_pruned_files
+from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
 from flexgs_edge.pipeline.inputs import Scene, Views, companions_of, find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import CompressOptions
@@ -215,25 +215,14 @@ class _Job:
         """The job for another program's format, in rank order or (`order` None) by measured costs: see `pipeline.foreign`."""
         options, plan = self.options, self.plan
         renderer = self.workspace.renderer if self.workspace else None
-
-        def on_step(step: Step) -> None:
-            LOG.info("%s", _step_words(step, plan.target))
-
         with open_files(format, output, options.force, self.budget, renderer, decide) as files:
             if plan.target is not None:
                 LOG.info("searching for %s", plan.target.describe())
-            if order is not None:
-                with self.clock.stage("search"):
-                    file, search = search_pruned_files(files, self.source, order, plan.target, options, on_step)
-            else:
-                assert (
-                    renderer is not None and self.views is not None and decide is not None and plan.target is not None
-                )
-                cameras = self.views.of(self.views.train)
-                file, search = search_best(
-                    file_search(options, files), renderer, self.source, cameras, decide, plan.target, options,
-                    self.budget, self.clock, on_step=on_step, progress=self.progress,
-                )  # fmt: skip
+            file, search = search_files(
+                files, order, renderer, self.source, self.views.of(self.views.train) if self.views else [], decide,
+                plan.target, options, self.budget, self.clock,
+                on_step=lambda step: LOG.info("%s", _step_words(step, plan.target)), progress=self.progress,
+            )  # fmt: skip
             if decide is not None and decide is not report:
                 decide.close()
             quality = None if report is None else self._measure_source(read_foreign(file.path), report)

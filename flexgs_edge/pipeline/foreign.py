@@ -29,9 +29,9 @@ from flexgs_edge.formats import (
     format_of,
     near_order,
     read_foreign,
-    read_geometry,
     write_foreign,
 )
+from flexgs_edge.pipeline.geometry import read_geometry
 from flexgs_edge.pipeline.judge import Judge, measurement_of
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.prune import Choice, nonzero_sh, ranks_from_order, select_rows
@@ -134,7 +134,7 @@ class FileMaker:
             return path, read_foreign(path)
 
     def geometry(self, source: SceneSource) -> tuple[SceneSource, np.ndarray]:
-        """See `flexgs_edge.formats.read_geometry`."""
+        """See `flexgs_edge.pipeline.geometry.read_geometry`."""
         with self._converting(source.count):
             return read_geometry(self.folder, source, self.format)
 
