@@ -84,7 +84,7 @@ def search_line(
         if found:
             if any(-CLOSE < step.excess <= 0 for step in found.values()):
                 break
-            points = [(_position(prune, by_size), step.excess) for prune, step in found.items()]
+            points = [(_position(prune, by_size), excess) for prune, excess in _weighed(list(found.values()))]
             rate = _rate(next_point(points, -1.0 if by_size else SLOPE, 1.2 if by_size else 0.3), by_size)
             if count == steps - 1 and not any(step.holds for step in found.values()):
                 # The last chance: the gentlest point of a quality, the smallest file of a size.
@@ -96,6 +96,17 @@ def search_line(
             break
         found[rate] = measure(rate)
     return list(found.values())
+
+
+def _weighed(steps: list[Step]) -> list[tuple[int, float]]:
+    """(rate, excess) of the steps; after points on one side only, those of the other count half for each (Illinois rule).
+
+    The log of a loss is curved: plain false position creeps towards the target from one side.
+    """
+    side = steps[-1].holds
+    streak = next((i for i, step in enumerate(reversed(steps)) if step.holds != side), len(steps))
+    far = 0.5 ** (streak - 1)
+    return [(step.choice.prune, step.excess * (1.0 if step.holds == side else far)) for step in steps]
 
 
 def better(step: Step, other: Step, target: Target) -> bool:

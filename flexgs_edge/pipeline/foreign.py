@@ -6,6 +6,7 @@ searched over; the best so far lies beside the output and takes its name at the 
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import tempfile
@@ -37,6 +38,8 @@ from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.prune import Choice, nonzero_sh, ranks_from_order, select_rows
 from flexgs_edge.render import Renderer
 from flexgs_edge.scene import Planes, Rows, SceneSource, check_writable, sh_rest_count
+
+LOG = logging.getLogger("flexgs_edge")
 
 SH_A_PRUNE = {".spz": 0.5, ".sog": 1.5}
 """SH rate for each unit of the prune rate, by the bytes that SH take (5.5 of 22, and 27 of 40): loss rises 2 to 3 times as fast
@@ -246,9 +249,11 @@ class _PrunedFiles:
         top = self.source.sh_degree
         if self.target.limit_bytes is not None:
             for degree in range(top + 1):
+                LOG.info("SH up to degree %d:", degree)
                 self.line(degree, steps)
             return
         for degree in range(top + 1):
+            LOG.info("SH up to degree %d:", degree)
             whole = self.measure(self.choice(0, degree), degree)
             if whole.holds:
                 self.line(degree, steps, [whole])
@@ -256,6 +261,7 @@ class _PrunedFiles:
         # A degree more takes more bytes a row: it can only win if it holds at the prune rate of equal bytes.
         for more in range(degree + 1, top + 1):
             assert self.best is not None
+            LOG.info("SH up to degree %d:", more)
             prune = self.rate_for(self.best[0].size, more)
             step = self.measure(self.choice(prune, more), more)
             if not step.holds:
