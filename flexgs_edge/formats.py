@@ -35,10 +35,15 @@ from flexgs_edge.scene import (
     register_reader,
     write_ply,
 )
+from flexgs_edge.spz import refine_sh
 
 CONVERTER = "gaussforge"
 OPACITY_LIMIT = 7.0
 """Logits of opacity 0 and 1, which 8-bit formats store and no logit reaches: half of a 8-bit step from either end is 6.2."""
+
+
+CONVERTER_MEMORY = 20 * 2**20
+"""Bytes of the converter's process before it has read anything."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +63,20 @@ class Format:
     sorted : bool
         Rows must come in an order in which neighbours are near each other: each 256 share a range, and the converter does
         not sort (unsorted, positions of the sample were 7 times worse).
+    shuffled : bool
+        The converter sorts rows by itself.
     probed : bool
         The converter may write SH in another order than it reads them (see `_sh_places`).
+    finer_sh : bool
+        SH are written again, with a finer step than the converter's (see `flexgs_edge.spz`).
+    one_degree : bool
+        Bytes fall with the SH degree of the whole scene only: SH that are zero take as much as any.
+    row_bytes : float
+        What a Gaussian of SH degree 3 takes, about (fox and the sample): where searches start.
+    sh_bytes : float
+        SH's part of it.
+    memory : int
+        Bytes a Gaussian that the converter holds at most (measured on fox and the sample).
     """
 
     suffix: str
@@ -67,16 +84,31 @@ class Format:
     reach: float = float("inf")
     max_degree: int = 3
     sorted: bool = False
+    shuffled: bool = False
     probed: bool = False
+    finer_sh: bool = False
+    one_degree: bool = False
+    row_bytes: float = 20.0
+    sh_bytes: float = 5.0
+    memory: int = 1024
 
 
 FORMATS: dict[str, Format] = {
     format.suffix: format
     for format in (
         # Positions are 24-bit numbers with 12 bits behind the point.
-        Format(".spz", "spz", reach=2.0**11 - 2.0**-12),
-        Format(".sog", "sog"),
-        Format(".compressed.ply", "compressed.ply", sorted=True, probed=True),
+        Format(".spz", "spz", reach=2.0**11 - 2.0**-12, finer_sh=True, row_bytes=22.0, sh_bytes=5.5),
+        Format(".sog", "sog", shuffled=True, row_bytes=39.7, sh_bytes=27.4, memory=2048),
+        # 16 bytes, 45 of SH, and 72 a chunk of 256.
+        Format(
+            ".compressed.ply",
+            "compressed.ply",
+            sorted=True,
+            probed=True,
+            one_degree=True,
+            row_bytes=61.3,
+            sh_bytes=45.0,
+        ),
     )
 }
 
@@ -103,6 +135,11 @@ def format_of(path: str | os.PathLike[str]) -> Format | None:
     """The format that a file name asks for, or None."""
     name = Path(path).name.lower()
     return next((format for suffix, format in FORMATS.items() if name.endswith(suffix)), None)
+
+
+def converter_bytes(format: Format, count: int) -> int:
+    """Memory that the converter's process needs for `count` Gaussians."""
+    return CONVERTER_MEMORY + format.memory * count
 
 
 def check_converter(path: str | os.PathLike[str]) -> None:
@@ -172,11 +209,21 @@ def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: b
         plain, finished = Path(folder) / "scene.ply", Path(folder) / f"scene{format.suffix}"
         if format.probed and source.sh_degree:
             world.sh_places = _sh_places(format, source.sh_degree)
-        write_ply(plain, world.select(_near_order(world)) if format.sorted else world)
+        write_ply(plain, world.select(near_order(world)) if format.sorted else world)
         _convert(path, plain, "ply", finished, format.name)
+        if format.finer_sh and source.sh_degree:
+            coded = finished.rename(Path(folder) / "coded")
+            refine_sh(coded, world, finished)
         os.replace(finished, target)
     far = bool(np.any(source.origin != 0))
     return ("positions rounded to float32: the scene is far from zero",) if far else ()
+
+
+def written_order(source: SceneSource, format: Format) -> np.ndarray | None:
+    """[N] i64: the rows of `source` in the order of the file that `write_foreign` makes; None where the converter sorts."""
+    if format.shuffled:
+        return None
+    return near_order(_WorldSource(source)) if format.sorted else np.arange(source.count)
 
 
 def _required(path: str | os.PathLike[str]) -> Format:
@@ -199,7 +246,7 @@ def _check_reach(path: str | os.PathLike[str], source: SceneSource, format: Form
             )
 
 
-def _near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
+def near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
     """[N] i64: rows along a Morton curve through the scene's box."""
     means = np.concatenate([source.read(rows, ["means"])["means"] for rows in source.chunks(chunk_rows)], axis=1)
     # By rank along each axis: a few far rows do not squeeze the rest into one cell.

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexgs_edge.best.choice import REMOVAL_FACTOR, SH_FACTOR, BitModel, choose, drop_bands
+from flexgs_edge.best.choice import REMOVAL_FACTOR, SH_FACTOR, BitModel, choose, choose_one_degree, drop_bands
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.score.removal import RemovalCosts
 
@@ -133,3 +133,30 @@ def test_nothing_to_drop() -> None:
     assert drop_bands(planes_of(0, 2), np.zeros(0, np.uint8), np.zeros((2, 3, 0), np.float32), SH_C0)[
         "sh_dc"
     ].shape == (3, 0)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-3, 1e3))
+def test_one_degree_for_all_is_the_cheapest_of_its_kind(seed: int, multiplier: float) -> None:
+    rng = np.random.default_rng(seed)
+    sh = np.sort(rng.uniform(0, 100, (3, 12)), axis=0)[::-1]
+    costs = costs_of(rng.uniform(0, 200, 12).tolist(), sh.tolist())
+    keep, degrees = choose_one_degree(costs, BITS, multiplier)
+    assert len(set(degrees.tolist())) == 1
+
+    def total(kept: np.ndarray, degree: int) -> float:
+        lost = SH_FACTOR * costs.sh[degree][kept].sum() if degree < 3 else 0.0
+        bits = multiplier * BITS.of_degree(degree) * kept.sum()
+        return float(REMOVAL_FACTOR * costs.removal[~kept].sum() + lost + bits)
+
+    found = total(keep, int(degrees[0]))
+    for degree in range(4):
+        alone = np.array([total(np.arange(12) != row, degree) for row in range(12)])
+        assert found <= min(total(np.ones(12, bool), degree), alone.min()) * (1 + 1e-9)
+
+
+def test_one_degree_keeps_or_drops_what_nobody_sees() -> None:
+    costs = costs_of([0.0, 1e9], [[0, 1e6]] * 3, weight2=[0.0, 1.0])
+    for keep_unseen in (True, False):
+        keep, degrees = choose_one_degree(costs, BITS, 1.0, keep_unseen)
+        assert keep.tolist() == [keep_unseen, True] and degrees.tolist() == [3, 3]

@@ -101,7 +101,7 @@ def _known_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def search(
     world: World, target: Target, path: FakePath | None = None, best_effort: bool = False, **words: Any
-) -> RateResult:
+) -> RateResult[GridScene]:
     words = {"effort": EFFORT, "refit": False, **words}
     World.multiplier = None
     world.path = path or FakePath()
@@ -164,7 +164,7 @@ def test_out_of_reach_names_the_closest_point() -> None:
     found = search(powers_with_floor(2.0), MaxDrop(1.0), best_effort=True)
     assert not found.reached and not found.chosen.holds and len(found.steps) == EFFORT.steps + EXTRA_STEPS
     assert found.chosen.excess == min(step.excess for step in found.steps)
-    assert found.grid.count > 0
+    assert found.product.count > 0
 
 
 def powers_with_floor(floor: float) -> World:
@@ -194,16 +194,16 @@ def test_the_file_is_the_chosen_step_s() -> None:
     seen: list[RateStep] = []
     found = search(world, MaxDrop(1.0), on_step=seen.append)
     assert tuple(seen) == found.steps
-    assert any(found.grid is grid for grid in world.grids)
-    assert (found.grid.count, found.grid.sh_count) == (found.chosen.count, found.chosen.sh_count)
-    assert found.grid.steps.opacity == pytest.approx(UNIT * math.sqrt(found.chosen.multiplier), rel=1e-5)
+    assert any(found.product is grid for grid in world.grids)
+    assert (found.product.count, found.product.sh_count) == (found.chosen.count, found.chosen.sh_count)
+    assert found.product.steps.opacity == pytest.approx(UNIT * math.sqrt(found.chosen.multiplier), rel=1e-5)
 
 
 def test_the_same_search_every_time() -> None:
     one, two = (search(powers(), MaxDrop(1.0)) for _ in range(2))
     assert [replace(s, seconds=0.0) for s in one.steps] == [replace(s, seconds=0.0) for s in two.steps]
     for name in ("position", "scale", "rotation", "opacity", "dc", "sh_degrees"):
-        np.testing.assert_array_equal(getattr(one.grid, name), getattr(two.grid, name))
+        np.testing.assert_array_equal(getattr(one.product, name), getattr(two.product, name))
 
 
 def test_the_path_is_walked_down_by_the_effort_s_share() -> None:
@@ -223,8 +223,8 @@ def test_larger_multipliers_keep_fewer() -> None:
 def test_unseen_gaussians_stay() -> None:
     path = FakePath(unseen=60)
     found = search(powers(), MaxDrop(1.0), path)
-    positions = np.rint(path.snapshots[0].planes["means"][:, :60] / found.grid.steps.position).astype(int)
-    kept = {tuple(p) for p in found.grid.position.T.tolist()}
+    positions = np.rint(path.snapshots[0].planes["means"][:, :60] / found.product.steps.position).astype(int)
+    kept = {tuple(p) for p in found.product.position.T.tolist()}
     assert found.reached and all(tuple(p) in kept for p in positions.T.tolist())
 
 
@@ -232,12 +232,12 @@ def test_unseen_gaussians_stay() -> None:
 @pytest.mark.parametrize("target", [MaxDrop(1.0), MaxSize(3000, "drop")])
 def test_few_gaussians(count: int, target: Target) -> None:
     found = search(powers(), target, FakePath(count))
-    assert found.reached and found.grid.count <= count
+    assert found.reached and found.product.count <= count
 
 
 def test_nothing_that_any_pose_sees() -> None:
     found = search(powers(), MaxDrop(1.0), FakePath(40, unseen=40), best_effort=True)
-    assert found.grid.count == 40 and found.grid.sh_count == 0
+    assert found.product.count == 40 and found.product.sh_count == 0
 
 
 def test_efforts_grow() -> None:

@@ -90,7 +90,7 @@ BOUNDS = {
         "opacity": 0.6 / 255,
         "log_scales": 0.032,
         "sh_dc": 0.014,
-        "sh_rest": 0.07,
+        "sh_rest": 0.032,
         "degrees": 0.3,
     },
     ".sog": {"means": 5e-4, "opacity": 0.6 / 255, "log_scales": 0.04, "sh_dc": 0.02, "sh_rest": 0.41, "degrees": 1.0},

@@ -136,6 +136,7 @@ def test_everything_that_scores_depend_on_is_in_the_fingerprint(project: Path) -
         fingerprint(plain, cameras, *w) for w in (("meson", *words[1:]), ("gs", 0.3, "exact"), ("gs", 0.2, "inria"))
     ]
     different += [fingerprint(plain, poses, *words) for poses in (cameras[1:], cameras[::-1])]
+    different.append(fingerprint(plain, cameras, *words, antialiased=True))
     one = cameras[0]
     turned = np.nextafter(one.rotation, 2)
     for change in (

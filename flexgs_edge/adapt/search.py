@@ -22,7 +22,7 @@ from flexgs_edge.adapt.targets import Measurement, Target
 from flexgs_edge.errors import TargetError
 from flexgs_edge.prune import Choice
 
-Phase = Literal["list", "refine", "fixed", "multiplier"]
+Phase = Literal["list", "refine", "fixed", "line", "multiplier"]
 
 CANDIDATES: tuple[tuple[int, int], ...] = (
     (2, 3), (1, 5), (2, 4), (3, 3), (1, 6), (2, 5), (3, 4), (4, 3), (2, 6), (3, 5),
@@ -64,7 +64,7 @@ class Step:
         Quality; `None` where size alone decided.
     excess : float
         By how much the target was missed; zero or less holds.
-    phase : {"list", "refine", "fixed", "multiplier"}
+    phase : {"list", "refine", "fixed", "line", "multiplier"}
         Part of the search that asked.
     seconds : float
         Wall time of the step.
@@ -136,12 +136,17 @@ def adapt(
     else:
         chosen = _search_size(search, target.limit_bytes, refine_steps)
     if not chosen.holds and not best_effort:
-        raise TargetError(
-            f"{target.describe()} cannot be reached: the closest point is {target.report(chosen.size, chosen.measurement)} "
-            f"(prune rate {chosen.choice.prune / 1000:g}, SH rate {chosen.choice.sh / 1000:g}); "
-            f"relax the target, or take that point with --best-effort"
-        )
+        raise out_of_reach(target, chosen)
     return SearchResult(chosen, chosen.holds, tuple(search.steps))
+
+
+def out_of_reach(target: Target, closest: Step) -> TargetError:
+    """The error when nothing holds, with the closest point."""
+    return TargetError(
+        f"{target.describe()} cannot be reached: the closest point is {target.report(closest.size, closest.measurement)} "
+        f"(prune rate {closest.choice.prune / 1000:g}, SH rate {closest.choice.sh / 1000:g}); "
+        f"relax the target, or take that point with --best-effort"
+    )
 
 
 def measure_fixed(evaluator: Evaluator, choice: Choice, target: Target | None = None) -> SearchResult:

@@ -65,6 +65,21 @@ def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.n
     return keep, degrees
 
 
+def choose_one_degree(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
+    """As `choose`, but with one SH degree for all that are kept: for formats where SH that are zero take as much as any."""
+    top = len(costs.sh)
+    nothing = np.zeros_like(costs.removal)
+    removal = REMOVAL_FACTOR * costs.removal
+    lagrangian = [
+        (SH_FACTOR * costs.sh[level] if level < top else nothing) + multiplier * bits.of_degree(level)
+        for level in range(top + 1)
+    ]
+    degree = int(np.argmin([np.minimum(removal, whole).sum() for whole in lagrangian]))
+    keep = removal >= lagrangian[degree]
+    keep[costs.weight2 <= 0] = True
+    return keep, np.full(len(keep), degree, np.uint8)
+
+
 def drop_bands(
     planes: dict[str, np.ndarray], degrees: np.ndarray, sh_mean: np.ndarray, y0: float
 ) -> dict[str, np.ndarray]:

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from flexgs_edge.adapt import Measurement, Target
+from flexgs_edge.adapt.line import AIM, NEAREST, next_point
 from flexgs_edge.best.choice import BitModel, choose, drop_bands
 from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
 from flexgs_edge.best.steps import Slopes, choose_steps, holdable, probe_slopes
@@ -21,6 +24,10 @@ from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps, from_grid, recolour, to_grid
 from flexgs_edge.refit import refit_colours
+from flexgs_edge.score.removal import RemovalCosts
+
+Product = TypeVar("Product")
+"""What a step makes: a grid, or a finished file."""
 
 PRUNED_PART = 0.45
 """Part of the allowed loss that pruning alone has used up when a whole result meets the target (fox .45, the sample .55): where
@@ -32,16 +39,12 @@ SIZE_SLOPE = -0.45
 FINE_COLOUR = 2.0**-8
 """Colour steps before the refit, as a share of the final ones: only geometry shall move."""
 MOST_ROUNDS = 24
-MENDED = 0.6
-"""Loss after the colour refit over the loss before it, until a whole result tells (fox and the sample scene: see PROBES)."""
+MENDED = 0.7
+"""Loss after the colour refit over the loss before it, until a whole result tells (the sample scene)."""
 PROBES = 3
 """Unmended results that are looked at between two whole ones, at most: a tenth of the time each."""
 EXTRA_STEPS = 3
 """Steps beyond the effort's own while nothing close to the target holds."""
-AIM = -0.01
-"""Excess that steps aim at."""
-NEAREST = 0.1
-"""A new step keeps this share of the interval between its neighbours away from both: curves are not quite smooth."""
 LARGEST_STRIDE = 1.2
 """Largest change of the log of the multiplier between two steps."""
 
@@ -110,13 +113,28 @@ class _Mended:
 
 
 @dataclass
-class _Choice:
-    """What a multiplier keeps: rows of the scene, their planes and SH degrees, and the grid steps."""
+class _Kept:
+    """What a multiplier keeps.
 
+    Attributes
+    ----------
+    snapshot : int
+        Number of the snapshot that was asked.
+    rows : np.ndarray
+        [n] i64, rows of the scene.
+    planes : dict
+        Of these rows, with SH dropped.
+    degrees : np.ndarray
+        [n] u8, SH degrees.
+    weight2 : np.ndarray
+        [n] f64, sums of squared weights.
+    """
+
+    snapshot: int
     rows: np.ndarray
     planes: dict[str, np.ndarray]
     degrees: np.ndarray
-    steps: Steps
+    weight2: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -152,72 +170,89 @@ class RateStep:
 
 
 @dataclass(frozen=True)
-class RateResult:
-    """The answer of a search: the grid to write and the way to it."""
+class RateResult(Generic[Product]):
+    """The answer of a search: what to write and the way to it."""
 
-    grid: GridScene
+    product: Product
     chosen: RateStep
     reached: bool
     steps: tuple[RateStep, ...]
 
 
-class RateSearch:
+class MultiplierSearch(ABC, Generic[Product]):
     """Searches the multiplier whose whole result meets a target with the fewest bytes.
 
     Parameters
     ----------
     path : PrunePath
-    size_of : callable
-        Exact bytes of a grid's file, and the coder's bit model.
     measure : callable
-        Quality of a grid's decoded planes.
+        Quality of planes without quantization, where the search starts.
+    effort : Effort
+    on_step : callable, optional
+        Called after each step.
     """
 
     def __init__(
         self,
         path: PrunePath,
-        size_of: Callable[[GridScene], tuple[int, BitModel]],
         measure: Callable[[dict[str, np.ndarray]], Measurement],
         effort: Effort,
-        refit: bool = True,
         on_step: Callable[[RateStep], None] | None = None,
     ) -> None:
-        self.path, self.size_of, self.measure = path, size_of, measure
-        self.effort, self.refit, self.on_step = effort, refit, on_step
+        self.path, self.measure, self.effort, self.on_step = path, measure, effort, on_step
         self.bits = BitModel()
-        self._slopes: dict[int, Slopes] = {}
-        self._mended: _Mended | None = None
 
-    def run(self, target: Target, best_effort: bool = False) -> RateResult:
+    @abstractmethod
+    def _calibrate(self, multiplier: float) -> None:
+        """Ask what Gaussians cost near the answer. Once: or every step would search another function."""
+
+    @abstractmethod
+    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, Product]:
+        """The whole result at a multiplier, measured."""
+
+    def _aim(self, multiplier: float, steps: Sequence[RateStep], target: Target) -> float:
+        """A better guess than `multiplier` of where the next whole result should be, for less than the time of one."""
+        return multiplier
+
+    def discard(self, product: Product) -> None:
+        """Let go of what is not the best any more."""
+        return
+
+    def choose(self, costs: RemovalCosts, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
+        """Which rows to keep ([n] bool), and their SH degrees."""
+        return choose(costs, self.bits, multiplier)
+
+    def run(self, target: Target, best_effort: bool = False) -> RateResult[Product]:
         """Search; raises `TargetError` with the closest point when nothing holds and `best_effort` is not set."""
         steps: list[RateStep] = []
-        best: tuple[RateStep, GridScene] | None = None
+        best: tuple[RateStep, Product] | None = None
         multiplier = self._start(target)
         self._calibrate(multiplier)
-        # A refit changes the size by little, the loss by much.
-        offset = math.log(MENDED) if self.refit and target.limit_bytes is None else 0.0
-        multiplier = self._aim(target, multiplier, offset)
+        multiplier = self._aim(multiplier, steps, target)
         for count in range(self.effort.steps + EXTRA_STEPS):
-            step, grid = self._whole(multiplier, target)
+            step, product = self._whole(multiplier, target)
             steps.append(step)
             if self.on_step:
                 self.on_step(step)
-            if best is None or _better(step, best[0], target):
-                best = (step, grid)
+            if best is None:
+                best = (step, product)
+            elif _better(step, best[0], target):
+                self.discard(best[1])
+                best = (step, product)
+            else:
+                self.discard(product)
             close = best[0].holds and best[0].excess > -self.effort.close
             if close or step.multiplier < 1e-30 or (best[0].holds and count + 1 >= self.effort.steps):
                 break
-            offset = step.excess - self._probe(multiplier, target)
-            low, high = _bounds(steps)
-            multiplier = self._aim(target, _next_multiplier(steps, target), offset, low, high)
+            multiplier = self._aim(_next_multiplier(steps, target), steps, target)
         assert best is not None
-        chosen, grid = best
+        chosen, product = best
         if not chosen.holds and not best_effort:
             raise TargetError(
                 f"{target.describe()} is out of reach; the closest point has {target.report(chosen.size, chosen.measurement)}"
                 " (--best-effort writes it)"
             )
-        return RateResult(grid, chosen, chosen.holds, tuple(steps))
+        return RateResult(product, chosen, chosen.holds, tuple(steps))
 
     def _start(self, target: Target) -> float:
         """Walk down until pruning alone has used up its part of the target; the multiplier at that cut."""
@@ -249,18 +284,53 @@ class RateSearch:
             if index == len(self.path.snapshots):
                 self.path.descend(self.effort.keep)
             snapshot = self.path.snapshots[index]
-            keep, degrees = choose(snapshot.costs, self.bits, multiplier)
+            keep, degrees = self.choose(snapshot.costs, multiplier)
             if keep.mean() >= self.effort.keep or snapshot.count < 16:
                 break
         return index, keep, degrees
+
+    def kept(self, multiplier: float) -> _Kept:
+        """What a multiplier keeps."""
+        index, keep, degrees = self._snapshot(multiplier)
+        snapshot = self.path.snapshots[index]
+        rows = np.flatnonzero(keep)
+        planes = drop_bands(take_rows(snapshot.planes, rows), degrees[rows], snapshot.costs.sh_mean[:, :, rows], SH_C0)
+        return _Kept(index, snapshot.rows[rows], planes, degrees[rows], snapshot.costs.weight2[rows])
+
+
+class RateSearch(MultiplierSearch[GridScene]):
+    """The search for the grid that is coded in container version 2.
+
+    Parameters
+    ----------
+    path : PrunePath
+    size_of : callable
+        Exact bytes of a grid's file, and the coder's bit model.
+    measure : callable
+        Quality of a grid's decoded planes.
+    """
+
+    def __init__(
+        self,
+        path: PrunePath,
+        size_of: Callable[[GridScene], tuple[int, BitModel]],
+        measure: Callable[[dict[str, np.ndarray]], Measurement],
+        effort: Effort,
+        refit: bool = True,
+        on_step: Callable[[RateStep], None] | None = None,
+    ) -> None:
+        super().__init__(path, measure, effort, on_step)
+        self.size_of, self.refit = size_of, refit
+        self._slopes: dict[int, Slopes] = {}
+        self._mended: _Mended | None = None
 
     def _calibrate(self, multiplier: float) -> None:
         """Ask the coder what Gaussians cost near the answer. Once: or every step would search another function."""
         _, self.bits = self.size_of(self._unmended(multiplier))
 
     def _unmended(self, multiplier: float) -> GridScene:
-        choice = self._choice(multiplier)
-        return to_grid(choice.planes, choice.degrees, choice.steps, self.path.origin)[0]
+        kept, steps = self._choice(multiplier)
+        return to_grid(kept.planes, kept.degrees, steps, self.path.origin)[0]
 
     def _probe(self, multiplier: float, target: Target) -> float:
         """The excess of a multiplier's result without a refit of its own."""
@@ -269,56 +339,61 @@ class RateSearch:
             return target.excess(self.size_of(grid)[0], None)
         return target.excess(0, self.measure(from_grid(grid)))
 
-    def _aim(
-        self, target: Target, multiplier: float, offset: float, low: float = -math.inf, high: float = math.inf
-    ) -> float:
-        """Move to where a whole result (a probe plus `offset`) should lie just below the target; the log stays in (low, high)."""
-        slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
-        seen: list[tuple[float, float]] = []
+    def _aim(self, multiplier: float, steps: Sequence[RateStep], target: Target) -> float:
+        """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""
+        by_size = target.limit_bytes is not None
+        slope = SIZE_SLOPE if by_size else SLOPE
+        if steps:
+            offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
+        else:
+            offset = math.log(MENDED) if self.refit and not by_size else 0.0
+        low, high = _bounds(steps)
         place = math.log(multiplier)
+        last: tuple[float, float] | None = None
         for _ in range(PROBES):
             excess = self._probe(math.exp(place), target) + offset
-            seen.append((place, excess))
             if abs(excess - AIM) < -AIM:
                 break
-            if len(seen) > 1 and seen[-1][0] != seen[-2][0]:
-                measured = (seen[-1][1] - seen[-2][1]) / (seen[-1][0] - seen[-2][0])
+            if last is not None and last[0] != place:
+                measured = (excess - last[1]) / (place - last[0])
                 slope *= min(max(measured / slope, 0.4), 2.5)
+            last = (place, excess)
             place += max(-LARGEST_STRIDE, min(LARGEST_STRIDE, (AIM - excess) / slope))
             place = max(min(place, high), low)
         return math.exp(place)
 
-    def _choice(self, multiplier: float) -> _Choice:
-        index, keep, degrees = self._snapshot(multiplier)
-        snapshot = self.path.snapshots[index]
-        rows = np.flatnonzero(keep)
-        degrees, weight2 = degrees[rows], snapshot.costs.weight2[rows]
-        planes = drop_bands(take_rows(snapshot.planes, rows), degrees, snapshot.costs.sh_mean[:, :, rows], SH_C0)
+    def _choice(self, multiplier: float) -> tuple[_Kept, Steps]:
+        """What a multiplier keeps, with the colours of the last refit, and the grid steps."""
+        kept = self.kept(multiplier)
         if self._mended is not None:
-            planes = self._mended.apply(snapshot.rows[rows], degrees, planes)
-        if index not in self._slopes:
-            self._slopes[index] = probe_slopes(self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras)
-        steps = choose_steps(self._slopes[index], weight2, degrees, len(snapshot.costs.sh), multiplier)
-        return _Choice(snapshot.rows[rows], planes, degrees, holdable(steps, planes))
+            kept.planes = self._mended.apply(kept.rows, kept.degrees, kept.planes)
+        snapshot = self.path.snapshots[kept.snapshot]
+        if kept.snapshot not in self._slopes:
+            self._slopes[kept.snapshot] = probe_slopes(
+                self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras
+            )
+        slopes = self._slopes[kept.snapshot]
+        steps = choose_steps(slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
+        return kept, holdable(steps, kept.planes)
 
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
         started = time.perf_counter()
-        choice = self._choice(multiplier)
-        grid = self._finish(choice)
+        kept, steps = self._choice(multiplier)
+        grid = self._finish(kept, steps)
         size, _ = self.size_of(grid)
         measurement = self.measure(from_grid(grid))
         excess = target.excess(size, measurement)
-        sh_count = int((choice.degrees > 0).sum())
+        sh_count = int((kept.degrees > 0).sum())
         seconds = time.perf_counter() - started
-        return RateStep(multiplier, len(choice.rows), sh_count, size, measurement, excess, seconds), grid
+        return RateStep(multiplier, len(kept.rows), sh_count, size, measurement, excess, seconds), grid
 
-    def _finish(self, choice: _Choice) -> GridScene:
+    def _finish(self, kept: _Kept, steps: Steps) -> GridScene:
         """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
-        path, planes, degrees, steps = self.path, choice.planes, choice.degrees, choice.steps
+        path, planes = self.path, kept.planes
         fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
         fine = holdable(fine, planes)
-        grid, order = to_grid(planes, degrees, fine, path.origin)
-        degrees = degrees[order]
+        grid, order = to_grid(planes, kept.degrees, fine, path.origin)
+        degrees = kept.degrees[order]
         moved = from_grid(grid)
         if self.refit:
             shared = (path.origin, path.cameras, path.targets)
@@ -331,7 +406,7 @@ class RateSearch:
                 subsets=self.effort.subsets,
                 progress=path.progress,
             )
-            self._mended = _Mended.of(choice.rows[order], degrees, moved)
+            self._mended = _Mended.of(kept.rows[order], degrees, moved)
             coarse = from_grid(
                 recolour(
                     replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree])),
@@ -377,23 +452,6 @@ def _bounds(steps: Sequence[RateStep]) -> tuple[float, float]:
 
 
 def _next_multiplier(steps: Sequence[RateStep], target: Target) -> float:
-    """Where the excess is expected to be just below zero: false position in the logs, kept away from points already asked."""
+    """Where the excess is expected to be just below zero, in the log of the multiplier."""
     slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
-    points = sorted((math.log(s.multiplier), s.excess) for s in steps)
-    if slope < 0:
-        points.reverse()
-    # In the order of rising excess: the last point that holds before the first one that misses.
-    first_miss = next((i for i, (_, excess) in enumerate(points) if excess > 0), len(points))
-    if 0 < first_miss < len(points):
-        (low, below), (high, above) = points[first_miss - 1], points[first_miss]
-        part = (AIM - below) / (above - below)
-        return math.exp(low + (high - low) * min(max(part, NEAREST), 1 - NEAREST))
-    edge, excess = points[-1] if first_miss else points[0]
-    most = LARGEST_STRIDE
-    if len(points) > 1:
-        # The slope between the two points nearest to the target, kept within reason.
-        (low, below), (high, above) = points[-2:] if first_miss else points[:2]
-        measured = (above - below) / (high - low) if high != low else slope
-        slope *= min(max(measured / slope, 0.2), 3.0)
-        most = 2 * LARGEST_STRIDE
-    return math.exp(edge + max(-most, min(most, (AIM - excess) / slope)))
+    return math.exp(next_point([(math.log(s.multiplier), s.excess) for s in steps], slope, LARGEST_STRIDE))

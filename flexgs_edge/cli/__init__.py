@@ -18,7 +18,7 @@ from flexgs_edge.errors import FlexGSError, InputError
 
 COMMANDS = {
     "compress": "Compress a scene to the fewest bytes that hold a quality, or the best quality in a size.",
-    "decompress": "Decode a .fgs file to a PLY that every viewer opens.",
+    "decompress": "Decode a .fgs file to a PLY that every viewer opens, or convert between formats.",
     "info": "Show what a scene file holds: counts, bits and bytes of every channel, settings.",
     "trim": "Cut a layered .fgs file to a size, at the speed of copying.",
     "verify": "Check every byte of a .fgs file against its checksums.",
@@ -61,8 +61,9 @@ def command() -> None:
       flexgs-edge info scene.fgs
       flexgs-edge decompress scene.fgs -o decoded.ply
 
-    A scene (INPUT) is a .ply in INRIA's layout, a .fgs file, or the folder that the 3DGS training program writes. The summary
-    goes to stdout, everything else to stderr; --json gives the same record to programs. Nothing is overwritten without -f.
+    A scene (INPUT) is a .ply in INRIA's layout, a .fgs, .spz, .sog or .compressed.ply file, or the folder that the 3DGS training
+    program writes. The summary goes to stdout, everything else to stderr; --json gives the same record to programs.
+    Nothing is overwritten without -f.
 
     Exit codes: 0 done; 2 misuse, bad input or a damaged file; 3 target not reachable; 4 no usable device; 5 memory limit
     or disk too small; 130 interrupted; 1 a fault of this program. COMMAND --help explains each command, with examples.

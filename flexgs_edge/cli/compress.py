@@ -11,7 +11,13 @@ from flexgs_edge.cli import words
 
 @click.command(cls=words.SectionCommand)
 @words.scene_argument
-@words.option("Output", "-o", "--output", metavar="OUT.fgs", help="File to write (not needed with --dry-run).")
+@words.option(
+    "Output",
+    "-o",
+    "--output",
+    metavar="OUT",
+    help="File to write: .fgs, .spz, .sog or .compressed.ply (a .fgs needs none with --dry-run).",
+)
 @words.option("Output", "--dry-run", is_flag=True, help="Do everything but write; the size shown is exact.")
 @words.report_option
 @words.option(
@@ -143,8 +149,8 @@ from flexgs_edge.cli import words
     type=click.Choice(["fast", "balanced", "thorough"]),
     default="balanced",
     show_default=True,
-    help="Steps of the search: paper 4, 10 or 32 after its list; best 3, 4 or 6 whole results, with more rounds and poses each. "
-    "Counted, never timed: same command, same bytes.",
+    help="Steps of the search: paper 4, 10 or 32 after its list (other formats: 4, 6 or 10 files); best 3, 4 or 6 whole "
+    "results, with more rounds and poses each. Counted, never timed: same command, same bytes.",
 )
 @words.drop_invalid_option
 @words.device_option
@@ -155,10 +161,11 @@ from flexgs_edge.cli import words
 def command(input: str, output: str | None, json_path: str | None, quiet: bool, **options: Any) -> None:
     """Compress a scene: the fewest bytes that hold a quality, or the best quality in a size.
 
-    INPUT is a .ply in INRIA's layout, a .fgs, or a model folder of the 3DGS training program. A cameras.json and an images/
-    folder beside it are used and named in the summary. Gaussians are scored over the training poses; then a search
-    finds how many to remove, how many lose their view-dependent colour, and measures each step by rendering. The figures
-    in the summary are measured on the finished file.
+    INPUT is a .ply in INRIA's layout, a .fgs, .spz, .sog or .compressed.ply, or a model folder of the 3DGS training program.
+    A cameras.json and an images/ folder beside it are used and named in the summary. Gaussians are scored over the training
+    poses; then a search finds how many to remove, how many lose their view-dependent colour, and measures each step by
+    rendering. The figures in the summary are measured on the finished file. With -o OUT.spz, .sog or .compressed.ply every
+    step writes that format and measures what it decodes to, so its own losses count.
 
     \b
     Examples:
@@ -173,6 +180,8 @@ def command(input: str, output: str | None, json_path: str | None, quiet: bool, 
           score once, then try another target
       flexgs-edge compress point_cloud.ply -o scene.fgs --prune-rate 0.3 --sh-rate 0.4
           fixed rates, no search
+      flexgs-edge compress point_cloud.ply -o scene.spz --max-drop 0.5
+          for viewers of that format (needs pip install 'flexgs-edge[formats]')
 
     Exit code 3 says that the target cannot be met, and names the closest point.
     """

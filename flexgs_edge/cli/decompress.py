@@ -8,22 +8,28 @@ from flexgs_edge.cli import words
 
 
 @click.command(cls=words.SectionCommand)
-@click.argument("input", metavar="IN.fgs", type=click.Path())
-@words.option("Output", "-o", "--output", metavar="OUT.ply", required=True, help="PLY to write.")
+@click.argument("input", metavar="INPUT", type=click.Path())
+@words.option(
+    "Output", "-o", "--output", metavar="OUT", required=True, help="File to write: .ply, .spz, .sog or .compressed.ply."
+)
 @words.memory_option
 @words.force_option
 @words.json_option
 @words.talk_options
 def command(input: str, output: str, memory_limit: int | None, force: bool, json_path: str | None, quiet: bool) -> None:
-    """Decode a .fgs file to a PLY that every viewer opens.
+    """Decode a .fgs file to a PLY that every viewer opens, or convert between formats.
 
-    The PLY has INRIA's layout: x y z, normals (zero), colours, opacity, scales and rotations as 32-bit floats, little endian.
-    Gaussians that lost their SH above degree 0 get zeros there. Decoding is exact: the same bits on every machine.
+    INPUT is a .fgs, .ply, .spz, .sog or .compressed.ply, or a model folder. A .ply is written in INRIA's layout: x y z, normals
+    (zero), colours, opacity, scales and rotations as 32-bit floats, little endian. Gaussians that lost their SH above degree
+    0 get zeros there. Decoding a .fgs is exact: the same bits on every machine. Other formats round values in their own ways, and
+    need the extra: pip install 'flexgs-edge[formats]'. To make such a file smaller, with its losses measured, use compress.
 
     \b
     Examples:
       flexgs-edge decompress scene.fgs -o scene.ply
       flexgs-edge decompress scene.fgs -o scene.ply -f --memory-limit 200MiB
+      flexgs-edge decompress scene.fgs -o scene.spz
+      flexgs-edge decompress scene.sog -o scene.ply
     """
     words.start(quiet, json_path, force)
     from flexgs_edge.pipeline.decompress import decompress

@@ -12,7 +12,11 @@ from flexgs_edge.cli import words
 @click.command(cls=words.SectionCommand)
 @words.scene_argument
 @words.option(
-    "Quality", "--against", metavar="REF", required=True, help="The original: a .ply, a .fgs or a model folder."
+    "Quality",
+    "--against",
+    metavar="REF",
+    required=True,
+    help="The original: any scene, such as its .ply or model folder.",
 )
 @words.option(
     "Quality",

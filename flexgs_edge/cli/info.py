@@ -16,8 +16,8 @@ def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
     """Show what a scene file holds.
 
     For a .fgs: Gaussians, SH degree, bits and bytes of every channel and SH degree, layers, the settings it was made with
-    and the target it reached (files of --method best are decoded for this; use verify to check every byte). For a .ply or a
-    model folder: counts, and what lies beside it.
+    and the target it reached (files of --method best are decoded for this; use verify to check every byte). For other
+    scene files and model folders: counts, and what lies beside it.
 
     \b
     Examples:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from typing import Any
 
 import numpy as np
 
@@ -11,12 +12,14 @@ from flexgs_edge.adapt import Measurement, SearchResult, Step, Target
 from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.layers import assign_layers
 from flexgs_edge.best.path import PrunePath
-from flexgs_edge.best.search import EFFORTS, RateResult, RateSearch, RateStep
+from flexgs_edge.best.search import EFFORTS, MultiplierSearch, Product, RateResult, RateSearch, RateStep
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
 from flexgs_edge.codec.container2 import coded_parts
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.grid import GridScene
+from flexgs_edge.pipeline.foreign import FileMaker, WrittenFile, search_pruned_files
+from flexgs_edge.pipeline.foreign_best import FileSearch
 from flexgs_edge.pipeline.judge import Judge, measurement_of
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.workspace import Stopwatch
@@ -38,7 +41,36 @@ SETTINGS_MOST = 1536
 """Bytes that the settings in the header take at most: the search counts them before they are known."""
 
 
+Measure = Callable[[dict[str, np.ndarray]], Measurement]
+Report = Callable[[RateStep], None]
+SearchMaker = Callable[[PrunePath, Measure, Report], MultiplierSearch[Product]]
+
+
+def grid_search(options: CompressOptions) -> SearchMaker[GridScene]:
+    """Searches for the grid of a `.fgs`."""
+
+    def size_of(grid: GridScene) -> tuple[int, BitModel]:
+        size, bits = size_and_bits(grid)
+        return (size if options.layers == 1 else round(LAYERS_COST * size)), bits
+
+    plan = EFFORTS[options.effort]
+    return lambda path, measure, report: RateSearch(path, size_of, measure, plan, options.refit, report)
+
+
+def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[WrittenFile]:
+    """Searches for a file of another program's format."""
+    plan = EFFORTS[options.effort]
+    return lambda path, measure, report: FileSearch(path, files, measure, plan, options.refit, report)
+
+
+def scored_poses(cameras: list[Camera], options: CompressOptions) -> list[Camera]:
+    """As many poses as the effort scores, evenly spread."""
+    count = min(EFFORTS[options.effort].views, len(cameras))
+    return [cameras[i * len(cameras) // count] for i in range(count)]
+
+
 def search_best(
+    make: SearchMaker[Product],
     renderer: Renderer,
     source: SceneSource,
     cameras: list[Camera],
@@ -49,11 +81,13 @@ def search_best(
     clock: Stopwatch,
     on_step: Callable[[Step], None] | None = None,
     progress: Progress = SILENT,
-) -> tuple[GridScene, SearchResult]:
-    """The grid to write, and the steps that led to it.
+) -> tuple[Product, SearchResult]:
+    """What to write, and the steps that led to it.
 
     Parameters
     ----------
+    make : callable
+        `grid_search` or `file_search`.
     source : SceneSource
         A checked scene; held in memory as a whole.
     cameras : list of Camera
@@ -68,8 +102,7 @@ def search_best(
     BudgetError
         When the scene does not fit.
     """
-    plan = EFFORTS[options.effort]
-    scored = [cameras[i * len(cameras) // min(plan.views, len(cameras))] for i in range(min(plan.views, len(cameras)))]
+    scored = scored_poses(cameras, options)
     size = COPIES * source.count * sum(4 * field.width(source.sh_degree) for field in FIELD.values())
     budget.take("the scene and its path", size)
     try:
@@ -99,19 +132,43 @@ def search_best(
                     if on_step:
                         on_step(as_step(step, source.count))
 
-                def size_of(grid: GridScene) -> tuple[int, BitModel]:
-                    size, bits = size_and_bits(grid)
-                    return (size if options.layers == 1 else round(LAYERS_COST * size)), bits
-
-                search = RateSearch(path, size_of, measure, plan, options.refit, report)
-                found = search.run(target, options.best_effort)
-            grid = found.grid
-            if options.layers > 1:
-                with clock.stage("layers"):
-                    grid = assign_layers(grid, options.layers, search.bits, renderer, scored, progress)
-        return grid, _as_search(found, source.count)
+                found = make(path, measure, report).run(target, options.best_effort)
+        return found.product, _as_search(found, source.count)
     finally:
         budget.give(size)
+
+
+def search_files(
+    files: FileMaker,
+    order: np.ndarray | None,
+    renderer: Renderer | None,
+    source: SceneSource,
+    cameras: list[Camera],
+    judge: Judge | None,
+    target: Target | None,
+    options: CompressOptions,
+    budget: MemoryBudget,
+    clock: Stopwatch,
+    on_step: Callable[[Step], None] | None = None,
+    progress: Progress = SILENT,
+) -> tuple[WrittenFile, SearchResult]:
+    """A file of another program's format: in rank order ([N] i64, least important row first), or by measured costs (None)."""
+    if order is not None:
+        with clock.stage("search"):
+            return search_pruned_files(files, source, order, target, options, on_step)
+    assert renderer is not None and judge is not None and target is not None
+    make = file_search(options, files)
+    return search_best(
+        make, renderer, source, cameras, judge, target, options, budget, clock, on_step=on_step, progress=progress
+    )
+
+
+def layered(
+    grid: GridScene, renderer: Renderer, cameras: list[Camera], options: CompressOptions, progress: Progress = SILENT
+) -> GridScene:
+    """The grid in as many layers as asked for."""
+    poses = scored_poses(cameras, options)
+    return assign_layers(grid, options.layers, size_and_bits(grid)[1], renderer, poses, progress)
 
 
 def alive(logits: np.ndarray) -> np.ndarray:
@@ -148,6 +205,6 @@ def as_step(step: RateStep, count: int) -> Step:
     )
 
 
-def _as_search(found: RateResult, count: int) -> SearchResult:
+def _as_search(found: RateResult[Any], count: int) -> SearchResult:
     steps = tuple(as_step(step, count) for step in found.steps)
     return SearchResult(steps[found.steps.index(found.chosen)], found.reached, steps)

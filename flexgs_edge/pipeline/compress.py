@@ -19,9 +19,11 @@ from flexgs_edge.budget import MemoryBudget, format_size
 from flexgs_edge.codec import FgsSource, coded_size, open_fgs, write_grid
 from flexgs_edge.codec.container import write_container
 from flexgs_edge.errors import InputError, TargetError
+from flexgs_edge.formats import FORMATS, Format, read_foreign
 from flexgs_edge.grid import GridScene, from_grid
-from flexgs_edge.pipeline.best import search_best
+from flexgs_edge.pipeline.best import grid_search, layered, search_best, search_files
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
+from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
 from flexgs_edge.pipeline.inputs import Scene, Views, companions_of, find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import CompressOptions
@@ -57,9 +59,9 @@ def compress(
     Parameters
     ----------
     input : path
-        A `.ply`, a `.fgs`, or INRIA's model folder.
+        A scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`), or INRIA's model folder.
     output : path or None
-        The `.fgs` file to write (None only in a dry run).
+        The `.fgs`, `.spz`, `.sog` or `.compressed.ply` to write (None, for a `.fgs`, only in a dry run).
     options : CompressOptions, optional
         What the command line would say.
     progress : Progress, optional
@@ -78,6 +80,7 @@ def compress(
         `InputError`, `TargetError`, `DeviceError` or `BudgetError`; nothing is left behind then.
     """
     options = replace(options or CompressOptions(), **words)
+    format = foreign_format(output, options)
     target_path = _check_outputs(output, options)
     reporter = Reporter.maybe(options.report, options.force)
     clock = Stopwatch()
@@ -98,10 +101,10 @@ def compress(
         workspace = stack.enter_context(Workspace(options, budget, clock)) if views is not None else None
         if reporter is not None and views is not None:
             reporter.reserve(budget, views, plan.report)
-        job = _Job(options, scene, views, plan, budget, clock, workspace, progress, reporter)
+        job = _Job(options, scene, views, plan, budget, clock, workspace, progress, reporter, format)
         result = job.run(target_path, scores)
     if reporter is not None:
-        if target_path is not None:
+        if target_path is not None and format is None:
             reporter.read_contents(target_path)
         reporter.write(result, plan.target)
     return result
@@ -116,8 +119,8 @@ def _check_outputs(output: str | Path | None, options: CompressOptions) -> Path 
         return None
     if output is None:
         raise InputError("-o OUT.fgs is missing: give the file to write, or --dry-run")
-    if Path(output).suffix.lower() != ".fgs":
-        raise InputError(f"-o {output}: expected a name that ends in .fgs")
+    if Path(output).suffix.lower() != ".fgs" and foreign_format(output, options) is None:
+        raise InputError(f"-o {output}: expected a name that ends in .fgs, {', '.join(FORMATS)}")
     check_writable(output, options.force)
     return Path(output)
 
@@ -136,8 +139,9 @@ class _Job:
         workspace: Workspace | None,
         progress: Progress,
         reporter: Reporter | None = None,
+        format: Format | None = None,
     ) -> None:
-        self.reporter = reporter
+        self.reporter, self.format = reporter, format
         self.options, self.scene, self.views, self.plan = options, scene, views, plan
         self.budget, self.clock, self.workspace, self.progress = budget, clock, workspace, progress
         self.source = scene.source
@@ -162,6 +166,8 @@ class _Job:
         if self.options.save_scores is not None and scores is not None:
             save_scores(self.options.save_scores, scores, self.options.force)
         order = np.arange(self.source.count) if scores is None else order_from_scores(scores)
+        if self.format is not None:
+            return self._run_files(self.format, output, order, decide, report)
         with self.clock.stage("open"):
             has_sh = nonzero_sh(self.source)
         evaluator = self._evaluator(order, has_sh, PAPER, decide)
@@ -188,7 +194,9 @@ class _Job:
         assert self.views is not None and options.near is not None and options.extent is not None
         with self.clock.stage("fingerprint"):
             cameras = self.views.of(self.views.train)
-            key = fingerprint(self.source, cameras, options.score, options.near, options.extent)
+            key = fingerprint(
+                self.source, cameras, options.score, options.near, options.extent, bool(options.antialiased)
+            )
         return ScoreCache(options.score_cache, key)
 
     def _run_best(self, output: Path | None, decide: Judge | None, report: Judge | None) -> CompressResult:
@@ -198,8 +206,11 @@ class _Job:
         assert decide is not None and report is not None
         renderer = self.workspace.renderer
         self._look_at_original(decide, report, None)
+        if self.format is not None:
+            return self._run_files(self.format, output, None, decide, report)
         LOG.info("searching for %s", plan.target.describe())
         grid, search = search_best(
+            grid_search(options),
             renderer,
             self.source,
             self.views.of(self.views.train),
@@ -213,6 +224,9 @@ class _Job:
         )
         if decide is not report:
             decide.close()
+        if options.layers > 1:
+            with self.clock.stage("layers"):
+                grid = layered(grid, renderer, self.views.of(self.views.train), options, self.progress)
         settings = make_settings(options, plan, self.scene, self.views, search, None)
         if output is None:
             if self.reporter is not None:
@@ -232,6 +246,33 @@ class _Job:
                 quality = self._measure_source(open_fgs(place), report)
             LOG.info("wrote %s, %s", output, format_size(size))
         return self._result(output, size, search.chosen.choice, grid, search, quality)
+
+    def _run_files(
+        self,
+        format: Format,
+        output: Path | None,
+        order: np.ndarray | None,
+        decide: Judge | None,
+        report: Judge | None,
+    ) -> CompressResult:
+        """The job for another program's format, in rank order or (`order` None) by measured costs: see `pipeline.foreign`."""
+        options, plan = self.options, self.plan
+        renderer = self.workspace.renderer if self.workspace else None
+        with open_files(format, output, options.force, self.budget, renderer, decide) as files:
+            if plan.target is not None:
+                LOG.info("searching for %s", plan.target.describe())
+            file, search = search_files(
+                files, order, renderer, self.source, self.views.of(self.views.train) if self.views else [], decide,
+                plan.target, options, self.budget, self.clock,
+                on_step=lambda step: LOG.info("%s", _step_words(step, plan.target)), progress=self.progress,
+            )  # fmt: skip
+            if decide is not None and decide is not report:
+                decide.close()
+            quality = None if report is None else self._measure_source(read_foreign(file.path), report)
+            if output is not None:
+                publish(file, output, options.force)
+                LOG.info("wrote %s, %s", output, format_size(file.size))
+        return self._result(output, file.size, search.chosen.choice, file, search, quality)
 
     def _measure_source(self, source: SceneSource, report: Judge) -> Quality:
         assert self.workspace is not None
@@ -354,7 +395,7 @@ class _Job:
         output: Path | None,
         size: int,
         choice: Choice,
-        scene: QuantizedScene | GridScene,
+        scene: QuantizedScene | GridScene | WrittenFile,
         search: SearchResult | None,
         quality: Quality | None,
     ) -> CompressResult:
@@ -387,6 +428,8 @@ class _Job:
             score_cache=options.score_cache if plan.computes_scores else None,
             scores_reused=self.scores_reused,
             run=run_info(self.budget, self.clock, self.workspace),
+            format=self.format.suffix[1:] if self.format else "fgs",
+            file_sh_degree=scene.sh_degree,
         )
 
 

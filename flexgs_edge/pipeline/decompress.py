@@ -1,4 +1,4 @@
-"""`decompress`: a `.fgs` file back to a PLY that every viewer opens."""
+"""`decompress`: a scene to a PLY that every viewer opens, or to another program's format."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.errors import InputError
+from flexgs_edge.formats import FORMATS, check_converter, converter_bytes, format_of, write_foreign
 from flexgs_edge.pipeline.inputs import load_scene
 from flexgs_edge.pipeline.records import scene_info
 from flexgs_edge.pipeline.workspace import Stopwatch, run_info
@@ -22,30 +23,37 @@ ANTIALIASED_NOTE = "an antialiased model: a PLY cannot say so; viewers must be t
 def decompress(
     input: str | Path, output: str | Path, force: bool = False, memory_limit: int | None = None
 ) -> DecompressResult:
-    """Decode a scene to a PLY in INRIA's layout (little endian, zero normals), chunk by chunk.
+    """Decode a scene to a PLY in INRIA's layout (little endian, zero normals), chunk by chunk, or convert it.
 
     Parameters
     ----------
     input : path
-        The `.fgs` file (a `.ply` or model folder works as well: it is rewritten in INRIA's layout).
+        Any scene: a `.fgs`, a `.ply`, a file of another program's format, or a model folder.
     output : path
-        The `.ply` to write.
+        The `.ply`, `.spz`, `.sog` or `.compressed.ply` to write.
     force : bool
         Overwrite `output` if it exists.
     memory_limit : int, optional
         Bytes for the whole process.
     """
-    if Path(output).suffix.lower() != ".ply":
-        raise InputError(f"-o {output}: expected a name that ends in .ply")
+    format = format_of(output)
+    if format is None and Path(output).suffix.lower() != ".ply":
+        raise InputError(f"-o {output}: expected a name that ends in .ply, {', '.join(FORMATS)}")
+    if format is not None:
+        check_converter(output)
     check_writable(output, force)
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(memory_limit)
     with clock.stage("open"):
         scene = load_scene(input)
     with clock.stage("write"):
-        row = inria_dtype(scene.source.sh_degree).itemsize
-        rows = budget.rows("decoding", WRITE_COPIES * row, minimum=min(scene.source.count, 1024), most=65536)
-        notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
+        if format is not None:
+            budget.require("the converter", converter_bytes(format, scene.source.count))
+            notes = write_foreign(output, scene.source, force=force)
+        else:
+            row = inria_dtype(scene.source.sh_degree).itemsize
+            rows = budget.rows("decoding", WRITE_COPIES * row, minimum=min(scene.source.count, 1024), most=65536)
+            notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
         if scene.settings.get("antialiased") is True:
             notes = (*notes, ANTIALIASED_NOTE)
     size = os.stat(output).st_size

@@ -44,7 +44,7 @@ def evaluate(
     Parameters
     ----------
     input : path
-        The scene to judge (`.fgs`, `.ply` or model folder).
+        The scene to judge (a file or a model folder).
     against : path
         The original. Cameras and photos beside it are used unless given; else those beside `input`.
     options : ViewOptions, optional

@@ -17,6 +17,7 @@ from flexgs_edge.codec.container2 import GridContainer
 from flexgs_edge.codec.layout import Header, Section
 from flexgs_edge.codec.layout2 import GridHeader
 from flexgs_edge.errors import InputError
+from flexgs_edge.formats import format_of
 from flexgs_edge.pipeline.inputs import companions_of
 from flexgs_edge.quantize import array_bytes
 from flexgs_edge.scene import FIELDS, SceneSource, inria_dtype, open_scene
@@ -29,7 +30,7 @@ def info(path: str | Path) -> dict[str, Any]:
     ----------
     path : path
         A `.fgs` (of version 1 only the header is read; version 2 is decoded, since entropy coding shares the bytes out), a
-        `.ply` or a model folder.
+        `.ply`, a file of another program's format or a model folder.
     """
     place = Path(path)
     if place.suffix.lower() == ".fgs" and place.is_file():
@@ -131,12 +132,13 @@ def _fgs_record(
 def _scene_info(path: Path, source: SceneSource) -> dict[str, Any]:
     beside = companions_of(path)
     place = Path(source.name)
+    foreign = format_of(place)
     ply = source.count * inria_dtype(source.sh_degree).itemsize
     return {
         "program": f"flexgs-edge {__version__}",
         "command": "info",
         "path": source.name,
-        "format": place.suffix.lower().lstrip("."),
+        "format": (foreign.suffix if foreign else place.suffix.lower()).lstrip("."),
         "size": os.stat(place).st_size,
         "count": source.count,
         "sh_count": source.sh_count,

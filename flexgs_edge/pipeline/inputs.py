@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-import flexgs_edge.codec  # noqa: F401  (registers the reader of .fgs)
+import flexgs_edge.codec
+import flexgs_edge.formats  # noqa: F401  (both register readers)
 from flexgs_edge.cameras import Camera, Photos, find_cameras, limit_width, read_cameras, split_views
 from flexgs_edge.cameras.auto import automatic_rig
 from flexgs_edge.constants import DEFAULT_NEAR
@@ -90,7 +91,7 @@ class Views:
 
 
 def read_scene(path: str | Path, drop_invalid: bool = False) -> SceneSource:
-    """A checked scene from a `.ply`, a `.fgs` or a model folder: finite values, at least one Gaussian; read lazily."""
+    """A checked scene from a scene file or a model folder: finite values, at least one Gaussian; read lazily."""
     return load_scene(path, drop_invalid).source
 
 

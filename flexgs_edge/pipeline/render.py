@@ -40,7 +40,7 @@ def render_views(
     Parameters
     ----------
     input : path
-        A `.fgs`, a `.ply` or a model folder.
+        A scene file or a model folder.
     output : path
         Folder; made if it is missing.
     options : ViewOptions, optional

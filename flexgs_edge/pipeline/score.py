@@ -35,7 +35,7 @@ def score_gaussians(
     Parameters
     ----------
     input : path
-        A `.ply`, a `.fgs` or a model folder.
+        A scene file or a model folder.
     output : path
         The `.npy` file to write: [N] f64, logarithms of the scores, -inf for Gaussians that no pose sees.
     options : ViewOptions, optional

@@ -138,6 +138,10 @@ class CompressResult:
         Whether they were taken from it.
     run : RunInfo
         Times, memory, device.
+    format : str
+        `fgs`, `spz`, `sog` or `compressed.ply`.
+    file_sh_degree : int or None
+        SH degree of the file.
     """
 
     scene: SceneInfo
@@ -166,6 +170,8 @@ class CompressResult:
     score_cache: str | None
     scores_reused: bool
     run: RunInfo
+    format: str = "fgs"
+    file_sh_degree: int | None = None
 
     @property
     def ratio(self) -> float:
@@ -185,6 +191,8 @@ class CompressResult:
             "input": self.scene.to_json(),
             "views": self.views.to_json() if self.views else None,
             "output": self.output,
+            "format": self.format,
+            "file_sh_degree": self.file_sh_degree,
             "size": self.size,
             "ratio": round(self.ratio, 4),
             "ratio_without_normals": round(self.ratio_without_normals, 4),

@@ -34,7 +34,11 @@ def compress_text(result: CompressResult) -> str:
     )
     share = f"{result.count} of {result.scene.count} Gaussians, {result.sh_count} of them with SH"
     lines.append(_line("kept", f"{share} (prune rate {result.prune_rate:g}, SH rate {result.sh_rate:g})"))
-    if result.steps is not None:
+    if result.format != "fgs":
+        lines.append(
+            _line("format", f".{result.format}, SH degree {result.file_sh_degree}, rounded as that format does")
+        )
+    elif result.steps is not None:
         steps = (f"{name} {value:.3g}" for name, value in result.steps.items() if not isinstance(value, list))
         lines.append(_line("grid steps", ", ".join(steps)))
     else:

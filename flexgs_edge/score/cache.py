@@ -22,7 +22,9 @@ FIELDS = ("means", "log_scales", "quats", "opacity_logits")
 """What hits, weights and volumes depend on; colours change none of them."""
 
 
-def fingerprint(source: SceneSource, cameras: Sequence[Camera], kind: str, near: float, extent: str) -> str:
+def fingerprint(
+    source: SceneSource, cameras: Sequence[Camera], kind: str, near: float, extent: str, antialiased: bool = False
+) -> str:
     """A digest of everything that scores depend on; reads the scene once, without its colours.
 
     Parameters
@@ -31,10 +33,12 @@ def fingerprint(source: SceneSource, cameras: Sequence[Camera], kind: str, near:
         The scene as it is scored: rows left out are not part of it.
     cameras : sequence of Camera
         The training poses, at the size they are drawn. Their names do not count.
-    kind, near, extent : str, float, str
+    kind, near, extent, antialiased : str, float, str, bool
         Which score, and how views are drawn.
     """
-    digest = hashlib.sha256(f"{__version__} {kind} {near!r} {extent} {source.count} {len(cameras)}".encode())
+    digest = hashlib.sha256(
+        f"{__version__} {kind} {near!r} {extent} {antialiased} {source.count} {len(cameras)}".encode()
+    )
     digest.update(source.origin.astype("<f8").tobytes())
     for camera in cameras:
         numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
