@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-import secrets
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +16,8 @@ from flexgs_edge.bitspec import PAPER, BitSpec
 from flexgs_edge.budget import MemoryBudget, format_size
 from flexgs_edge.codec import FgsSource, coded_size, open_fgs, write_grid
 from flexgs_edge.codec.container import write_container
-from flexgs_edge.errors import InputError, TargetError
-from flexgs_edge.formats import FORMATS, Format, read_foreign
+from flexgs_edge.errors import TargetError
+from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, from_grid
 from flexgs_edge.pipeline.best import grid_search, layered, search_best, search_files
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
@@ -27,6 +25,7 @@ from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files
 from flexgs_edge.pipeline.inputs import Scene, Views, companions_of, find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.pipeline.outputs import check_outputs, temporary_name
 from flexgs_edge.pipeline.plan import EVERYTHING, Plan, make_settings
 from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.pipeline.report import Reporter
@@ -37,7 +36,7 @@ from flexgs_edge.quantize import QuantizedScene
 from flexgs_edge.render import DeviceScene
 from flexgs_edge.render.quality import Quality, error_for_drop
 from flexgs_edge.report.result import CompressResult
-from flexgs_edge.scene import MemorySource, SceneSource, check_writable
+from flexgs_edge.scene import MemorySource, SceneSource
 from flexgs_edge.score import ScoreCache, fingerprint, load_scores, save_scores, score_scene
 from flexgs_edge.sensitivity import ALLOWED_DROP, Sensitivity, search_bits
 
@@ -81,7 +80,7 @@ def compress(
     """
     options = replace(options or CompressOptions(), **words)
     format = foreign_format(output, options)
-    target_path = _check_outputs(output, options)
+    target_path = check_outputs(output, options)
     reporter = Reporter.maybe(options.report, options.force)
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(options.memory_limit)
@@ -108,21 +107,6 @@ def compress(
             reporter.read_contents(target_path)
         reporter.write(result, plan.target)
     return result
-
-
-def _check_outputs(output: str | Path | None, options: CompressOptions) -> Path | None:
-    if options.save_scores is not None:
-        check_writable(options.save_scores, options.force)
-    if options.score_cache is not None:
-        check_writable(options.score_cache, force=True)
-    if options.dry_run:
-        return None
-    if output is None:
-        raise InputError("-o OUT.fgs is missing: give the file to write, or --dry-run")
-    if Path(output).suffix.lower() != ".fgs" and foreign_format(output, options) is None:
-        raise InputError(f"-o {output}: expected a name that ends in .fgs, {', '.join(FORMATS)}")
-    check_writable(output, options.force)
-    return Path(output)
 
 
 class _Job:
@@ -436,17 +420,3 @@ class _Job:
 def _step_words(step: Step, target: Target | None) -> str:
     figure = target.report(step.size, step.measurement) if target else ""
     return f"{step.phase}: prune {step.choice.prune / 1000:g}, SH {step.choice.sh / 1000:g}: {figure}, {step.seconds:.1f} s"
-
-
-@contextmanager
-def temporary_name(output: Path, force: bool) -> Iterator[Path]:
-    """A name beside `output` that becomes `output` when the block ends well, and is removed when it does not."""
-    target = check_writable(output, force)
-    place = target.with_name(f".flexgs-{secrets.token_hex(8)}.tmp.fgs")
-    try:
-        yield place
-        check_writable(output, force)
-        os.replace(place, target)
-    finally:
-        with suppress(FileNotFoundError):
-            place.unlink()
