@@ -7,6 +7,7 @@ who confuse colours can tell apart, and every series has a mark of its own besid
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -17,10 +18,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-INCHES, DPI = (7.2, 4.4), 144
+INCHES, TALL, DPI = (7.2, 4.4), (7.2, 6.2), 144
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 GREY, INK = "#7a7a7a", "#222222"
-MARKS = ("o", "s", "^", "D", "v", "P")
+MARKS, OPEN_MARKS = ("o", "s", "^", "D", "v", "P"), ("*", "d")
 _STYLE: dict[Any, Any] = {
     "font.size": 9.0,
     "axes.titlesize": 10.0,
@@ -105,6 +106,27 @@ class BarChart:
 
 
 @dataclass(frozen=True)
+class DotChart:
+    """Dots on a log axis, grouped, with words beside them: for values of many magnitudes, which bars would hide.
+
+    Parameters
+    ----------
+    groups : sequence of str
+        Along the axis.
+    dots : dict
+        One value a group, by label; those that are not above zero cannot be shown and stand at the foot as "none".
+    words : dict
+        As `dots`, what is written beside each.
+    """
+
+    title: str
+    y_label: str
+    groups: Sequence[str]
+    dots: dict[str, Sequence[float]]
+    words: dict[str, Sequence[str]]
+
+
+@dataclass(frozen=True)
 class PlaneChart:
     """A grid of cells over the two rates, with lines and points on it.
 
@@ -138,7 +160,7 @@ class PlaneChart:
     answer: tuple[float, float] | None = None
 
 
-Chart = LineChart | BarChart | PlaneChart
+Chart = LineChart | BarChart | DotChart | PlaneChart
 
 
 def require_matplotlib() -> None:
@@ -167,24 +189,36 @@ def draw(chart: Chart) -> Figure:
     """The chart as a figure that nothing else holds on to (no pyplot: no windows, no state)."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=INCHES, layout="constrained")
+    figure = Figure(figsize=TALL if isinstance(chart, PlaneChart) else INCHES, layout="constrained")
     axes = figure.add_subplot()
     axes.set_title(chart.title, loc="left")
     if isinstance(chart, LineChart):
         _lines(axes, chart)
     elif isinstance(chart, BarChart):
         _bars(axes, chart)
+    elif isinstance(chart, DotChart):
+        _dots(axes, chart)
     else:
         _plane(figure, axes, chart)
     return figure
 
 
 def _lines(axes: Axes, chart: LineChart) -> None:
-    own = 0
+    own = others = 0
+    xs = [x for series in chart.series for x in series.x]
+    scale = math.log2 if chart.doublings else float
+    middle = (scale(min(xs)) + scale(max(xs))) / 2
     for series in chart.series:
         points = [(x, y, i) for i, (x, y) in enumerate(zip(series.x, series.y)) if y is not None]
-        style: dict[str, Any] = {"color": GREY, "marker": "*", "markerfacecolor": "white", "markersize": 9}
-        if not series.published:
+        if series.published:
+            style: dict[str, Any] = {
+                "color": GREY,
+                "marker": OPEN_MARKS[others],
+                "markerfacecolor": "white",
+                "markersize": 9,
+            }
+            others += 1
+        else:
             style = {"color": COLOURS[own], "marker": MARKS[own], "markersize": 5}
             own += 1
         axes.plot(
@@ -194,12 +228,20 @@ def _lines(axes: Axes, chart: LineChart) -> None:
             linewidth=1.5,
             label=series.label,
             zorder=2 if series.published else 3,
+            clip_on=False,  # marks at zero are shown whole
             **style,
         )
         for x, y, i in points:
             if series.notes:
+                right = scale(x) > middle  # towards the middle: words do not leave the chart
+                place = ((-5 if right else 5), 5)
                 axes.annotate(
-                    series.notes[i], (x, y), (4, 4), textcoords="offset points", fontsize=8, color=style["color"]
+                    series.notes[i],
+                    (x, y),
+                    place,
+                    textcoords="offset points",
+                    fontsize=8,
+                    ha="right" if right else "left",
                 )
     if chart.limit is not None:
         axes.axhline(chart.limit, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
@@ -213,6 +255,27 @@ def _lines(axes: Axes, chart: LineChart) -> None:
     low = min((y for series in chart.series for y in series.y if y is not None), default=0.0)
     axes.set_ylim(bottom=min(low * 1.1, 0.0))
     axes.set_xlabel(chart.x_label)
+    axes.set_ylabel(chart.y_label)
+    if any(series.label for series in chart.series):
+        axes.legend()
+
+
+def _dots(axes: Axes, chart: DotChart) -> None:
+    axes.set_yscale("log")
+    shown = [value for values in chart.dots.values() for value in values if value > 0]
+    axes.set_ylim(min(shown, default=1.0) / 4, max(shown, default=1.0) * 4)
+    foot = axes.get_ylim()[0]
+    width = 0.5 / len(chart.dots)
+    for number, (label, values) in enumerate(chart.dots.items()):
+        x = [group + (number + 0.5) * width - 0.4 for group in range(len(chart.groups))]
+        points = [(at, value) for at, value in zip(x, values) if value > 0]
+        axes.plot(*_split(points), MARKS[number], color=COLOURS[number], markersize=7, label=label)
+        for at, value, words in zip(x, values, chart.words[label]):
+            place = (at, value) if value > 0 else (at, foot)
+            text = words if value > 0 else f"none: {words}"
+            axes.annotate(text, place, (6, 0), textcoords="offset points", va="center", fontsize=8)
+    axes.set_xticks(range(len(chart.groups)), chart.groups)
+    axes.set_xlim(-0.6, len(chart.groups) - 0.4)
     axes.set_ylabel(chart.y_label)
     axes.legend()
 

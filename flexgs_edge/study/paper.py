@@ -27,12 +27,11 @@ from flexgs_edge.study.tables import json_bytes
 
 LOG = logging.getLogger("flexgs_edge")
 
-# The plane first: it makes the search, whose steps must be measured and not remembered, and whose answer others use.
 EXPERIMENTS: tuple[Callable[[Bench], Experiment], ...] = (
-    pruning.plane,
     quantization.rtn,
     quantization.attributes,
     pruning.splits,
+    pruning.plane,
     whole.parts,
     quantization.groups,
     pruning.scores,
@@ -136,6 +135,10 @@ def study_paper(
 
 def _study_scene(path: str | Path, name: str, options: CompressOptions, progress: Progress) -> SceneStudy:
     with open_bench(path, name, options, progress, scores=("gs", "meson")) as bench:
+        # First: several experiments build on its answer, and its steps must be measured and not remembered.
+        LOG.info("%s: searching for %s", name, bench.target.describe())
+        chosen = bench.search.chosen
+        LOG.info("%s: prune %g, SH %g", name, chosen.choice.prune / 1000, chosen.choice.sh / 1000)
         experiments = []
         for number, make in enumerate(EXPERIMENTS, 1):
             started = time.perf_counter()
@@ -172,8 +175,8 @@ def _write(folder: Path, scenes: Sequence[SceneStudy]) -> None:
         sections.append(Section(scene.name, _facts(scene), drawn))
     intro = (
         "The experiments of the FlexGaussian paper (Tian et al., ACM MM 2025), made again by flexgs-edge with its own programs, "
-        "containers and quality figures. Sizes are bytes of the finished file; ratios are to the PLY as INRIA writes it. The paper's figures "
-        "are means over its own scenes: beside one scene they give the order of magnitude."
+        "containers and quality figures. Sizes are bytes of the finished file; ratios are to the PLY as INRIA writes it. The "
+        "paper's figures are means over its own scenes: beside one scene they give the order of magnitude."
     )
     page = study_page("The paper's evaluation", intro, sections)
     (folder / "index.html").write_text(page, encoding="utf-8")

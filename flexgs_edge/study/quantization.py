@@ -8,7 +8,7 @@ from flexgs_edge.bitspec import PAPER, BitSpec
 from flexgs_edge.pipeline.plan import EVERYTHING
 from flexgs_edge.scene import FIELDS
 from flexgs_edge.study.bench import FIGURES, Bench, Setting
-from flexgs_edge.study.charts import BarChart, LineChart, Series
+from flexgs_edge.study.charts import BarChart, DotChart, LineChart, Series
 from flexgs_edge.study.experiment import Experiment
 from flexgs_edge.study.tables import Cell, Table, columns
 
@@ -74,7 +74,7 @@ def attributes(bench: Bench) -> Experiment:
     heads = columns(attribute="attribute", bits="bits", **FIGURES, rise="rise of the squared error")
     table = Table(heads, tuple(rows))
     figure = bench.figure
-    low, high = (table.values(figure, bits=bits) for bits in ALONE_BITS)
+    losses = {bits: table.values(figure, bits=bits) for bits in ALONE_BITS}
     worst = max(rows, key=lambda row: float(row["rise"] or 0.0))
     mildest = min((row for row in rows if row["bits"] == 4), key=lambda row: float(row["rise"] or 0.0))
     return Experiment(
@@ -83,11 +83,12 @@ def attributes(bench: Bench) -> Experiment:
         "All Gaussians stay, with a range for each sub-group; the other attributes have 16 bits, which by itself loses "
         f"{rows[0][figure]:.4f} dB. The rise is that of the mean squared error against the original's renders.",
         table,
-        BarChart(
-            "One attribute at 4 or 8 bits, all others at 16",
-            FIGURES[figure],
+        DotChart(
+            f"One attribute at 4 or 8 bits, all others at 16 (beside the dots: {FIGURES[figure]})",
+            "rise of the squared error against the original's renders",
             [NAMES[name] for name in names],
-            {f"{bits} bits": values for bits, values in zip(ALONE_BITS, (low, high))},
+            {f"{bits} bits": table.values("rise", bits=bits) for bits in ALONE_BITS},
+            {f"{bits} bits": [f"{loss:.2f}" for loss in found] for bits, found in losses.items()},
         ),
         (
             f"At 4 bits {NAMES[str(worst['attribute'])]} hurts most ({worst[figure]:.3f} dB) and "
