@@ -27,6 +27,9 @@ from flexgs_edge.study.tables import Cell
 
 LOG = logging.getLogger("flexgs_edge")
 
+RANK_BYTES = 24
+"""Bytes a row and score that the bench and its evaluator hold: order, rank, and the rows with SH above each rank."""
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -220,6 +223,7 @@ def open_bench(
     with ExitStack() as stack:
         workspace = stack.enter_context(Workspace(options, budget, clock))
         renderer = workspace.renderer
+        budget.take("ranks", RANK_BYTES * scene.source.count * len(scores))
         judge = Judge(
             renderer, scene.source, views, plan.decide, budget, plan.judge == "drop", base_psnr=options.base_psnr
         )

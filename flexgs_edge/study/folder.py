@@ -40,21 +40,22 @@ def check_folder(path: str | os.PathLike[str], force: bool = False) -> Path:
 
 @contextmanager
 def atomic_folder(path: str | os.PathLike[str], force: bool = False) -> Iterator[Path]:
-    """Yield an empty folder beside `path` that takes its name only when the block ends without an error.
+    """Yield an empty folder whose files get to `path` only when the block ends without an error.
 
-    On any error (Ctrl-C included) nothing is left behind. Where `path` holds files already (`force`), each finished file
-    takes the place of one of the same name, and files of other names stay as they are.
+    On any error (Ctrl-C included) nothing is left behind. A new `path` appears whole. Where there is such a folder (with
+    `force` also one that is in use), the finished files take the places of those of the same names, and all others stay.
     """
     target = check_folder(path, force)
-    place = target.with_name(f".flexgs-{secrets.token_hex(8)}.tmp")
+    # Inside a folder that is there: its parent may be closed to us, or on another disk.
+    home = target if target.is_dir() else target.parent
+    place = home / f".flexgs-{secrets.token_hex(8)}.tmp"
     try:
         place.mkdir()
         yield place
-        check_folder(path, force)
-        if target.is_dir() and any(target.iterdir()):
+        if target.is_dir():
             _merge(place, target)
         else:
-            os.replace(place, target)
+            os.rename(place, target)
     except OSError as error:
         if error.errno in DISK_FULL:
             raise BudgetError(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from flexgs_edge.adapt import CANDIDATES
 from flexgs_edge.prune import Choice
 from flexgs_edge.study.bench import FIGURES, Bench, Point, Setting
@@ -26,16 +28,18 @@ def candidates(bench: Bench) -> list[Choice]:
     return sorted(choices, key=lambda choice: (-bench.size(Setting(choice)), choice))
 
 
-def nearest(bench: Bench, family: Sequence[Choice], size: int) -> Choice | None:
-    """The choice of a one-parameter family (bytes falling) whose file is nearest to `size`; `None` when out of reach.
+def nearest(sizes: Sequence[int], size: int) -> int | None:
+    """Where in `sizes` (falling) the one nearest to `size` stands; `None` when out of reach.
 
-    Out of reach: further than half a step of the family beyond its ends.
+    Out of reach: beyond an end by more than half of the step there.
+
+    >>> nearest([90, 50, 10], 40), nearest([90, 50, 10], 0), nearest([90, 50, 10], -20)
+    (1, 2, None)
     """
-    sizes = [bench.size(Setting(choice)) for choice in family]
-    best = min(range(len(family)), key=lambda i: (abs(sizes[i] - size), i))
-    end = best in (0, len(family) - 1)
+    best = min(range(len(sizes)), key=lambda i: (abs(sizes[i] - size), i))
+    end = best in (0, len(sizes) - 1)
     step = abs(sizes[best] - sizes[best - 1 if best else 1])
-    return None if end and abs(sizes[best] - size) > step / 2 else family[best]
+    return None if end and abs(sizes[best] - size) > step / 2 else best
 
 
 def splits(bench: Bench) -> Experiment:
@@ -44,15 +48,16 @@ def splits(bench: Bench) -> Experiment:
         "Row-P": [Choice(rate, 0) for rate in range(MAX_ROWS + 1)],
         "SH-P": [Choice(0, rate) for rate in range(1001)],
     }
+    ladders = {name: [bench.size(Setting(choice)) for choice in family] for name, family in families.items()}
     levels = [("ADP p=s", Choice(rate, rate)) for rate in DIAGONAL]
     levels += [("ADP candidate", choice) for choice in candidates(bench)]
     wanted: list[tuple[str, str, Choice]] = []
     for kind, choice in levels:
         wanted.append((kind, kind, choice))
         for family, members in families.items():
-            equal = nearest(bench, members, bench.size(Setting(choice)))
+            equal = nearest(ladders[family], bench.size(Setting(choice)))
             if equal is not None:
-                wanted.append((kind, family, equal))
+                wanted.append((kind, family, members[equal]))
     found = bench.points([Setting(choice) for _, _, choice in wanted], "splits")
     rows: list[dict[str, Cell]] = []
     for (level, method, choice), point in zip(wanted, found):
@@ -245,9 +250,10 @@ def scores(bench: Bench) -> Experiment:
     figure = bench.figure
     gs, meson = (table.values(figure, score=score) for score in kinds)
     gaps = [b - a for a, b in zip(gs, meson)]
-    count = bench.scene.source.count
-    half = [set(bench.orders[score][: count // 2].tolist()) for score in kinds]
-    same = len(half[0] & half[1]) / max(count // 2, 1)
+    half = bench.scene.source.count // 2
+    low = np.zeros(bench.scene.source.count, bool)
+    low[bench.orders["gs"][:half]] = True
+    same = low[bench.orders["meson"][:half]].sum() / max(half, 1)
     return Experiment(
         "scores",
         "Ranking by gs or by meson",
@@ -266,8 +272,8 @@ def scores(bench: Bench) -> Experiment:
         ),
         (
             f"meson loses less at {sum(gap < 0 for gap in gaps)} of {len(gaps)} candidates; its loss less that of gs is "
-            f"{mean(gaps):+.3f} dB in the mean ({min(gaps):+.3f} to {max(gaps):+.3f}). Of the lower half of the ranks the two share "
-            f"{100 * same:.0f} %.",
+            f"{mean(gaps):+.3f} dB in the mean ({min(gaps):+.3f} to {max(gaps):+.3f}). Of the lower half of the ranks the two "
+            f"share {100 * same:.0f} %.",
         ),
     )
 

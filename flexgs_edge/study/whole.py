@@ -197,8 +197,8 @@ def times(bench: Bench) -> Experiment:
             digits=3,
         ),
         (
-            f"All stages of a compress run {whole:.1f} s, of which the search {stages['search']:.1f} s in {len(steps)} steps; peak "
-            f"memory of the process {memory / 2**30:.2f} GiB.",
+            f"All stages of a compress run {whole:.1f} s, of which the search {stages['search']:.1f} s in {len(steps)} steps; "
+            f"peak memory of the process {memory / 2**30:.2f} GiB.",
         ),
         (
             Beside("whole run", f"{whole:.1f} s", "26 / 18 / 26 s on an RTX 3090, 59 to 135 s on a Jetson Xavier"),
