@@ -188,8 +188,8 @@ def test_the_frontier_lies_where_the_loss_passes_the_limit() -> None:
     cells = [Choice(p, s) for p in range(0, 500, 100) for s in range(0, 1001 - p, 100)]
     losses = {choice: 4 * choice.prune / 1000 + choice.sh / 1000 for choice in cells}
     found = pruning._frontier(losses, 1.25)
-    # 4 p + s = 1.25; at p = 0 no s reaches it, and at p = 0.4 every s is past it.
-    assert found == [(0.1, 0.85), (0.2, 0.45), (0.3, 0.05)]
+    # 4 p + s = 1.25; at s = 1 there is one cell, and it holds.
+    assert found == [(pytest.approx((1.25 - s / 10) / 4, abs=1e-4), s / 10) for s in range(10)]
 
 
 def test_parts_have_the_bytes_of_what_is_left(bench: Bench, project: Path) -> None:

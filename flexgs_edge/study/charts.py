@@ -21,7 +21,11 @@ if TYPE_CHECKING:
 INCHES, TALL, DPI = (7.2, 4.4), (7.2, 6.2), 144
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 GREY, INK = "#7a7a7a", "#222222"
+SHORT = 8
+"""Letters up to which a note is centred over its point."""
 MARKS, OPEN_MARKS = ("o", "s", "^", "D", "v", "P"), ("*", "d")
+LINEAR_BELOW = 0.1
+LEVELS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 _STYLE: dict[Any, Any] = {
     "font.size": 9.0,
     "axes.titlesize": 10.0,
@@ -76,6 +80,8 @@ class LineChart:
         A level of y to mark, such as a target.
     doublings : bool
         x in powers of two.
+    magnitudes : bool
+        y in logarithms, linear from `LINEAR_BELOW` down through zero: losses below and far above 1 dB in one chart.
     """
 
     title: str
@@ -84,6 +90,7 @@ class LineChart:
     series: tuple[Series, ...]
     limit: float | None = None
     doublings: bool = False
+    magnitudes: bool = False
 
 
 @dataclass(frozen=True)
@@ -204,6 +211,9 @@ def draw(chart: Chart) -> Figure:
 
 
 def _lines(axes: Axes, chart: LineChart) -> None:
+    from matplotlib.patheffects import withStroke
+    from matplotlib.ticker import NullLocator
+
     own = others = 0
     xs = [x for series in chart.series for x in series.x]
     scale = math.log2 if chart.doublings else float
@@ -233,16 +243,11 @@ def _lines(axes: Axes, chart: LineChart) -> None:
         )
         for x, y, i in points:
             if series.notes:
-                right = scale(x) > middle  # towards the middle: words do not leave the chart
-                place = ((-5 if right else 5), 5)
-                axes.annotate(
-                    series.notes[i],
-                    (x, y),
-                    place,
-                    textcoords="offset points",
-                    fontsize=8,
-                    ha="right" if right else "left",
-                )
+                words = series.notes[i]
+                # Long words go towards the middle, so that they do not leave the chart; white under all of them.
+                side = "center" if len(words) < SHORT else "right" if scale(x) > middle else "left"
+                note = axes.annotate(words, (x, y), (0, 6), textcoords="offset points", fontsize=8, ha=side, zorder=5)
+                note.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
     if chart.limit is not None:
         axes.axhline(chart.limit, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
         axes.annotate(
@@ -253,9 +258,14 @@ def _lines(axes: Axes, chart: LineChart) -> None:
         axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}x")
     # Losses start at zero, or below where compression helped: no axis makes small ones look large.
     low = min((y for series in chart.series for y in series.y if y is not None), default=0.0)
+    if chart.magnitudes:
+        axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
+        axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.set_ylim(top=1.3 * max((y for series in chart.series for y in series.y if y is not None), default=1.0))
     axes.set_ylim(bottom=min(low * 1.1, 0.0))
     axes.set_xlabel(chart.x_label)
-    axes.set_ylabel(chart.y_label)
+    axes.set_ylabel(chart.y_label + (", log above 0.1" if chart.magnitudes else ""))
     if any(series.label for series in chart.series):
         axes.legend()
 

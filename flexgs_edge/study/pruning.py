@@ -90,6 +90,7 @@ def splits(bench: Bench) -> Experiment:
             ),
             limit=getattr(bench.target, "limit", None),
             doublings=True,
+            magnitudes=True,
         ),
         tuple(_wins(rows, level, family, figure) for level in ("ADP p=s", "ADP candidate") for family in families),
     )
@@ -194,13 +195,13 @@ def plane(bench: Bench) -> Experiment:
 
 
 def _frontier(losses: dict[Choice, float], limit: float) -> list[tuple[float, float]]:
-    """For each p of the grid the s at which the loss first passes `limit`, interpolated; nothing where it never does."""
+    """For each s of the grid the p at which the loss first passes `limit`, interpolated; nothing where it never does."""
     found = []
-    for p in sorted({choice.prune for choice in losses}):
-        column = sorted((choice.sh, loss) for choice, loss in losses.items() if choice.prune == p)
-        for (s, loss), (t, more) in zip(column, column[1:]):
+    for s in sorted({choice.sh for choice in losses}):
+        line = sorted((choice.prune, loss) for choice, loss in losses.items() if choice.sh == s)
+        for (p, loss), (q, more) in zip(line, line[1:]):
             if loss <= limit < more:
-                found.append((p / 1000, round((s + (t - s) * (limit - loss) / (more - loss)) / 1000, 4)))
+                found.append((round((p + (q - p) * (limit - loss) / (more - loss)) / 1000, 4), s / 1000))
                 break
     return found
 
@@ -227,14 +228,15 @@ def _monotone(found: dict[Choice, Point], bench: Bench) -> str:
 def _slope(frontier: Sequence[tuple[float, float]], bench: Bench) -> str:
     """How the frontier lies, against lines of equal bytes."""
     if len(frontier) < 2:
-        return f"The target lies on fewer than two columns of the plane ({len(frontier)}): no frontier to speak of."
+        return f"The target lies on fewer than two rows of the plane ({len(frontier)}): no frontier to speak of."
     (p, s), (q, t) = frontier[0], frontier[-1]
+    across = f"{(q - p) / (t - s):.2f} in p for each s"
     sizes = [bench.size(Setting(choice)) for choice in (Choice(0, 0), Choice(100, 0), Choice(0, 100))]
-    equal = -(sizes[0] - sizes[1]) / max(sizes[0] - sizes[2], 1)
+    equal = -(sizes[0] - sizes[2]) / (sizes[0] - sizes[1])
     best = min(frontier, key=lambda at: bench.size(Setting(Choice.from_rates(*at))))
     return (
-        f"The frontier goes from (p, s) = ({p:g}, {s:.2f}) to ({q:g}, {t:.2f}): {(t - s) / (q - p):.2f} in s for each p "
-        f"(equal bytes: {equal:.2f}); of its points ({best[0]:g}, {best[1]:.2f}) has the fewest bytes."
+        f"The frontier goes from (p, s) = ({p:.2f}, {s:g}) to ({q:.2f}, {t:g}): {across} (at equal bytes: {equal:.2f}); of its "
+        f"points ({best[0]:.2f}, {best[1]:g}) has the fewest bytes."
     )
 
 
@@ -269,6 +271,7 @@ def scores(bench: Bench) -> Experiment:
                 for score in kinds
             ),
             doublings=True,
+            magnitudes=True,
         ),
         (
             f"meson loses less at {sum(gap < 0 for gap in gaps)} of {len(gaps)} candidates; its loss less that of gs is "

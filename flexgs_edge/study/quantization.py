@@ -33,7 +33,7 @@ def rtn(bench: Bench) -> Experiment:
 
     def series(label: str, coding: str, notes: list[str]) -> Series:
         sizes = [size / 1e6 for size in table.values("size", coding=coding)]
-        return Series(label, sizes, table.values(figure, coding=coding), notes=notes)
+        return Series(label, sizes, table.values(figure, coding=coding), line=bool(notes), notes=notes)
 
     best, mixed = rows[-2], rows[-1]
     return Experiment(
@@ -84,11 +84,11 @@ def attributes(bench: Bench) -> Experiment:
         f"{rows[0][figure]:.4f} dB. The rise is that of the mean squared error against the original's renders.",
         table,
         DotChart(
-            f"One attribute at 4 or 8 bits, all others at 16 (beside the dots: {FIGURES[figure]})",
+            f"One attribute at 4 or 8 bits, all others at 16 (beside the dots: {bench.plan.judge} in dB)",
             "rise of the squared error against the original's renders",
             [NAMES[name] for name in names],
             {f"{bits} bits": table.values("rise", bits=bits) for bits in ALONE_BITS},
-            {f"{bits} bits": [f"{loss:.2f}" for loss in found] for bits, found in losses.items()},
+            {f"{bits} bits": [_short(loss) for loss in found] for bits, found in losses.items()},
         ),
         (
             f"At 4 bits {NAMES[str(worst['attribute'])]} hurts most ({worst[figure]:.3f} dB) and "
@@ -149,6 +149,11 @@ def groups(bench: Bench) -> Experiment:
 def _scientific(value: float) -> float:
     """Four digits, however small."""
     return float(f"{value:.4g}")
+
+
+def _short(loss: float) -> str:
+    """Two digits, three where there would be nothing to see, and no minus before zero."""
+    return f"{round(loss, 3 if abs(loss) < 0.1 else 2) + 0.0:g}"
 
 
 def _share(row: dict[str, Cell], other: dict[str, Cell], column: str) -> str:

@@ -81,7 +81,7 @@ def parts(bench: Bench) -> Experiment:
     table = Table(columns(method="method", **FIGURES), tuple(rows))
     figure = bench.figure
     losses = [float(row[figure] or 0.0) for row in rows]
-    words = [f"{row['method']}: {row['ratio']}x, {loss:.2f} dB" for row, loss in zip(rows, losses)]
+    words = [f"{row['method']}: {row['ratio']:.1f}x, {loss:.2f} dB" for row, loss in zip(rows, losses)]
     return Experiment(
         "parts",
         "Pruning only, quantization only, both",
@@ -141,6 +141,7 @@ def rates(bench: Bench) -> Experiment:
             ),
             limit=getattr(bench.target, "limit", None),
             doublings=True,
+            magnitudes=True,
         ),
         (
             f"The method reaches from {low['ratio']}x ({low[figure]:.3f} dB, nothing pruned) to {high['ratio']}x "
