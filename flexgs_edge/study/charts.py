@@ -257,13 +257,13 @@ def _lines(axes: Axes, chart: LineChart) -> None:
         axes.set_xscale("log", base=2)
         axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}x")
     # Losses start at zero, or below where compression helped: no axis makes small ones look large.
-    low = min((y for series in chart.series for y in series.y if y is not None), default=0.0)
+    shown = [y for series in chart.series for y in series.y if y is not None]
+    low, high = min(shown, default=0.0), max(shown, default=1.0)
     if chart.magnitudes:
         axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
         axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)
         axes.yaxis.set_minor_locator(NullLocator())
-        axes.set_ylim(top=1.3 * max((y for series in chart.series for y in series.y if y is not None), default=1.0))
-    axes.set_ylim(bottom=min(low * 1.1, 0.0))
+    axes.set_ylim(min(low * 1.1, 0.0), max(high, LINEAR_BELOW) * (1.4 if chart.magnitudes else 1.1))
     axes.set_xlabel(chart.x_label)
     axes.set_ylabel(chart.y_label + (", log above 0.1" if chart.magnitudes else ""))
     if any(series.label for series in chart.series):
