@@ -37,7 +37,7 @@ from flexgs_edge.render import Renderer
 from flexgs_edge.scene import FIELDS, MemorySource, SceneSource
 from flexgs_edge.study import pruning, quantization, whole
 from flexgs_edge.study.bench import Bench, Setting, open_bench, scene_names
-from flexgs_edge.study.charts import BarChart, DotChart, LineChart, PlaneChart
+from flexgs_edge.study.charts import BarChart, DotChart, LineChart, PlaneChart, picture
 from flexgs_edge.study.folder import atomic_folder, check_folder
 from flexgs_edge.study.paper import EXPERIMENTS, PaperStudy, study_paper
 from flexgs_edge.study.tables import Table, columns
@@ -324,6 +324,21 @@ def test_without_photos_the_modelled_drop_decides(project: Path) -> None:
         assert table.values("drop") == [None] * 8 and all(value > 0 for value in table.values("modelled_drop"))
 
 
+def test_a_scene_without_held_out_views_or_sh(tmp_path: Path) -> None:
+    project = make_project(tmp_path / "plain", photos=False, degree=0)
+    options = replace(OPTIONS, holdout=0, select="train", max_drop=1e-4)
+    with open_bench(project / "point_cloud.ply", "plain", options, SILENT, ("gs", "meson")) as bench:
+        assert "9 training views" in bench.decided_by
+        found = {make.__name__: make(bench) for make in (quantization.attributes, pruning.splits, pruning.plane)}
+    assert not bench.search.reached
+    assert "NOT reached" in found["plane"].findings[-1] and "no frontier" in found["plane"].findings[1]
+    assert "rest" not in found["attributes"].table.values("attribute")
+    # No SH: removing Gaussians is all that ADP can do, and SH-P reaches no smaller file.
+    assert "SH-P reaches none" in found["splits"].findings[1]
+    for experiment in found.values():
+        assert picture(experiment.chart)[0].startswith(b"\x89PNG"), experiment.key
+
+
 def test_the_bench_searches_as_the_pipeline_does(bench: Bench) -> None:
     fresh = adapt(bench.evaluator(Setting()), MaxDrop(4.0), "fast", best_effort=True)
     assert [(s.choice, s.size, s.measurement) for s in fresh.steps] == [
@@ -413,7 +428,7 @@ def test_help_teaches(words: list[str], capsys: pytest.CaptureFixture[str]) -> N
         option.help and option.help.endswith(".") for option in command.params if isinstance(option, click.Option)
     )
     known = {option.name for option in command.params}
-    assert set(ViewOptions.__dataclass_fields__) | {"max_drop", "base_psnr"} <= known
+    assert set(ViewOptions.__dataclass_fields__) | {"max_drop", "base_psnr", "select"} <= known
 
 
 def test_names_of_scenes() -> None:

@@ -25,6 +25,7 @@ from flexgs_edge.cli import words
 @words.cameras_option
 @words.images_option
 @words.holdout_option
+@words.select_option
 @words.drawing_options
 @words.drop_invalid_option
 @words.device_option
