@@ -57,6 +57,7 @@ def copy(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("adapt", "adapt/__init__.py", "import flexgs_edge.codec"),
         ("choice", "quantize.py", "import flexgs_edge.device"),
         ("codec", "codec/__init__.py", "import flexgs_edge.render"),
+        ("charts", "study/tables.py", "import matplotlib"),
         ("kernels", "kernels/source.py", "from flexgs_edge.scene import fields"),
         ("opencl", "kernels/twins/sort.py", "import pyopencl"),
         ("opencl", "scene/source.py", "import flexgs_edge.device.session"),  # through a third module

@@ -7,12 +7,12 @@ import logging
 import sys
 import traceback
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Any, NoReturn
 
 import click
 
 from flexgs_edge._version import __version__
+from flexgs_edge.cli.lazy import LazyGroup
 from flexgs_edge.cli.words import State
 from flexgs_edge.errors import FlexGSError, InputError
 
@@ -25,6 +25,7 @@ COMMANDS = {
     "render": "Draw views of a scene as PNG files, and time them.",
     "evaluate": "Measure what a scene lost against another: PSNR, SSIM, fidelity and drop of every view.",
     "score": "Save the importance of every Gaussian, so that other targets need no scoring.",
+    "study": "Make the experiments of a paper on scenes of your own: tables, charts and one page.",
     "devices": "List the OpenCL devices, whether they work, and which one is used.",
 }
 """Subcommands and their line in the overview: spelled out here so that `--help` loads none of them."""
@@ -32,24 +33,11 @@ COMMANDS = {
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
-class _LazyGroup(click.Group):
-    """A group whose subcommands are imported when they are run."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in COMMANDS:
-            return None
-        command: click.Command = import_module(f"flexgs_edge.cli.{cmd_name}").command
-        return command
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
-
-
-@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(
+    cls=LazyGroup,
+    commands_from=("flexgs_edge.cli", COMMANDS),
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
 @click.version_option(__version__, "-V", "--version", message="flexgs-edge %(version)s")
 def command() -> None:
     """Make trained 3D Gaussian splatting scenes more than ten times smaller, without training.

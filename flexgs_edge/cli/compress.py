@@ -56,14 +56,7 @@ from flexgs_edge.cli import words
 @words.cameras_option
 @words.images_option
 @words.holdout_option
-@words.option(
-    "Views",
-    "--select",
-    type=click.Choice(["test", "train"]),
-    default="test",
-    show_default=True,
-    help="Views that decide where to stop: the held-out ones, or the training poses (then fidelity and modelled drop decide).",
-)
+@words.select_option
 @words.drawing_options
 @words.option(
     "Method",

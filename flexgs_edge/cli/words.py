@@ -169,6 +169,14 @@ holdout_option = option(
     show_default=True,
     help="Every N-th view by name is held out (the first, the N+1st, ...); 0 holds out none.",
 )
+select_option = option(
+    "Views",
+    "--select",
+    type=click.Choice(["test", "train"]),
+    default="test",
+    show_default=True,
+    help="Views that decide where to stop: the held-out ones, or the training poses (then fidelity and modelled drop decide).",
+)
 drawing_options = stack(
     option(
         "Views",

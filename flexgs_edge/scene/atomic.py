@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from flexgs_edge.errors import BudgetError, InputError
 
-_DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def check_writable(path: str | os.PathLike[str], force: bool = False) -> Path:
@@ -67,7 +67,7 @@ def atomic_write(path: str | os.PathLike[str], force: bool = False) -> Iterator[
             yield file
         os.replace(temporary, target)
     except OSError as error:
-        if error.errno in _DISK_FULL:
+        if error.errno in DISK_FULL:
             raise BudgetError(
                 f"{path}: the disk is full ({error.strerror}); free some space or write elsewhere"
             ) from error

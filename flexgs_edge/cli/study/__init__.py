@@ -1,0 +1,26 @@
+"""`flexgs-edge study`: experiments, one module a subcommand."""
+
+from __future__ import annotations
+
+import click
+
+from flexgs_edge.cli.lazy import LazyGroup
+
+COMMANDS = {
+    "paper": "The FlexGaussian paper's evaluation: nine experiments on the paper's method, beside its own figures.",
+}
+"""Subcommands and their line in the overview."""
+
+
+@click.group(cls=LazyGroup, commands_from=("flexgs_edge.cli.study", COMMANDS))
+def command() -> None:
+    """Make the experiments of a paper on scenes of your own: tables, charts and one page.
+
+    Every study writes a folder: index.html with all charts, and for every experiment its rows as CSV and JSON and its chart as
+    PNG and SVG. Charts need matplotlib: pip install 'flexgs-edge[charts]'.
+
+    \b
+    Examples:
+      flexgs-edge study paper point_cloud.ply -o study
+      flexgs-edge study paper --help
+    """

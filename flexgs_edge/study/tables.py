@@ -1,0 +1,104 @@
+"""Tables of experiments: rows once, as CSV, JSON and HTML."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from flexgs_edge.report import html
+
+Cell = str | int | float | bool | None
+Row = Mapping[str, Cell]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    Parameters
+    ----------
+    name : str
+        Key of the rows, and head in CSV and JSON.
+    head : str
+        Head for people, with the unit.
+    """
+
+    name: str
+    head: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """What an experiment measured: rows that hold exactly the columns, in their order.
+
+    Numbers are rounded when the rows are made: CSV, JSON, page and charts then show the same ones.
+    """
+
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+
+    def __post_init__(self) -> None:
+        names = [column.name for column in self.columns]
+        for number, row in enumerate(self.rows):
+            if list(row) != names:
+                raise ValueError(f"row {number}: expected the columns {', '.join(names)}, found {', '.join(row)}")
+
+    def values(self, column: str, **where: Cell) -> list[Any]:
+        """The column's cells of the rows whose other cells are as in `where`."""
+        return [row[column] for row in self.rows if all(row[key] == cell for key, cell in where.items())]
+
+    def to_csv(self) -> bytes:
+        """UTF-8 with a head line and LF; an empty cell is null, floats read back as the same numbers."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(column.name for column in self.columns)
+        writer.writerows(map(_csv_cell, row.values()) for row in self.rows)
+        return text.getvalue().encode()
+
+    def to_json(self) -> list[dict[str, Cell]]:
+        """The rows as plain records."""
+        return [dict(row) for row in self.rows]
+
+    def to_html(self) -> str:
+        """A table for the page."""
+        return html.table(
+            [column.head for column in self.columns], [[_words(cell) for cell in row.values()] for row in self.rows]
+        )
+
+
+def json_bytes(record: Any) -> bytes:
+    """A record as JSON text; NaN and infinity are faults."""
+    return (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
+
+
+def columns(**heads: str) -> tuple[Column, ...]:
+    """Columns from `name="head"`."""
+    return tuple(Column(name, head) for name, head in heads.items())
+
+
+def mean(values: Sequence[float]) -> float:
+    """Mean of at least one number."""
+    return sum(values) / len(values)
+
+
+def _csv_cell(cell: Cell) -> str:
+    if cell is None:
+        return ""
+    if isinstance(cell, bool):
+        return "true" if cell else "false"
+    return repr(cell) if isinstance(cell, float) else str(cell)
+
+
+def _words(cell: Cell) -> str:
+    if cell is None:
+        return "-"
+    if isinstance(cell, bool):
+        return "yes" if cell else "no"
+    if isinstance(cell, float):
+        return f"{cell:.7g}"
+    # Sizes are read by digit groups; a narrow no-break space keeps them in one piece.
+    return f"{cell:,}".replace(",", "\N{NARROW NO-BREAK SPACE}") if isinstance(cell, int) else cell
