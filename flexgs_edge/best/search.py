@@ -18,6 +18,8 @@ import numpy as np
 from flexgs_edge.adapt import Measurement, Target
 from flexgs_edge.adapt.line import AIM, NEAREST, next_point
 from flexgs_edge.best.choice import BitModel, choose, drop_bands
+from flexgs_edge.best.effort import Effort
+from flexgs_edge.best.kept import Kept, Mended
 from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
 from flexgs_edge.best.steps import Slopes, choose_steps, holdable, probe_slopes
 from flexgs_edge.constants import SH_C0
@@ -47,94 +49,6 @@ EXTRA_STEPS = 3
 """Steps beyond the effort's own while nothing close to the target holds."""
 LARGEST_STRIDE = 1.2
 """Largest change of the log of the multiplier between two steps."""
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How much work a search spends; fixed counts.
-
-    Parameters
-    ----------
-    keep : float
-        Share of the Gaussians that stays in each round of the path.
-    refit_rounds : int
-        Rounds on all coefficients before SH are put on their grid (one on the constant follows).
-    subsets : int
-        Steps a round, as for `refit_colours`.
-    steps : int
-        Whole results that are measured, at most while something holds.
-    close : float
-        Excess (log of loss over limit) that ends the search when it is no farther below the target: 0.03 are about 1.5 % of
-        the bytes.
-    views : int
-        Most scored poses.
-    """
-
-    keep: float
-    refit_rounds: int
-    subsets: int
-    steps: int
-    close: float
-    views: int
-
-
-EFFORTS = {
-    "fast": Effort(keep=0.66, refit_rounds=1, subsets=4, steps=2, close=0.08, views=24),
-    "balanced": Effort(keep=0.8, refit_rounds=1, subsets=6, steps=3, close=0.04, views=96),
-    "thorough": Effort(keep=0.88, refit_rounds=2, subsets=6, steps=6, close=0.015, views=400),
-}
-
-
-@dataclass
-class _Mended:
-    """Colours after a refit, by row of the scene (ascending): where the next refit starts."""
-
-    rows: np.ndarray
-    degrees: np.ndarray
-    planes: dict[str, np.ndarray]
-
-    @classmethod
-    def of(cls, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> _Mended:
-        order = np.argsort(rows)
-        return cls(rows[order], degrees[order], {name: planes[name][:, order] for name in ("sh_dc", "sh_rest")})
-
-    def apply(self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """`planes` with these colours where a row was kept with the same SH degree."""
-        if not len(self.rows):
-            return planes
-        at = np.minimum(np.searchsorted(self.rows, rows), len(self.rows) - 1)
-        same = np.flatnonzero((self.rows[at] == rows) & (self.degrees[at] == degrees))
-        changed = {name: planes[name].copy() for name in self.planes}
-        for name, values in changed.items():
-            # A grid may have lost its highest degrees: coefficients are channel by channel.
-            mended = self.planes[name].reshape(3, -1, len(self.rows))
-            values.reshape(3, -1, len(rows))[:, : mended.shape[1], same] = mended[:, :, at[same]]
-        return {**planes, **changed}
-
-
-@dataclass
-class _Kept:
-    """What a multiplier keeps.
-
-    Attributes
-    ----------
-    snapshot : int
-        Number of the snapshot that was asked.
-    rows : np.ndarray
-        [n] i64, rows of the scene.
-    planes : dict
-        Of these rows, with SH dropped.
-    degrees : np.ndarray
-        [n] u8, SH degrees.
-    weight2 : np.ndarray
-        [n] f64, sums of squared weights.
-    """
-
-    snapshot: int
-    rows: np.ndarray
-    planes: dict[str, np.ndarray]
-    degrees: np.ndarray
-    weight2: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -289,13 +203,13 @@ class MultiplierSearch(ABC, Generic[Product]):
                 break
         return index, keep, degrees
 
-    def kept(self, multiplier: float) -> _Kept:
+    def kept(self, multiplier: float) -> Kept:
         """What a multiplier keeps."""
         index, keep, degrees = self._snapshot(multiplier)
         snapshot = self.path.snapshots[index]
         rows = np.flatnonzero(keep)
         planes = drop_bands(take_rows(snapshot.planes, rows), degrees[rows], snapshot.costs.sh_mean[:, :, rows], SH_C0)
-        return _Kept(index, snapshot.rows[rows], planes, degrees[rows], snapshot.costs.weight2[rows])
+        return Kept(index, snapshot.rows[rows], planes, degrees[rows], snapshot.costs.weight2[rows])
 
 
 class RateSearch(MultiplierSearch[GridScene]):
@@ -322,7 +236,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         super().__init__(path, measure, effort, on_step)
         self.size_of, self.refit = size_of, refit
         self._slopes: dict[int, Slopes] = {}
-        self._mended: _Mended | None = None
+        self._mended: Mended | None = None
 
     def _calibrate(self, multiplier: float) -> None:
         """Ask the coder what Gaussians cost near the answer. Once: or every step would search another function."""
@@ -362,7 +276,7 @@ class RateSearch(MultiplierSearch[GridScene]):
             place = max(min(place, high), low)
         return math.exp(place)
 
-    def _choice(self, multiplier: float) -> tuple[_Kept, Steps]:
+    def _choice(self, multiplier: float) -> tuple[Kept, Steps]:
         """What a multiplier keeps, with the colours of the last refit, and the grid steps."""
         kept = self.kept(multiplier)
         if self._mended is not None:
@@ -387,7 +301,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         seconds = time.perf_counter() - started
         return RateStep(multiplier, len(kept.rows), sh_count, size, measurement, excess, seconds), grid
 
-    def _finish(self, kept: _Kept, steps: Steps) -> GridScene:
+    def _finish(self, kept: Kept, steps: Steps) -> GridScene:
         """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
         path, planes = self.path, kept.planes
         fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
@@ -406,7 +320,7 @@ class RateSearch(MultiplierSearch[GridScene]):
                 subsets=self.effort.subsets,
                 progress=path.progress,
             )
-            self._mended = _Mended.of(kept.rows[order], degrees, moved)
+            self._mended = Mended.of(kept.rows[order], degrees, moved)
             coarse = from_grid(
                 recolour(
                     replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree])),

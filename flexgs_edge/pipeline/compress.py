@@ -20,13 +20,14 @@ from flexgs_edge.errors import TargetError
 from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, from_grid
 from flexgs_edge.pipeline.best import grid_search, layered, search_best, search_files
+from flexgs_edge.pipeline.bits import bits_by_sensitivity
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
 from flexgs_edge.pipeline.inputs import Scene, Views, companions_of, find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.outputs import check_outputs, temporary_name
-from flexgs_edge.pipeline.plan import EVERYTHING, Plan, make_settings
+from flexgs_edge.pipeline.plan import Plan, make_settings
 from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.pipeline.report import Reporter
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, run_info
@@ -34,16 +35,13 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice, nonzero_sh, order_from_scores
 from flexgs_edge.quantize import QuantizedScene
 from flexgs_edge.render import DeviceScene
-from flexgs_edge.render.quality import Quality, error_for_drop
+from flexgs_edge.render.quality import Quality
 from flexgs_edge.report.result import CompressResult
 from flexgs_edge.scene import MemorySource, SceneSource
 from flexgs_edge.score import ScoreCache, fingerprint, load_scores, save_scores, score_scene
-from flexgs_edge.sensitivity import ALLOWED_DROP, Sensitivity, search_bits
+from flexgs_edge.sensitivity import Sensitivity
 
 LOG = logging.getLogger("flexgs_edge")
-
-SENSITIVITY_VIEWS = 8
-"""Training poses that `--bits auto` measures on, evenly spread."""
 
 
 def compress(
@@ -158,7 +156,9 @@ class _Job:
         bits, _ = self.options.bit_spec()
         if bits is None:
             with self.clock.stage("sensitivity"):
-                bits = self._search_bits(evaluator)
+                bits, self.sensitivity = bits_by_sensitivity(
+                    evaluator, self.views, self.options.base_psnr, self.progress
+                )
         evaluator.bits = bits
         with self.clock.stage("search"):
             search = self._search(evaluator)
@@ -304,29 +304,6 @@ class _Job:
     def _evaluator(self, order: np.ndarray, has_sh: np.ndarray, bits: BitSpec, judge: Judge | None) -> SceneEvaluator:
         renderer = self.workspace.renderer if self.workspace else None
         return SceneEvaluator(self.source, order, has_sh, bits, self.groups, renderer, judge, self.budget)
-
-    def _search_bits(self, evaluator: SceneEvaluator) -> BitSpec:
-        """`--bits auto` on a few training poses, with nothing pruned."""
-        assert self.workspace is not None and self.views is not None
-        renderer, train = self.workspace.renderer, self.views.train
-        indices = [
-            train[i * len(train) // min(SENSITIVITY_VIEWS, len(train))]
-            for i in range(min(SENSITIVITY_VIEWS, len(train)))
-        ]
-        judge = Judge(renderer, self.source, self.views, indices, self.budget, False, self.options.base_psnr)
-        with renderer.load(self.source) as original:
-            judge.prepare(original, self.progress)
-
-        def error(bits: BitSpec) -> float:
-            with evaluator.quantized(EVERYTHING, bits) as quantized, renderer.load_quantized(quantized) as scene:
-                return judge.compare(scene).error
-
-        kept, with_sh = evaluator.counts(EVERYTHING)
-        allowed = error_for_drop(ALLOWED_DROP, self.options.base_psnr)
-        bits, self.sensitivity = search_bits(error, self.source.sh_degree, with_sh / kept, allowed)
-        judge.close()
-        LOG.info("bits found by sensitivity: %s", bits)
-        return bits
 
     def _search(self, evaluator: SceneEvaluator) -> SearchResult | None:
         fixed = self.options.fixed

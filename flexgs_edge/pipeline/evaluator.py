@@ -58,7 +58,7 @@ class SceneEvaluator:
         self.groups = groups
         self.renderer = renderer
         self.judge = judge
-        self._budget = budget
+        self.budget = budget
         self._ranks = ranks_from_order(order)
         self._has_sh = has_sh
         # SH rows of rank r and above, so that sizes cost nothing: the search asks for hundreds.
@@ -86,11 +86,11 @@ class SceneEvaluator:
         kept, with_sh = self.counts(choice)
         bits = self.bits if bits is None else bits
         size = quantized_bytes(kept, with_sh, self.source.sh_degree if with_sh else 0, bits, self.groups)
-        self._budget.take("the quantized scene", size)
+        self.budget.take("the quantized scene", size)
         try:
             per_row = QUANTIZE_COPIES * 4 * (14 + self.source.width("sh_rest"))
-            chunk_rows = self._budget.rows("quantizing", per_row, minimum=min(kept, 1024), most=65536)
+            chunk_rows = self.budget.rows("quantizing", per_row, minimum=min(kept, 1024), most=65536)
             rows = select_rows(self._ranks, choice, self._has_sh)
             yield quantize_scene(self.source, *rows, bits, self.groups, chunk_rows)
         finally:
-            self._budget.give(size)
+            self.budget.give(size)

@@ -215,7 +215,7 @@ def open_bench(
         companions = companions_of(path)
         scene = load_scene(path, options.drop_invalid)
         options = resolve_drawing(options, scene, companions)
-        views = find_views(options, companions)
+        views = find_views(options, companions, scene.source)
         # The plan refuses scenes without cameras and splits without training poses, in the words of `compress`.
         plan = Plan.make(options, scene, views)
         has_sh = nonzero_sh(scene.source)

@@ -1,0 +1,60 @@
+"""What a multiplier keeps, and the colours that a refit of it gave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass
+class Mended:
+    """Colours after a refit, by row of the scene (ascending): where the next refit starts."""
+
+    rows: np.ndarray
+    degrees: np.ndarray
+    planes: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> Mended:
+        """Of refitted `planes`, whose columns belong to `rows` in any order."""
+        order = np.argsort(rows)
+        return cls(rows[order], degrees[order], {name: planes[name][:, order] for name in ("sh_dc", "sh_rest")})
+
+    def apply(self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """`planes` with these colours where a row was kept with the same SH degree."""
+        if not len(self.rows):
+            return planes
+        at = np.minimum(np.searchsorted(self.rows, rows), len(self.rows) - 1)
+        same = np.flatnonzero((self.rows[at] == rows) & (self.degrees[at] == degrees))
+        changed = {name: planes[name].copy() for name in self.planes}
+        for name, values in changed.items():
+            # A grid may have lost its highest degrees: coefficients are channel by channel.
+            mended = self.planes[name].reshape(3, -1, len(self.rows))
+            values.reshape(3, -1, len(rows))[:, : mended.shape[1], same] = mended[:, :, at[same]]
+        return {**planes, **changed}
+
+
+@dataclass
+class Kept:
+    """What a multiplier keeps.
+
+    Attributes
+    ----------
+    snapshot : int
+        Number of the snapshot that was asked.
+    rows : np.ndarray
+        [n] i64, rows of the scene.
+    planes : dict
+        Of these rows, with SH dropped.
+    degrees : np.ndarray
+        [n] u8, SH degrees.
+    weight2 : np.ndarray
+        [n] f64, sums of squared weights.
+    """
+
+    snapshot: int
+    rows: np.ndarray
+    planes: dict[str, np.ndarray]
+    degrees: np.ndarray
+    weight2: np.ndarray
