@@ -15,8 +15,9 @@ from flexgs_edge.adapt import MaxDrop, Measurement, MinFidelity, Target
 from flexgs_edge.adapt.targets import MaxSize
 from flexgs_edge.best import search as search_module
 from flexgs_edge.best.choice import BitModel
+from flexgs_edge.best.effort import EFFORTS, Effort
 from flexgs_edge.best.path import Snapshot, take_rows
-from flexgs_edge.best.search import EFFORTS, EXTRA_STEPS, Effort, RateResult, RateSearch, RateStep
+from flexgs_edge.best.search import EXTRA_STEPS, RateResult, RateSearch, RateStep
 from flexgs_edge.best.steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps

@@ -10,9 +10,10 @@ import numpy as np
 
 from flexgs_edge.adapt import Measurement, SearchResult, Step, Target
 from flexgs_edge.best.choice import BitModel
+from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.layers import assign_layers
 from flexgs_edge.best.path import PrunePath
-from flexgs_edge.best.search import EFFORTS, MultiplierSearch, Product, RateResult, RateSearch, RateStep
+from flexgs_edge.best.search import MultiplierSearch, Product, RateResult, RateSearch, RateStep
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
 from flexgs_edge.codec.container2 import coded_parts
