@@ -43,6 +43,10 @@ FINE_COLOUR = 2.0**-8
 MOST_ROUNDS = 24
 MENDED = 0.7
 """Loss after the colour refit over the loss before it, until a whole result tells (the sample scene)."""
+DRIFT = -0.2
+"""What a second refit, which goes on where the first one ended, adds to the excess (the sample: -0.3 to -0.1)."""
+DECAY = 0.45
+"""Part of that which the next refit adds again."""
 PROBES = 3
 """Unmended results that are looked at between two whole ones, at most: a tenth of the time each."""
 EXTRA_STEPS = 3
@@ -237,6 +241,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         self.size_of, self.refit = size_of, refit
         self._slopes: dict[int, Slopes] = {}
         self._mended: Mended | None = None
+        self._drift, self._expected = DRIFT, 0.0
 
     def _calibrate(self, multiplier: float) -> None:
         """Ask the coder what Gaussians cost near the answer. Once: or every step would search another function."""
@@ -257,16 +262,22 @@ class RateSearch(MultiplierSearch[GridScene]):
         """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
+        offset = math.log(MENDED) if self.refit and not by_size else 0.0
         if steps:
             offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
-        else:
-            offset = math.log(MENDED) if self.refit and not by_size else 0.0
+            if self.refit and not by_size:
+                # Those probes have the colours of the last refit; the next one goes on from them.
+                if len(steps) > 1:
+                    self._drift = DECAY * min(self._drift + steps[-1].excess - self._expected, 0.0)
+                offset += self._drift
         low, high = _bounds(steps)
         place = math.log(multiplier)
         last: tuple[float, float] | None = None
+        self._expected = AIM
         for _ in range(PROBES):
             excess = self._probe(math.exp(place), target) + offset
             if abs(excess - AIM) < -AIM:
+                self._expected = excess
                 break
             if last is not None and last[0] != place:
                 measured = (excess - last[1]) / (place - last[0])
