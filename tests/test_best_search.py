@@ -163,7 +163,7 @@ def test_out_of_reach_names_the_closest_point() -> None:
     with pytest.raises(TargetError, match=r"drop <= 1 dB is out of reach.*drop 2\.000 dB at .*--best-effort"):
         search(world, MaxDrop(1.0))
     found = search(powers_with_floor(2.0), MaxDrop(1.0), best_effort=True)
-    assert not found.reached and not found.chosen.holds and len(found.steps) == EFFORT.steps + EXTRA_STEPS
+    assert not found.reached and not found.chosen.holds and len(found.steps) <= EFFORT.steps + EXTRA_STEPS
     assert found.chosen.excess == min(step.excess for step in found.steps)
     assert found.product.count > 0
 
