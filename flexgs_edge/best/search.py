@@ -53,6 +53,8 @@ EXTRA_STEPS = 3
 """Steps beyond the effort's own while nothing close to the target holds."""
 LARGEST_STRIDE = 1.2
 """Largest change of the log of the multiplier between two steps."""
+FARTHEST = 3.0
+"""The same for probes together."""
 
 
 @dataclass(frozen=True)
@@ -272,6 +274,8 @@ class RateSearch(MultiplierSearch[GridScene]):
                 offset += self._drift
         low, high = _bounds(steps)
         place = min(max(math.log(multiplier), low), high)
+        # Curves that are flat, where nothing holds, must not send the search to the end of numbers.
+        low, high = max(low, place - FARTHEST), min(high, place + FARTHEST)
         seen: list[tuple[float, float]] = []
         self._expected = AIM
         for _ in range(PROBES):
