@@ -125,7 +125,7 @@ def test_fixed_rates_and_scores_of_a_file(project: Path, tmp_path: Path) -> None
     np.save(tmp_path / "s.npy", scores)
     lonely = tmp_path / "lonely.ply"
     lonely.write_bytes((project / "point_cloud.ply").read_bytes())
-    words: dict[str, Any] = {"score": str(tmp_path / "s.npy"), "prune_rate": 0.5}
+    words: dict[str, Any] = {"score": str(tmp_path / "s.npy"), "prune_rate": 0.5, "cameras": "none"}
     result = compress(lonely, tmp_path / "a.spz", sh_rate=0.25, **words)
     assert (result.count, result.sh_count, result.quality, result.reached) == (COUNT // 2, COUNT // 4, None, None)
     bare = compress(lonely, tmp_path / "b.spz", sh_rate=0.5, **words)

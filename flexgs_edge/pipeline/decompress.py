@@ -17,7 +17,7 @@ from flexgs_edge.scene import check_writable, inria_dtype, write_ply
 WRITE_COPIES = 3
 """Times a chunk's rows that decoding and writing hold at once: codes, planes, rows of the PLY."""
 
-ANTIALIASED_NOTE = "an antialiased model: a PLY cannot say so; viewers must be told, and here --antialiased"
+ANTIALIASED_NOTE = "an antialiased model: the file does not say so; viewers must be told, and here --antialiased"
 
 
 def decompress(
