@@ -52,7 +52,8 @@ inline uint tile_mask(int4 first, int4 last, int tile_x) {
     const int y1 = (int)fmin(floor(r[1] + r[10] + slack), height - 1.0f);                                       \
     for (int top = y0 / TILE; top <= y1 / TILE; top += BANDS / 4) {                                             \
       int first[BANDS], last[BANDS];                                                                            \
-      for (int v = 0; v < BANDS; v += W) {                                                                      \
+      const int bands = min(BANDS, 4 * (y1 / TILE - top + 1));                                                  \
+      for (int v = 0; v < bands; v += W) {                                                                      \
         IW f, l;                                                                                                \
         block_spans(r, top * 4 + v, width, &f, &l);                                                             \
         STOREI(f, first, v);                                                                                    \
