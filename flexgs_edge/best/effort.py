@@ -35,7 +35,7 @@ class Effort:
 
 
 EFFORTS = {
-    "fast": Effort(keep=0.66, refit_rounds=1, subsets=3, steps=2, close=0.08, views=32),
+    "fast": Effort(keep=0.66, refit_rounds=1, subsets=3, steps=2, close=0.08, views=48),
     "balanced": Effort(keep=0.8, refit_rounds=1, subsets=3, steps=4, close=0.04, views=96),
     "thorough": Effort(keep=0.88, refit_rounds=2, subsets=4, steps=6, close=0.015, views=400),
 }

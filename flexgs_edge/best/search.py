@@ -43,17 +43,19 @@ FINE_COLOUR = 2.0**-8
 MOST_ROUNDS = 24
 MENDED = 0.7
 """Loss after the colour refit over the loss before it, until a whole result tells (the sample scene)."""
-DRIFT = -0.2
-"""What a second refit, which goes on where the first one ended, adds to the excess (the sample: -0.3 to -0.1)."""
-DECAY = 0.45
-"""Part of that which the next refit adds again."""
-PROBES = 5
+DRIFT = -0.12
+"""What a second refit, which goes on where the first one ended, adds to the excess (fox -.15, the sample -.3 to 0)."""
+DECAY = 0.8
+"""Part of that which the next refit adds again (fox .9, the sample .4). Above zero where refits fit the scored poses too well."""
+FARTHER = 0.05
+"""Excess below the target that is aimed at for each result that missed it, from the second in a row on."""
+PROBES = 4
 """Unmended results that are looked at between two whole ones, at most: a thirtieth of the time each."""
-EXTRA_STEPS = 3
+EXTRA_STEPS = 4
 """Steps beyond the effort's own while nothing close to the target holds."""
 LARGEST_STRIDE = 1.2
 """Largest change of the log of the multiplier between two steps."""
-FARTHEST = 3.0
+FARTHEST = 2.0
 """The same for probes together."""
 
 
@@ -241,7 +243,7 @@ class RateSearch(MultiplierSearch[GridScene]):
     ) -> None:
         super().__init__(path, measure, effort, on_step)
         self.size_of, self.refit = size_of, refit
-        self._slopes: dict[int, Slopes] = {}
+        self._slopes: Slopes | None = None
         self._mended: Mended | None = None
         self._drift, self._expected = DRIFT, 0.0
 
@@ -270,8 +272,9 @@ class RateSearch(MultiplierSearch[GridScene]):
             if self.refit and not by_size:
                 # Those probes have the colours of the last refit; the next one goes on from them.
                 if len(steps) > 1:
-                    self._drift = DECAY * min(self._drift + steps[-1].excess - self._expected, 0.0)
-                offset += self._drift
+                    self._drift = DECAY * (self._drift + steps[-1].excess - self._expected)
+                # Whatever the reason that results keep missing: go farther each time.
+                offset += self._drift + FARTHER * max(_misses(steps) - 1, 0)
         low, high = _bounds(steps)
         place = min(max(math.log(multiplier), low), high)
         # Curves that are flat, where nothing holds, must not send the search to the end of numbers.
@@ -293,12 +296,10 @@ class RateSearch(MultiplierSearch[GridScene]):
         if self._mended is not None:
             kept.planes = self._mended.apply(kept.rows, kept.degrees, kept.planes)
         snapshot = self.path.snapshots[kept.snapshot]
-        if kept.snapshot not in self._slopes:
-            self._slopes[kept.snapshot] = probe_slopes(
-                self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras
-            )
-        slopes = self._slopes[kept.snapshot]
-        steps = choose_steps(slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
+        if self._slopes is None:
+            # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
+            self._slopes = probe_slopes(self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras)
+        steps = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
         return kept, holdable(steps, kept.planes)
 
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
@@ -362,6 +363,11 @@ def _better(step: RateStep, other: RateStep, target: Target) -> bool:
     if target.limit_bytes is not None:
         return step.measurement.loss(target.judge) < other.measurement.loss(target.judge)
     return step.size < other.size
+
+
+def _misses(steps: Sequence[RateStep]) -> int:
+    """How many of the last results missed the target."""
+    return next((count for count, step in enumerate(reversed(steps)) if step.holds), len(steps))
 
 
 def _bounds(steps: Sequence[RateStep]) -> tuple[float, float]:

@@ -16,9 +16,10 @@ from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
 
 RELAX_DC = 1.0
-RELAX_SH = 0.3
+RELAX_SH = 0.6
 """Step of a round, as a share of the SIRT step of the constant alone. With all bands moving at once, a pixel's row sum is
-about 1 + 15 mean |Y_k| / Y_0 of the constant's, hence the smaller step for the bands."""
+about 1 + 15 mean |Y_k| / Y_0 of the constant's, hence the smaller step for the bands. Bytes at 1 dB after one whole result of
+effort fast with all poses, fox: 0.3 683 kB, 0.6 660, 1.0 662, 1.4 673."""
 
 
 def refit_colours(
