@@ -142,7 +142,7 @@ from flexgs_edge.cli import words
     type=click.Choice(["fast", "balanced", "thorough"]),
     default="balanced",
     show_default=True,
-    help="Steps of the search: paper 4, 10 or 32 after its list (other formats: 4, 6 or 10 files); best 3, 4 or 6 whole "
+    help="Steps of the search: paper 4, 10 or 32 after its list (other formats: 4, 6 or 10 files); best 2, 4 or 6 whole "
     "results, with more rounds and poses each. Counted, never timed: same command, same bytes.",
 )
 @words.drop_invalid_option
@@ -155,8 +155,8 @@ def command(input: str, output: str | None, json_path: str | None, quiet: bool, 
     """Compress a scene: the fewest bytes that hold a quality, or the best quality in a size.
 
     INPUT is a .ply in INRIA's layout, a .fgs, .spz, .sog or .compressed.ply, or a model folder of the 3DGS training program.
-    A cameras.json and an images/ folder beside it are used and named in the summary. Gaussians are scored over the training
-    poses; then a search finds how many to remove, how many lose their view-dependent colour, and measures each step by
+    Cameras and an images/ folder beside it are used and named in the summary; a lone scene gets views made from itself.
+    Gaussians are scored over the training poses; then a search finds how many to remove, how many lose their view-dependent colour, and measures each step by
     rendering. The figures in the summary are measured on the finished file. With -o OUT.spz, .sog or .compressed.ply every
     step writes that format and measures what it decodes to, so its own losses count.
 
