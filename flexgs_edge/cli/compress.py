@@ -156,9 +156,9 @@ def command(input: str, output: str | None, json_path: str | None, quiet: bool, 
 
     INPUT is a .ply in INRIA's layout, a .fgs, .spz, .sog or .compressed.ply, or a model folder of the 3DGS training program.
     Cameras and an images/ folder beside it are used and named in the summary; a lone scene gets views made from itself.
-    Gaussians are scored over the training poses; then a search finds how many to remove, how many lose their view-dependent colour, and measures each step by
-    rendering. The figures in the summary are measured on the finished file. With -o OUT.spz, .sog or .compressed.ply every
-    step writes that format and measures what it decodes to, so its own losses count.
+    Gaussians are scored over the training poses; then a search finds how many to remove, how many lose their view-dependent
+    colour, and measures each step by rendering. The figures in the summary are measured on the finished file. With -o OUT.spz,
+    .sog or .compressed.ply every step writes that format and measures what it decodes to, so its own losses count.
 
     \b
     Examples:
