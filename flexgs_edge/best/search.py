@@ -50,7 +50,7 @@ DECAY = 0.8
 FARTHER = 0.05
 """Excess below the target that is aimed at for each result that missed it, from the second in a row on."""
 PROBES = 4
-"""Unmended results that are looked at between two whole ones, at most: a thirtieth of the time each."""
+"""Unmended results that are looked at between two whole ones, at most: less than a tenth of the time each."""
 EXTRA_STEPS = 4
 """Steps beyond the effort's own while nothing close to the target holds."""
 LARGEST_STRIDE = 1.2
