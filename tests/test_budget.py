@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -188,3 +191,11 @@ def test_memory_of_a_container(tmp_path: Path, group: str, limits: Any, expected
 
 def test_memory_where_nothing_can_be_read(tmp_path: Path) -> None:
     assert available_memory(tmp_path, tmp_path) == 2**30
+
+
+def test_the_peak_is_this_process_s_own() -> None:
+    """ru_maxrss survives exec: a child of a large process would report its parent."""
+    ballast = np.ones(200 * 2**20, np.uint8)
+    command = [sys.executable, "-c", "from flexgs_edge.budget import peak_rss; print(peak_rss())"]
+    found = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[1])
+    assert int(found.stdout) < ballast.nbytes

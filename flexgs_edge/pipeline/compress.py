@@ -242,6 +242,8 @@ class _Job:
         """The job for another program's format, in rank order or (`order` None) by measured costs: see `pipeline.foreign`."""
         options, plan = self.options, self.plan
         renderer = self.workspace.renderer if self.workspace else None
+        if options.antialiased:
+            LOG.warning("%s does not say that the model is antialiased: viewers must be told", format.suffix)
         with open_files(format, output, options.force, self.budget, renderer, decide) as files:
             if plan.target is not None:
                 LOG.info("searching for %s", plan.target.describe())
