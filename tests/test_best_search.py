@@ -16,6 +16,7 @@ from flexgs_edge.adapt.targets import MaxSize
 from flexgs_edge.best import search as search_module
 from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.effort import EFFORTS, Effort
+from flexgs_edge.best.kept import Mended
 from flexgs_edge.best.path import Snapshot, take_rows
 from flexgs_edge.best.search import EXTRA_STEPS, RateResult, RateSearch, RateStep
 from flexgs_edge.best.steps import GEOMETRY, Slopes, choose_steps
@@ -247,3 +248,19 @@ def test_efforts_grow() -> None:
         assert getattr(fast, name) <= getattr(balanced, name) <= getattr(thorough, name)
         assert getattr(fast, name) < getattr(thorough, name)
     assert fast.close > balanced.close > thorough.close
+
+
+def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> None:
+    rng = np.random.default_rng(5)
+    mended = {"sh_dc": rng.normal(size=(3, 3)).astype(np.float32), "sh_rest": np.ones((9, 3), np.float32)}
+    last = Mended.of(np.array([7, 2, 5]), np.array([1, 0, 1]), mended)
+    planes = {"sh_dc": np.zeros((3, 4), np.float32), "sh_rest": np.zeros((24, 4), np.float32), "means": np.ones((3, 4))}
+    found = last.apply(np.array([1, 2, 5, 7]), np.array([1, 1, 1, 1]), planes)
+    np.testing.assert_array_equal(
+        found["sh_dc"], np.stack([0 * mended["sh_dc"][:, 0]] * 2 + [*mended["sh_dc"].T[[2, 0]]], 1)
+    )
+    # Three coefficients of eight a channel were there before; row 2 had another degree, row 1 was not kept.
+    expected = np.zeros((3, 8, 4))
+    expected[:, :3, 2:] = 1
+    np.testing.assert_array_equal(found["sh_rest"].reshape(3, 8, 4), expected)
+    assert not planes["sh_dc"].any() and found["means"] is planes["means"]

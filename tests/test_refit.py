@@ -77,10 +77,14 @@ class Bench:
     def fidelity(self, planes: Planes) -> float:
         return -10 * np.log10(self.error(planes))
 
-    def refit(self, planes: Planes, degrees: np.ndarray | int, rounds: int, bands: bool = True) -> Planes:
+    def refit(
+        self, planes: Planes, degrees: np.ndarray | int, rounds: int, bands: bool = True, subsets: int = 1
+    ) -> Planes:
         count = planes["means"].shape[1]
         degrees = np.broadcast_to(np.asarray(degrees, np.uint8), count)
-        return refit_colours(self.renderer, planes, degrees, np.zeros(3), self.cameras, self.targets, rounds, bands)
+        return refit_colours(
+            self.renderer, planes, degrees, np.zeros(3), self.cameras, self.targets, rounds, bands, subsets
+        )
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -91,6 +95,16 @@ def test_every_round_gets_closer(degree: int) -> None:
     fidelity = [bench.fidelity(bench.refit(wrong, degree, rounds)) for rounds in range(5)]
     assert (np.diff(fidelity) > 0.1).all(), fidelity
     assert fidelity[-1] > fidelity[0] + (5 if degree == 0 else 3), fidelity
+
+
+def test_steps_after_parts_of_the_poses_get_closer_than_one_after_all() -> None:
+    planes = bright_planes(1)
+    bench = Bench(planes)
+    wrong = perturbed(planes)
+    one, three = bench.refit(wrong, 1, 1), bench.refit(wrong, 1, 1, subsets=3)
+    assert bench.fidelity(three) > bench.fidelity(one) + 0.5
+    most = bench.refit(wrong, 1, 1, subsets=len(bench.cameras))
+    assert same_bits(bench.refit(wrong, 1, 1, subsets=99)["sh_dc"], most["sh_dc"])
 
 
 def test_the_constant_alone_gets_closer_too() -> None:
