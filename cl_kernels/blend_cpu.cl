@@ -8,6 +8,17 @@
 #define BLOCK_VECTORS (16 / W)   // vectors of a 4x4 block
 #define BLOCKS 16                // blocks of a tile
 #define RETIRE_EVERY 16          // splats between two looks for blocks whose pixels have all ended
+#define AHEAD 8                  // splats
+
+// Records and sums lie in row order, so a tile's are all over the memory: without this a third of the blend waits for them.
+#if defined(__has_builtin) && !defined(NO_FETCH)
+#if __has_builtin(__builtin_prefetch)
+#define FETCH(p) __builtin_prefetch(p)
+#endif
+#endif
+#ifndef FETCH
+#define FETCH(p)
+#endif
 
 #ifndef STATS
 #error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs) must be defined"
@@ -37,9 +48,8 @@ inline int any_alive(FW t) {
 }
 
 #if STATS
-#define ADD_SUM(k, v, scale)                                                                               \
-  add_fixed(sums + (size_t)(2 * (k)) * rows + pair.x, sums + (size_t)(2 * (k) + 1) * rows + pair.x, \
-            tree_sum(v), scale)
+#define SUMS (STATS == 1 ? 1 : STATS == 2 ? 2 : STATS == 3 ? 4 : 6)
+#define ADD_SUM(k, v, scale) add_fixed(sums + (size_t)pair.x * (2 * SUMS) + 2 * (k), tree_sum(v), scale)
 
 // The fixed pairwise tree over the 16 lanes of a block: l + (l + 8), then + 4, + 2, + 1.
 #if W == 16
@@ -105,8 +115,7 @@ __kernel void blend(
 #if STATS
     ,
     __global uint *hits,                  // [N]
-    __global uint *sums,                  // [S, 2, N] low and high words of fixed-point sums, see SUMS in renderer.py
-    const uint rows,                      // N
+    __global uint *sums,                  // [N, SUMS, 2] low and high words of fixed-point sums
     __global const float *target          // [3, padded height, padded width] 2, 4: the finished image, 3: the residual
 #endif
 #if STATS == 4
@@ -160,6 +169,11 @@ __kernel void blend(
       if (!live) break;
     }
     const uint2 pair = pairs[n];
+    const size_t ahead = pairs[min(n + AHEAD, last - 1)].x;
+    FETCH(records + ahead * 16);
+#if STATS
+    FETCH(sums + ahead * (2 * SUMS));
+#endif
     uint mask = pair.y & live;
     if (!mask) continue;
     __global const float *r = records + (size_t)pair.x * 16;

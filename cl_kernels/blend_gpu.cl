@@ -45,7 +45,6 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
     ,
     __global uint *hits,
     __global uint *sums,
-    const uint rows,
     __global const float *target
 #endif
 #if STATS == 4
@@ -168,8 +167,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
           __local float *s = parts[c];
           for (int l = 0; l < 8; ++l) s[l] += s[l + 8];
           for (int l = 0; l < 4; ++l) s[l] += s[l + 4];
-          add_fixed(sums + (size_t)(2 * c) * rows + row, sums + (size_t)(2 * c + 1) * rows + row,
-                    (s[0] + s[2]) + (s[1] + s[3]), SUM_UNIT);
+          add_fixed(sums + ((size_t)row * SUMS + c) * 2, (s[0] + s[2]) + (s[1] + s[3]), SUM_UNIT);
         }
       }
       barrier(CLK_LOCAL_MEM_FENCE);

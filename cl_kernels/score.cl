@@ -16,15 +16,11 @@ __kernel void residual(
 #endif
 }
 
-// Fixed-point words (low, high) of W rows as float; 0 in the last `W - count` lanes, whose words belong to other chunks.
-// Planes of sums are W - 1 elements longer than the scene.
-inline FW sum_value(__global const uint *low, __global const uint *high, size_t row, int count, float unit) {
-#if W == 1
-  return convert_float((long)((ulong)low[row] | (ulong)high[row] << 32)) * unit;
-#else
-  const CAT(ulong, W) words = CAT(convert_ulong, W)(CAT(vload, W)(0, low + row)) | CAT(convert_ulong, W)(CAT(vload, W)(0, high + row)) << 32;
-  return pick(MASK(LANE_INDEX < (IW)count), CAT(convert_float, W)(CAT(as_long, W)(words)) * (FW)unit, (FW)0.0f);
-#endif
+// Sum number `plane` of W rows as float; 0 in lanes from `count` on, whose rows belong to other chunks.
+inline FW sum_value(__global const long *sums, uint planes, uint plane, size_t row, int count, float unit) {
+  float lanes[W];
+  for (int l = 0; l < W; ++l) lanes[l] = l < count ? convert_float(sums[(row + l) * planes + plane]) : 0.0f;
+  return LOADF(lanes, 0) * (FW)unit;
 }
 
 // acc[i] += value in fixed point: sums over views in any order give the same bits.
@@ -44,18 +40,17 @@ __kernel void sh_costs(
     const uint stride,
     const uint base,                    // row of the scene that the chunk starts at
     const uint degree,                  // SH degree of the chunk, at least 1
-    const uint rows,                    // elements of a plane of `sums`
-    const uint plane,                   // plane of `sums` that holds the squared weights
+    const uint planes,                  // S
+    const uint plane,                   // which of them holds the squared weights
     __global const float *camera,       // [32]
     __global const float *means,        // [3, stride]
     __global const float *sh_rest,      // [3 * K, stride]
-    __global const uint *sums,          // [S, 2, rows] words from a blend with removal costs
+    __global const long *sums,          // [N, S] from a blend with removal costs
     __global long *moments)             // [degree, 4, stride]
 {
   const size_t i = get_global_id(0) * W, s = stride;
   if (i >= count) return;
-  __global const uint *words = sums + 2 * (size_t)plane * rows;
-  const FW w2 = sum_value(words, words + rows, base + i, (int)min(count - (uint)i, (uint)W), 1.0f / FIXED_ERROR);
+  const FW w2 = sum_value(sums, planes, plane, base + i, (int)min(count - (uint)i, (uint)W), 1.0f / FIXED_ERROR);
   if (!ANY(MASK(w2 > (FW)0.0f))) return;
   FW x, y, z;
   view_direction(camera, LOADF(means, i), LOADF(means, s + i), LOADF(means, 2 * s + i), &x, &y, &z);
@@ -83,19 +78,17 @@ __kernel void sh_residual(
     const uint stride,
     const uint base,
     const uint degree,                  // SH degree of the chunk, 0 as well
-    const uint rows,                    // elements of a plane of `sums`
+    const uint planes,                  // S
     __global const float *camera,       // [32]
     __global const float *means,        // [3, stride]
-    __global const uint *sums,          // [S, 2, rows] words from a blend with residuals: weight, red, green, blue first
+    __global const long *sums,          // [N, S] from a blend with residuals: weight, red, green, blue first
     __global float *normal)             // [K + 1, 4, stride] red, green, blue, weight
 {
   const size_t i = get_global_id(0) * W, s = stride;
   if (i >= count) return;
   FW seen[4];
   for (int c = 0; c < 4; ++c)
-    seen[(c + 3) & 3] =
-        sum_value(sums + (size_t)(2 * c) * rows, sums + (size_t)(2 * c + 1) * rows, base + i,
-                  (int)min(count - (uint)i, (uint)W), 1.0f / FIXED_WEIGHT);
+    seen[(c + 3) & 3] = sum_value(sums, planes, (uint)c, base + i, (int)min(count - (uint)i, (uint)W), 1.0f / FIXED_WEIGHT);
   if (!ANY(MASK(seen[3] > (FW)0.0f))) return;
   FW x, y, z;
   view_direction(camera, LOADF(means, i), LOADF(means, s + i), LOADF(means, 2 * s + i), &x, &y, &z);

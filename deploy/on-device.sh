@@ -12,14 +12,16 @@ Usage: deploy/on-device.sh SCENE [OPTIONS OF COMPRESS...]
 Sets this checkout up (as deploy/setup.sh does), then compresses SCENE: a .ply, a .fgs or a model folder.
 
   deploy/on-device.sh garden/point_cloud.ply                       writes garden/point_cloud.fgs
-  deploy/on-device.sh garden/point_cloud.ply -f --max-drop 0.5     again, with the scores of the first call
+  deploy/on-device.sh garden/point_cloud.ply --effort fast         in about half the time, some more bytes
   deploy/on-device.sh garden/point_cloud.ply -o /mnt/ssd/garden.fgs --memory-limit 2GiB
+  deploy/on-device.sh garden/point_cloud.ply --method paper                       a quick look: five times the bytes,
+  deploy/on-device.sh garden/point_cloud.ply --method paper -f --max-drop 0.5     again, with the scores of that call
 
 What follows SCENE goes to `flexgs-edge compress` (.venv/bin/flexgs-edge compress --help lists it). Added unless given:
 
   -o OUT.fgs           beside the scene, under its name
   --memory-limit       a share of the memory that is free, within the limits of a container
-  --score-cache FILE   OUT.scores.npz: scores are made again only if scene, poses or score have changed (--method paper)
+  --score-cache FILE   with --method paper: OUT.scores.npz; scores are made again only if scene, poses or score have changed
 
   FLEXGS_MEMORY_SHARE  that share in percent (default 60: CPU and GPU of such boards use the same memory)
   FLEXGS_VENV, FLEXGS_PYTHON   as for deploy/setup.sh
@@ -126,7 +128,7 @@ else
 fi
 
 if [ "$method" != paper ]; then
-  note "scores: --method $method measures as it goes, there is nothing to keep"
+  note "scores: --method $method measures as it goes, there is nothing to keep (--method paper is quicker, and keeps them)"
 elif [ -n "$score" ] && [ "$score" != gs ] && [ "$score" != meson ]; then
   note "scores: from $score"
 else

@@ -29,6 +29,7 @@ fi
 
 if [ $# -eq 0 ]; then
   rm -f .coverage .coverage.* # left by a run that was killed
-  set -- --cov=flexgs_edge --cov-report=term --cov-fail-under=90
+  # Most of the suite is Python in one thread: two processes, whole files each, so that fixtures are made once.
+  set -- --numprocesses=2 --dist=loadfile --cov=flexgs_edge --cov-report=term --cov-fail-under=90
 fi
 exec "$VENV/bin/python" -m pytest "$@"

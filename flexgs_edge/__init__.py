@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from flexgs_edge.pipeline.render import render_views
     from flexgs_edge.pipeline.score import score_gaussians
     from flexgs_edge.pipeline.trim import trim
+    from flexgs_edge.pipeline.worth import worth
     from flexgs_edge.progress import Progress
     from flexgs_edge.scene import SceneSource, write_ply
 
@@ -43,6 +44,7 @@ _HOMES = {
     "info": "pipeline.info",
     "verify": "pipeline.info",
     "trim": "pipeline.trim",
+    "worth": "pipeline.worth",
     "list_devices": "device.select",
     "read_scene": "pipeline.inputs",
     "read_cameras": "cameras",
@@ -71,6 +73,7 @@ __all__ = [
     "info",
     "verify",
     "trim",
+    "worth",
     "list_devices",
     "read_scene",
     "read_cameras",

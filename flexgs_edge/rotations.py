@@ -40,6 +40,22 @@ def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarra
     return turned * np.where(turned[0] < 0, -1.0, 1.0), np.take_along_axis(log_scales, _axes(best), axis=0)
 
 
+def turned(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """[3, n] f64: vectors ([3, n]) turned by quaternions ([4, n], any norm but zero)."""
+    wide = np.asarray(quats, np.float64)
+    w, axis = wide[0], wide[1:]
+    across = 2 * np.cross(axis, vectors, axis=0) / (wide * wide).sum(axis=0)
+    result: np.ndarray = vectors + w * across + np.cross(axis, across, axis=0)
+    return result
+
+
+def tilted(quats: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """[4, n] f64: unit quaternions ([4, n]) after small turns about their own axes, `errors` [3, n] the turns' vector parts."""
+    unit = np.asarray(quats, np.float64)
+    unit = unit / np.sqrt((unit * unit).sum(axis=0))
+    return _times_conjugate(unit, np.stack([np.sqrt(1 - (errors * errors).sum(axis=0)), *-errors]))
+
+
 def _nearest_cube_rotation(quats: np.ndarray) -> np.ndarray:
     """[4, n] f64: the cube's rotation u with the largest product u . q."""
     size = np.abs(quats)

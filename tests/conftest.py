@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -40,3 +42,17 @@ def fox_dir(scenes_dir: Path) -> Path:
     if not (folder / "point_cloud.ply").is_file():
         pytest.skip(f"no fox scene at {folder}: set FLEXGS_SCENES to a folder that has it")
     return folder
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_report_to_serializable() -> Generator[None, Any, Any]:
+    """Reports travel between test processes as UTF-8, which has no place for the odd bytes of paths that some tests make."""
+    return _printable((yield))
+
+
+def _printable(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, dict):
+        return {_printable(key): _printable(inner) for key, inner in value.items()}
+    return type(value)(map(_printable, value)) if isinstance(value, (list, tuple)) else value

@@ -118,6 +118,22 @@ def test_help_is_quick_to_load(repository: Path) -> None:
     assert "flexgs_edge" in imported and "compress" in result.stdout
 
 
+def test_info_loads_nothing_heavy(repository: Path) -> None:
+    """Of either version: no device, no charts, no cameras and none of what searches."""
+    for version in ("v1", "v2"):
+        file = repository / "tests" / "golden" / version / "tiny.fgs"
+        command = f"from flexgs_edge.cli import main\ntry: main(['info', {str(file)!r}])\nexcept SystemExit: pass"
+        script = f"import sys\n{command}\nprint(*sys.modules, file=sys.stderr)"
+        result = subprocess.run(
+            [sys.executable, "-c", script], cwd=repository, capture_output=True, text=True, check=False
+        )
+        assert result.returncode == 0 and "settings:" in result.stdout, result.stderr[-2000:]
+        loaded = set(result.stderr.split())
+        assert {name.partition(".")[0] for name in loaded}.isdisjoint(HEAVY)
+        rooms = ("cameras", "render", "kernels", "device", "adapt", "study", "formats")
+        assert loaded.isdisjoint(f"flexgs_edge.{room}" for room in rooms)
+
+
 def test_modules_stay_short(repository: Path) -> None:
     lengths = {
         str(path.relative_to(repository)): len(path.read_text().splitlines())

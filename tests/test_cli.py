@@ -6,6 +6,7 @@ import errno
 import importlib
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -99,6 +100,20 @@ def test_words_of_the_options_are_those_of_the_library() -> None:
     for name in ("render", "evaluate", "score"):
         found = {p.name for p in importlib.import_module(f"flexgs_edge.cli.{name}").command.params}
         assert set(ViewOptions.__dataclass_fields__) - found <= {"images", "holdout"}
+
+
+def test_the_examples_of_help_and_readme_make_sense() -> None:
+    """Every `compress` that is shown may be typed: its options are known, and belong to its method."""
+    root = Path(cli.__file__).parents[2]
+    shown = [root / "README.md", *(root / "docs").glob("*.md"), *(root / "flexgs_edge" / "cli").glob("*.py")]
+    lines = [line.strip() for path in shown for line in path.read_text().splitlines()]
+    examples = [shlex.split(line, comments=True)[2:] for line in lines if line.startswith("flexgs-edge compress ")]
+    command = importlib.import_module("flexgs_edge.cli.compress").command
+    assert len(examples) > 15
+    for example in examples:
+        with command.make_context("compress", list(example)) as context:
+            given = {name: context.params[name] for name in CompressOptions.__dataclass_fields__}
+            CompressOptions(**given)
 
 
 def test_a_whole_way_in_processes_of_its_own(project: Path, tmp_path: Path) -> None:
@@ -202,6 +217,9 @@ def test_nothing_is_overwritten_without_force(
         (["compress", "none.ply", "-o", "a.fgs", "--background", "#12"], "#rrggbb"),
         (["compress", "none.ply", "-o", "a.fgs", "--effort", "lots"], "lots"),
         (["compress", "none.ply"], "-o OUT.fgs is missing"),
+        (["compress", "none.ply", "-o", "a.fgs", "--score-cache", "s.npz"], "add --method paper"),
+        (["compress", "none.ply", "-o", "a.fgs", "--score", "gs"], "add --method paper"),
+        (["compress", "none.ply", "-o", "a.fgs", "--method", "paper", "--refit"], "add --method best"),
         (["decompress", "none.fgs", "-o", "a.ply"], "none.fgs"),
         (["decompress", "none.fgs"], "Missing option"),
         (["info", "none.fgs"], "none.fgs"),
@@ -306,7 +324,7 @@ def test_ctrl_c_leaves_nothing_behind(sample_dir: Path, tmp_path: Path) -> None:
     root = str(Path(cli.__file__).parents[2])
     # On the twins this would take minutes: the interrupt surely comes in the middle.
     with subprocess.Popen(
-        [*command, "--device", "numpy", "--resolution", "48"],
+        [*command, "--method", "paper", "--device", "numpy", "--resolution", "48"],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": root},
         stderr=subprocess.PIPE,

@@ -132,6 +132,11 @@ def test_what_is_given_is_not_added(repository: Path, machine: dict[str, str], t
     assert refused.returncode == 4 and "no OpenCL device passes the self-test" in refused.stderr
     assert "docs/jetson.md" in refused.stderr and "--device numpy" in refused.stderr
     assert not list((tmp_path / "scene").glob("*.fgs"))
+    # Without a method: the default one, which has no scores to keep, so what only the other knows is refused.
+    other = ("--device", "numpy", "--score-cache", "c.npz")
+    refused = call(repository, machine, tmp_path, "scene/point_cloud.ply", *other, OCL_ICD_VENDORS=str(tmp_path / "no"))
+    assert refused.returncode == 2 and "add --method paper" in refused.stderr
+    assert "scores: --method best measures as it goes" in refused.stderr and not list(tmp_path.glob("*.npz"))
     Path(machine["ASKED"]).unlink(missing_ok=True)  # it may ask for PoCL then, and is told no
 
 

@@ -312,7 +312,7 @@ def test_a_score_file_of_another_scene(project: Path, tmp_path: Path) -> None:
 )
 def test_options_that_make_no_sense(words: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        CompressOptions(**words)
+        CompressOptions(**{"method": "paper", **words})
 
 
 def test_outputs_are_checked_before_any_work(project: Path, tmp_path: Path) -> None:
@@ -326,7 +326,7 @@ def test_outputs_are_checked_before_any_work(project: Path, tmp_path: Path) -> N
         with pytest.raises(InputError, match=message):
             compress(missing, output)
     with pytest.raises(InputError, match="exists"):
-        compress(missing, tmp_path / "new.fgs", save_scores=str(tmp_path / "old.fgs"))
+        compress(missing, tmp_path / "new.fgs", method="paper", save_scores=str(tmp_path / "old.fgs"))
     with pytest.raises(InputError, match=r"ends in \.ply"):
         decompress(missing, tmp_path / "a.fgs")
     with pytest.raises(InputError, match=r"ends in \.npy"):

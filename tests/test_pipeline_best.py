@@ -223,7 +223,9 @@ def test_one_gaussian(project: Path, tmp_path: Path) -> None:
         ({"score": "meson"}, "--score belongs to --method paper"),
         ({"save_scores": "s.npy"}, "--save-scores belongs to --method paper"),
         ({"bits": "auto"}, "--bits belongs to --method paper"),
-        ({"groups": 7}, "--groups belongs to --method paper"),
+        ({"groups": 7}, "--groups belongs to --method paper, and this run is --method best: add --method paper"),
+        ({"method": "paper", "unseen": "drop"}, "--unseen belongs to --method best"),
+        ({"method": "paper", "refit": False}, r"--\[no-\]refit belongs to --method best"),
         ({"unseen": "hide"}, "--unseen hide: expected keep, drop, or a share"),
         ({"unseen": "120%"}, "--unseen 120%: expected"),
         ({"max_drop": 1.0, "min_ratio": 3.0}, "--max-drop and --min-ratio: give one target"),
@@ -231,7 +233,7 @@ def test_one_gaussian(project: Path, tmp_path: Path) -> None:
 )
 def test_words_that_make_no_sense(words: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        CompressOptions(method="best", **words)
+        CompressOptions(**words)
 
 
 def test_layers_are_the_same_scene_and_worth_most_first(project: Path, tmp_path: Path) -> None:
@@ -255,7 +257,7 @@ def test_layers_are_the_same_scene_and_worth_most_first(project: Path, tmp_path:
     assert best.fidelity > rest.fidelity + 3  # type: ignore[operator]
     with pytest.raises(InputError, match="--layers 5"):
         CompressOptions(method="best", layers=5)
-    with pytest.raises(InputError, match="only --method best"):
+    with pytest.raises(InputError, match="--layers belongs to --method best"):
         CompressOptions(method="paper", layers=2)
 
 

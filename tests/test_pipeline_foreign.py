@@ -31,6 +31,8 @@ from tiny_project import COUNT, make_project
 
 SUFFIXES = tuple(FORMATS)
 FAST: dict[str, Any] = {"effort": "fast", "holdout": 4}
+PAPER: dict[str, Any] = {"method": "paper", **FAST}
+"""The quicker search, where a test is not about the method."""
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 
@@ -101,7 +103,7 @@ def test_finished_files_fit(project: Path, tmp_path: Path, suffix: str, method: 
 
 
 def test_out_of_reach(project: Path, tmp_path: Path) -> None:
-    words = {**FAST, "min_fidelity": 150.0}
+    words = {**PAPER, "min_fidelity": 150.0}
     with pytest.raises(TargetError, match=r"fidelity >= 150 dB .*the closest point.*--best-effort"):
         compress(project / "point_cloud.ply", tmp_path / "a.spz", **words)
     assert list(tmp_path.iterdir()) == []
@@ -112,9 +114,9 @@ def test_out_of_reach(project: Path, tmp_path: Path) -> None:
 def test_without_writing(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "tmp").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    dry = compress(project / "point_cloud.ply", tmp_path / "a.spz", dry_run=True, max_drop=2.0, **FAST)
+    dry = compress(project / "point_cloud.ply", tmp_path / "a.spz", dry_run=True, max_drop=2.0, **PAPER)
     assert dry.output is None and dry.format == "spz" and [p.name for p in tmp_path.iterdir()] == ["tmp"]
-    real = compress(project / "point_cloud.ply", tmp_path / "a.spz", max_drop=2.0, **FAST)
+    real = compress(project / "point_cloud.ply", tmp_path / "a.spz", max_drop=2.0, **PAPER)
     assert real.size == dry.size == (tmp_path / "a.spz").stat().st_size and real.quality == dry.quality
     assert list((tmp_path / "tmp").iterdir()) == []
 
@@ -125,7 +127,7 @@ def test_fixed_rates_and_scores_of_a_file(project: Path, tmp_path: Path) -> None
     np.save(tmp_path / "s.npy", scores)
     lonely = tmp_path / "lonely.ply"
     lonely.write_bytes((project / "point_cloud.ply").read_bytes())
-    words: dict[str, Any] = {"score": str(tmp_path / "s.npy"), "prune_rate": 0.5, "cameras": "none"}
+    words: dict[str, Any] = {"method": "paper", "score": str(tmp_path / "s.npy"), "prune_rate": 0.5, "cameras": "none"}
     result = compress(lonely, tmp_path / "a.spz", sh_rate=0.25, **words)
     assert (result.count, result.sh_count, result.quality, result.reached) == (COUNT // 2, COUNT // 4, None, None)
     bare = compress(lonely, tmp_path / "b.spz", sh_rate=0.5, **words)
@@ -137,7 +139,7 @@ def test_fixed_rates_and_scores_of_a_file(project: Path, tmp_path: Path) -> None
 
 def test_scores_are_saved_and_training_poses_decide(project: Path, tmp_path: Path) -> None:
     saved = tmp_path / "s.npy"
-    words = {**FAST, "select": "train", "max_drop": 2.0, "score": "meson"}
+    words = {**PAPER, "select": "train", "max_drop": 2.0, "score": "meson"}
     result = compress(project / "point_cloud.ply", tmp_path / "a.spz", save_scores=str(saved), **words)
     assert result.decision_views == "training" and result.quality_views == "held-out"
     assert result.scores_saved == str(saved) and np.load(saved).shape == (COUNT,)
@@ -156,7 +158,7 @@ def test_the_refit_pays(project: Path, tmp_path: Path) -> None:
 def test_files_of_these_formats_go_in_again(project: Path, tmp_path: Path) -> None:
     scene = project / "point_cloud.ply"
     decompress(scene, tmp_path / "a.spz")
-    result = compress(tmp_path / "a.spz", tmp_path / "b.fgs", cameras=str(project), min_fidelity=20.0, **FAST)
+    result = compress(tmp_path / "a.spz", tmp_path / "b.fgs", cameras=str(project), min_fidelity=20.0, **PAPER)
     assert result.scene.count == COUNT and result.format == "fgs"
     for name in ("c.compressed.ply", "d.sog", "e.ply"):
         assert decompress(tmp_path / "b.fgs", tmp_path / name).size == (tmp_path / name).stat().st_size
@@ -175,32 +177,43 @@ def test_files_of_these_formats_go_in_again(project: Path, tmp_path: Path) -> No
 )
 def test_what_is_refused(project: Path, tmp_path: Path, name: str, words: dict[str, Any], message: str) -> None:
     with pytest.raises((InputError, BudgetError), match=message):
-        compress(project / "point_cloud.ply", tmp_path / name, **FAST, **words)
+        compress(project / "point_cloud.ply", tmp_path / name, **PAPER, **words)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_is_left_behind(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.spz").write_text("earlier")
     with pytest.raises(InputError, match="the file exists"):
-        compress(project / "point_cloud.ply", tmp_path / "a.spz", **FAST)
+        compress(project / "point_cloud.ply", tmp_path / "a.spz", **PAPER)
 
     def stop(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("flexgs_edge.pipeline.compress.publish", stop)  # after the last file has been measured
     with pytest.raises(KeyboardInterrupt):
-        compress(project / "point_cloud.ply", tmp_path / "a.spz", force=True, **FAST)
+        compress(project / "point_cloud.ply", tmp_path / "a.spz", force=True, **PAPER)
     assert [path.name for path in tmp_path.iterdir()] == ["a.spz"] and (tmp_path / "a.spz").read_text() == "earlier"
     monkeypatch.setattr(formats, "CONVERTER", "gaussforge_that_nobody_has")
     with pytest.raises(InputError, match=r"pip install 'flexgs-edge\[formats\]'"):
-        compress(project / "point_cloud.ply", tmp_path / "b.spz", **FAST)
+        compress(project / "point_cloud.ply", tmp_path / "b.spz", **PAPER)
 
 
 def test_on_the_command_line(
     project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = str(project / "point_cloud.ply")
-    command = ["compress", scene, "-o", str(tmp_path / "a.spz"), "--min-fidelity", "150", "--effort", "fast"]
+    command = [
+        "compress",
+        scene,
+        "-o",
+        str(tmp_path / "a.spz"),
+        "--method",
+        "paper",
+        "--min-fidelity",
+        "150",
+        "--effort",
+        "fast",
+    ]
     with pytest.raises(SystemExit) as caught:
         cli.main([*command, "-q", "--holdout", "4"])
     assert caught.value.code == 3 and "the closest point is fidelity" in capsys.readouterr().err

@@ -63,7 +63,7 @@ class Bench:
         self.renderer, self.cameras = Renderer(open_form(form), large_budget()), poses(views)
         self.original = self.images(planes)
         with self.renderer.load(MemorySource(planes)) as scene:
-            self.targets = TargetViews(self.renderer, scene, self.cameras)
+            self.targets = TargetViews.of(self.renderer, scene, self.cameras)
         OPENED.append(self.targets)
 
     def images(self, planes: Planes) -> list[np.ndarray]:
@@ -231,7 +231,7 @@ def test_targets_are_the_renders_in_half_precision(tmp_path: Path) -> None:
     renderer, cameras = Renderer(open_form("w16"), large_budget(), background=(0.2, 0.4, 0.6)), poses(2)
     cameras += [make_camera(17, 33), make_camera(64, 16)]
     with renderer.load(MemorySource(planes)) as scene:
-        with TargetViews(renderer, scene, cameras, tmp_path) as targets:
+        with TargetViews.of(renderer, scene, cameras, tmp_path) as targets:
             for view in (3, 0, 2, 1, 0):
                 camera, target = cameras[view], targets[view]
                 assert target.dtype == np.float16 and target.shape[0] == 3
@@ -263,9 +263,9 @@ def test_the_scratch_file_goes_when_something_fails(tmp_path: Path, monkeypatch:
         monkeypatch.setattr("flexgs_edge.render.targets.tempfile.TemporaryFile", remembered)
         monkeypatch.setattr(renderer, "render_planes", fail_at_last)
         with pytest.raises(KeyboardInterrupt):
-            TargetViews(renderer, scene, cameras, tmp_path)
+            TargetViews.of(renderer, scene, cameras, tmp_path)
         monkeypatch.setattr(renderer, "render_planes", plain)
-        with pytest.raises(ZeroDivisionError), TargetViews(renderer, scene, cameras, tmp_path):
+        with pytest.raises(ZeroDivisionError), TargetViews.of(renderer, scene, cameras, tmp_path):
             raise ZeroDivisionError
     assert len(files) == 2 and all(file.closed for file in files)
     assert list(tmp_path.iterdir()) == []

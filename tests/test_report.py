@@ -180,7 +180,7 @@ def test_one_view_and_photos_larger_than_the_page_shows(project: Path, tmp_path:
 def test_fixed_rates_have_no_search_and_no_views_no_pictures(project: Path, tmp_path: Path) -> None:
     (tmp_path / "lone.ply").write_bytes((project / "point_cloud.ply").read_bytes())
     np.save(tmp_path / "scores.npy", np.arange(400, dtype=np.float32))
-    rates: dict[str, Any] = {"prune_rate": 0.3, "sh_rate": 0.2}
+    rates: dict[str, Any] = {"method": "paper", "prune_rate": 0.3, "sh_rate": 0.2}
     compress(project / "point_cloud.ply", tmp_path / "a.fgs", report=str(tmp_path / "seen"), **rates, **FAST)
     page = read_page(tmp_path / "seen")
     assert "fixed rates, nothing was searched" in page.text and len(page.pictures("photo")) == 3
@@ -250,12 +250,12 @@ def test_odd_bytes_in_real_paths(project: Path, tmp_path: Path) -> None:
     place = tmp_path / "a<b>&\"'\udcff"
     place.mkdir()
     scene = project / "point_cloud.ply"
-    compress(scene, place / "s.fgs", report=str(place / "p"), prune_rate=0.3, sh_rate=0.2, **FAST)
+    compress(scene, place / "s.fgs", report=str(place / "p"), method="paper", prune_rate=0.3, sh_rate=0.2, **FAST)
     assert "a<b>&\"'\ufffd/s.fgs" in read_page(place / "p").text
 
 
 def test_a_missed_target_is_said(project: Path, tmp_path: Path) -> None:
-    options: dict[str, Any] = {"max_size": 1200, **FAST}
+    options: dict[str, Any] = {"method": "paper", "max_size": 1200, **FAST}
     with pytest.raises(TargetError):
         compress(project / "point_cloud.ply", tmp_path / "a.fgs", report=str(tmp_path / "page"), **options)
     assert list(tmp_path.iterdir()) == [], "nothing is left behind"

@@ -30,8 +30,8 @@ def page(browser: Browser, sample_dir: Path, tmp_path_factory: pytest.TempPathFa
     """The sample's page; drawn small, and pruned so much that pictures differ."""
     folder = tmp_path_factory.mktemp("sample")
     compress(
-        sample_dir / "point_cloud.ply", folder / "a.fgs", report=str(folder / "page"), effort="fast", max_drop=2.0,
-        resolution=160, holdout=20,
+        sample_dir / "point_cloud.ply", folder / "a.fgs", report=str(folder / "page"), method="paper", effort="fast",
+        max_drop=2.0, resolution=160, holdout=20,
     )  # fmt: skip
     return folder / "page" / "index.html"
 

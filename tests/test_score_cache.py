@@ -172,6 +172,6 @@ def test_nothing_to_keep(project: Path, tmp_path: Path) -> None:
     result = run(project, tmp_path, prune_rate=0.0, sh_rate=0.0)
     assert result.score_cache is None and not (tmp_path / "s.npz").exists()
     with pytest.raises(InputError, match="leave it out with --score mine.npy"):
-        CompressOptions(score="mine.npy", score_cache="s.npz")
+        CompressOptions(method="paper", score="mine.npy", score_cache="s.npz")
     with pytest.raises(InputError, match="--score-cache belongs to --method paper"):
         CompressOptions(method="best", score_cache="s.npz")

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+LEAST_VIEWS = 6
+"""Poses a step of the refit at the least: steps after 3 poses each fitted fox's 24 scored ones ever better and all others ever
+worse."""
+
 
 @dataclass(frozen=True)
 class Effort:
@@ -16,7 +20,7 @@ class Effort:
     refit_rounds : int
         Rounds on all coefficients before SH are put on their grid (one on the constant follows).
     subsets : int
-        Steps a round, as for `refit_colours`.
+        Steps a round at most, as for `refit_colours`.
     steps : int
         Whole results that are measured, at most while something holds.
     close : float
@@ -33,9 +37,13 @@ class Effort:
     close: float
     views: int
 
+    def subsets_of(self, poses: int) -> int:
+        """Steps a round for so many scored poses."""
+        return max(min(self.subsets, poses // LEAST_VIEWS), 1)
+
 
 EFFORTS = {
-    "fast": Effort(keep=0.66, refit_rounds=1, subsets=3, steps=2, close=0.08, views=48),
-    "balanced": Effort(keep=0.8, refit_rounds=1, subsets=3, steps=4, close=0.04, views=96),
-    "thorough": Effort(keep=0.88, refit_rounds=2, subsets=4, steps=6, close=0.015, views=400),
+    "fast": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=1, close=0.08, views=48),
+    "balanced": Effort(keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.05, views=96),
+    "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, views=400),
 }

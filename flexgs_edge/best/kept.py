@@ -23,7 +23,7 @@ class Mended:
 
     def apply(self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """`planes` with these colours where a row was kept with the same SH degree."""
-        if not len(self.rows):
+        if not len(self.rows) or not len(rows):
             return planes
         at = np.minimum(np.searchsorted(self.rows, rows), len(self.rows) - 1)
         same = np.flatnonzero((self.rows[at] == rows) & (self.degrees[at] == degrees))

@@ -11,7 +11,7 @@ from flexgs_edge.best.choice import BitModel
 from flexgs_edge.cameras import Camera
 from flexgs_edge.grid import GridScene, from_grid
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.render import Renderer
+from flexgs_edge.render import Renderer, sum_bytes
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.score.removal import measure_costs
 
@@ -51,7 +51,7 @@ def assign_layers(
         end = HALF * spent[left].sum()
         while len(left) and spent[left].sum() > end:
             kept = {name: np.ascontiguousarray(values[:, left]) for name, values in planes.items()}
-            with renderer.load(MemorySource(kept, origin=grid.origin)) as scene:
+            with renderer.load(MemorySource(kept, origin=grid.origin), sum_bytes(2)) as scene:
                 costs = measure_costs(renderer, scene, cameras, sh_costs=False, progress=progress)
             worth = np.where(costs.weight2 > 0, costs.removal / spent[left], -1.0)
             order = np.argsort(worth, kind="stable")

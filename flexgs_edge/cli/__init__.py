@@ -24,7 +24,7 @@ COMMANDS = {
     "verify": "Check every byte of a .fgs file against its checksums.",
     "render": "Draw views of a scene as PNG files, and time them.",
     "evaluate": "Measure what a scene lost against another: PSNR, SSIM, fidelity and drop of every view.",
-    "score": "Save the importance of every Gaussian, so that other targets need no scoring.",
+    "score": "Save the importance of every Gaussian, for --method paper: other targets then need no scoring.",
     "study": "Make the experiments of a paper on scenes of your own: tables, charts and one page.",
     "devices": "List the OpenCL devices, whether they work, and which one is used.",
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from flexgs_edge.cli import words
 
@@ -53,19 +54,17 @@ from flexgs_edge.cli import words
     is_flag=True,
     help="Write the closest point when the target cannot be met (exit code 0 then, not 3).",
 )
-@words.cameras_option
-@words.images_option
-@words.holdout_option
+@words.photos_options
 @words.select_option
 @words.drawing_options
 @words.option(
     "Method",
     "--method",
     type=click.Choice(["best", "paper"]),
-    default="paper",
+    default="best",
     show_default=True,
-    help="paper: FlexGaussian's, bit-packed without entropy coding. best: measured removal costs, colour refit and an entropy "
-    "coder: a fifth of the bytes at the same drop, in a few times the seconds.",
+    help="best: measured removal costs, colour refit and an entropy coder. paper: FlexGaussian's, bit-packed without entropy "
+    "coding: some five times the bytes at the same drop, in a fraction of the seconds.",
 )
 @words.option(
     "Method",
@@ -93,30 +92,35 @@ from flexgs_edge.cli import words
     metavar="gs|meson|FILE",
     default="gs",
     show_default=True,
-    help="Importance of Gaussians: gs (opacity, volume, pixels hit), meson (MesonGS), or a .npy/.npz file with a number each.",
+    help="Importance of Gaussians (paper only): gs (opacity, volume, pixels hit), meson (MesonGS), or a .npy/.npz file with a "
+    "number each.",
 )
 @words.option(
-    "Method", "--save-scores", metavar="FILE", help="Write the scores to a .npy file, for --score in later runs."
+    "Method",
+    "--save-scores",
+    metavar="FILE",
+    help="Write the scores (paper only) to a .npy file, for --score in later runs.",
 )
 @words.option(
     "Method",
     "--score-cache",
     metavar="FILE",
-    help="Keep the scores in FILE; a later run takes them if scene, poses and score are the same, else makes them anew.",
+    help="Keep the scores (paper only) in FILE; a later run takes them if scene, poses and score are the same, else makes them "
+    "anew.",
 )
 @words.option(
     "Method",
     "--prune-rate",
     metavar="P",
     type=float,
-    help="Remove this share of the Gaussians, from 0 to 1: with --sh-rate, instead of a search.",
+    help="Remove this share of the Gaussians, from 0 to 1: with --sh-rate, instead of a search (paper only).",
 )
 @words.option(
     "Method",
     "--sh-rate",
     metavar="S",
     type=float,
-    help="Take the SH above degree 0 from this further share of the Gaussians, from 0 to 1.",
+    help="Take the SH above degree 0 from this further share of the Gaussians, from 0 to 1 (paper only).",
 )
 @words.option(
     "Method",
@@ -124,16 +128,16 @@ from flexgs_edge.cli import words
     metavar="SPEC",
     default="paper",
     show_default=True,
-    help="Bits for each value: paper (xyz=16, dc=8, scale=8, rot=8, opacity=4, rest=4), what shall differ from it, such as "
-    "rest=3,dc=7, auto (sensitivity search), or rtn8, rtn4, ... (one width for all, one range a channel: the baseline "
-    "that fails).",
+    help="Bits for each value (paper only): paper (xyz=16, dc=8, scale=8, rot=8, opacity=4, rest=4), what shall differ from it, "
+    "such as rest=3,dc=7, auto (sensitivity search), or rtn8, rtn4, ... (one width for all, one range a channel: the "
+    "baseline that fails).",
 )
 @words.option(
     "Method",
     "--groups",
     metavar="N",
     type=int,
-    help="Ranges for each channel (the paper: 1000). Default: one for about 512 Gaussians.",
+    help="Ranges for each channel (paper only; there 1000). Default: one for about 512 Gaussians.",
 )
 @words.base_psnr_option
 @words.option(
@@ -142,23 +146,20 @@ from flexgs_edge.cli import words
     type=click.Choice(["fast", "balanced", "thorough"]),
     default="balanced",
     show_default=True,
-    help="Steps of the search: paper 4, 10 or 32 after its list (other formats: 4, 6 or 10 files); best 2, 4 or 6 whole "
-    "results, with more rounds and poses each. Counted, never timed: same command, same bytes.",
+    help="Steps of the search: best 1, 2 or 5 whole results, with more rounds and poses each; paper 4, 10 or 32 after its "
+    "list (other formats: 4, 6 or 10 files). Counted, never timed: same command, same bytes.",
 )
 @words.drop_invalid_option
-@words.device_option
-@words.memory_option
-@words.force_option
-@words.json_option
-@words.talk_options
+@words.run_options
 def command(input: str, output: str | None, json_path: str | None, quiet: bool, **options: Any) -> None:
     """Compress a scene: the fewest bytes that hold a quality, or the best quality in a size.
 
     INPUT is a .ply in INRIA's layout, a .fgs, .spz, .sog or .compressed.ply, or a model folder of the 3DGS training program.
     Cameras and an images/ folder beside it are used and named in the summary; a lone scene gets views made from itself.
-    Gaussians are scored over the training poses; then a search finds how many to remove, how many lose their view-dependent
-    colour, and measures each step by rendering. The figures in the summary are measured on the finished file. With -o OUT.spz,
-    .sog or .compressed.ply every step writes that format and measures what it decodes to, so its own losses count.
+    The training poses tell what each Gaussian is worth; then a search finds which to remove, which lose their view-dependent
+    colour and how finely the rest is kept, and measures each step by rendering. The figures in the summary are measured on
+    the finished file. With -o OUT.spz, .sog or .compressed.ply every step writes that format and measures what it decodes to,
+    so its own losses count.
 
     \b
     Examples:
@@ -168,10 +169,12 @@ def command(input: str, output: str | None, json_path: str | None, quiet: bool, 
           a model folder with photos elsewhere
       flexgs-edge compress point_cloud.ply -o scene.fgs --max-size 8MB
           the best that fits
-      flexgs-edge compress point_cloud.ply -o a.fgs --score-cache s.npz
-      flexgs-edge compress point_cloud.ply -o b.fgs --score-cache s.npz --max-drop 2
-          score once, then try another target
-      flexgs-edge compress point_cloud.ply -o scene.fgs --prune-rate 0.3 --sh-rate 0.4
+      flexgs-edge compress point_cloud.ply -o scene.fgs --effort fast
+          half the seconds, some more bytes
+      flexgs-edge compress point_cloud.ply -o a.fgs --method paper --score-cache s.npz
+      flexgs-edge compress point_cloud.ply -o b.fgs --method paper --score-cache s.npz --max-drop 2
+          the paper's method: score once, then try another target
+      flexgs-edge compress point_cloud.ply -o scene.fgs --method paper --prune-rate 0.3 --sh-rate 0.4
           fixed rates, no search
       flexgs-edge compress point_cloud.ply -o scene.spz --max-drop 0.5
           for viewers of that format (needs pip install 'flexgs-edge[formats]')
@@ -180,8 +183,11 @@ def command(input: str, output: str | None, json_path: str | None, quiet: bool, 
     """
     progress = words.start(quiet, json_path, options["force"], options["report"])
     from flexgs_edge.pipeline.compress import compress
-    from flexgs_edge.pipeline.options import CompressOptions
+    from flexgs_edge.pipeline.options import METHOD_ONLY, CompressOptions, check_method
     from flexgs_edge.report.summary import compress_text
 
+    # An option that is spelled out is meant, even where it says its default.
+    source = click.get_current_context().get_parameter_source
+    check_method(options["method"], [name for name in METHOD_ONLY if source(name) is ParameterSource.COMMANDLINE])
     result = compress(input, output, CompressOptions(**options), progress)
     words.emit(compress_text(result), result.to_json(), json_path, options["force"])

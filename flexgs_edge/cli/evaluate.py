@@ -26,16 +26,10 @@ from flexgs_edge.cli import words
 )
 @words.base_psnr_option
 @words.report_option
-@words.cameras_option
-@words.images_option
-@words.holdout_option
+@words.photos_options
 @words.drawing_options
 @words.drop_invalid_option
-@words.device_option
-@words.memory_option
-@words.force_option
-@words.json_option
-@words.talk_options
+@words.run_options
 def command(
     input: str,
     against: str,

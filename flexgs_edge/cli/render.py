@@ -23,11 +23,7 @@ from flexgs_edge.cli import words
 )
 @words.drawing_options
 @words.drop_invalid_option
-@words.device_option
-@words.memory_option
-@words.force_option
-@words.json_option
-@words.talk_options
+@words.run_options
 def command(
     input: str, output: str, views: list[int] | None, force: bool, json_path: str | None, quiet: bool, **options: Any
 ) -> None:

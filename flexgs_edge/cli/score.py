@@ -20,29 +20,23 @@ from flexgs_edge.cli import words
     show_default=True,
     help="gs: opacity * volume^0.1 * pixels hit. meson: volume^0.1 * summed weights.",
 )
-@words.cameras_option
-@words.images_option
-@words.holdout_option
+@words.photos_options
 @words.drawing_options
 @words.drop_invalid_option
-@words.device_option
-@words.memory_option
-@words.force_option
-@words.json_option
-@words.talk_options
+@words.run_options
 def command(
     input: str, output: str, score: str, force: bool, json_path: str | None, quiet: bool, **options: Any
 ) -> None:
     """Score every Gaussian over the training poses, and save the scores.
 
     The file holds one float64 a Gaussian, in the scene's order: the logarithm of the score, -inf for those that no
-    training pose sees. `compress --score FILE` then takes only a search. Photos are not compared, but scale the
-    views where they are smaller than the cameras say.
+    training pose sees. `compress --method paper --score FILE` then takes only a search. Photos are not compared, but
+    scale the views where they are smaller than the cameras say.
 
     \b
     Examples:
       flexgs-edge score point_cloud.ply -o scores.npy
-      flexgs-edge compress point_cloud.ply -o scene.fgs --score scores.npy --max-drop 0.5
+      flexgs-edge compress point_cloud.ply -o scene.fgs --method paper --score scores.npy --max-drop 0.5
     """
     progress = words.start(quiet, json_path, force)
     from flexgs_edge.pipeline.options import ViewOptions

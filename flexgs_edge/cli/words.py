@@ -270,6 +270,19 @@ talk_options = stack(
     ),
 )
 
+run_options = stack(device_option, memory_option, force_option, json_option, talk_options)
+"""What every command has that works on a device and writes something."""
+photos_options = stack(cameras_option, images_option, holdout_option)
+"""Where the views are, and which of them judge."""
+study_options = stack(
+    base_psnr_option, photos_options, select_option, drawing_options, drop_invalid_option, run_options
+)
+"""What every study has."""
+results_option = option(
+    "Output", "-o", "--output", metavar="DIR", required=True, help="Folder for the results; made if missing."
+)
+"""Where a study writes."""
+
 
 def start(quiet: bool, json_path: str | None = None, force: bool = False, report: str | None = None) -> Progress:
     """Set up the log on stderr and check the JSON file before any work; progress bars for the job."""

@@ -12,6 +12,7 @@ from flexgs_edge.codec.model import SHARED, Model, group_kinds, tables_of
 from flexgs_edge.codec.ports import UNIFORM, Batch, CountPort, DecodePort, FitPort
 from flexgs_edge.codec.rans import PRECISION, Decoder, Encoder, StreamError, lane_count
 from flexgs_edge.codec.tables import merge_contexts, to_levels
+from flexgs_edge.codec.threads import in_order, thread_count
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds, walk_chunk
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import POSITION_BITS, GridScene, morton
@@ -90,9 +91,10 @@ class Encoded:
         return bits / 8 + len(self.model.to_bytes()) - len(self.model.to_bytes(with_sh=False))
 
     def streams(self) -> Iterator[bytes]:
-        """The bytes of every chunk, made one by one."""
-        for chunk, batches in zip(self.chunks, self.batches, strict=True):
-            yield encode_chunk(self.model, chunk.stop - chunk.start, batches)
+        """The bytes of every chunk in order, each made when it is asked for or one before."""
+        sizes = [chunk.stop - chunk.start for chunk in self.chunks]
+        pairs = list(zip(sizes, self.batches, strict=True))
+        yield from in_order(lambda pair: encode_chunk(self.model, *pair), pairs, thread_count(len(pairs)))
 
 
 def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS) -> Encoded:
@@ -109,12 +111,17 @@ def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS) -> Encoded:
         _walk(grid, cells, chunks[i], depth, fit)
     groups = [fit_group(kind, samples) for kind, samples in zip(kinds, fit.samples, strict=True)]
     del fit
+
+    def counted(chunk: Chunk) -> CountPort:
+        port = CountPort(groups)
+        _walk(grid, cells, chunk, depth, port)
+        return port
+
     count = CountPort(groups)
     batches = []
-    for chunk in chunks:
-        _walk(grid, cells, chunk, depth, count)
-        batches.append(count.batches)
-        count.batches = []
+    for port in in_order(counted, chunks, thread_count(len(chunks))):
+        batches.append(port.batches)
+        count.add(port)
     merged = [merge_contexts(counts) for counts in count.counts]
     levels = [
         to_levels(counts if len(counts) else np.zeros((1, len(all_[0])), np.int64))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -208,9 +208,9 @@ class GridContainer(SectionFile):
         """The codes of a chunk, checked."""
         return self._decode(model, chunk, entry, base_only, None)
 
-    def cost(self, model: Model, chunk: Chunk, entry: ChunkEntry, cost: np.ndarray) -> None:
-        """Add the bits of every alphabet in a chunk to `cost`."""
-        self._decode(model, chunk, entry, False, cost)
+    def cost(self, model: Model, chunk: Chunk, entry: ChunkEntry, cost: np.ndarray) -> ChunkCodes:
+        """Decode a chunk, and add the bits of every alphabet in it to `cost`."""
+        return self._decode(model, chunk, entry, False, cost)
 
     def _decode(
         self, model: Model, chunk: Chunk, entry: ChunkEntry, base_only: bool, cost: np.ndarray | None
@@ -241,14 +241,21 @@ def _wrong_length(length: int, room: int) -> str:
     return "" if length <= most else f"wanted at most {most}"
 
 
-def channel_bytes(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Bytes that each channel costs in a version 2 file, by name, all chunks decoded; the rest of the file by section."""
+def channel_bytes(
+    path: str | os.PathLike[str], look: Callable[[Chunk, ChunkEntry, ChunkCodes], None] | None = None
+) -> dict[str, float]:
+    """Bytes that each channel costs in a version 2 file, by name; the rest of the file by section.
+
+    All chunks are decoded for this; `look` sees each in turn.
+    """
     container = GridContainer(path)
     model = container.read_model()
     cost = np.zeros(len(model.tables))
     entries = container.read_table()
     for chunk, entry in zip(container.header.chunks(), entries, strict=True):
-        container.cost(model, chunk, entry, cost)
+        codes = container.cost(model, chunk, entry, cost)
+        if look is not None:
+            look(chunk, entry, codes)
     names = ["position", "repeats", *(group.kind.name for group in model.groups)]
     table = dict(zip(names, (cost / 8).tolist(), strict=True))
     payload = sum(entry.section.length for entry in entries)

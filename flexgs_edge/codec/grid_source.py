@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from flexgs_edge.codec.coder import Chunk
 from flexgs_edge.codec.container2 import GridContainer
 from flexgs_edge.codec.octree import unmorton
 from flexgs_edge.codec.source import by_chunk
+from flexgs_edge.codec.threads import in_order, thread_count
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds
 from flexgs_edge.grid import CODE_LIMIT, GridScene, from_grid
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
@@ -55,10 +57,17 @@ class GridSource(SceneSource):
         self._chunks = header.chunks()
         self._starts = np.array([chunk.start for chunk in self._chunks], np.int64)
         self._last: tuple[int, bool, GridScene] | None = None
+        self._coming: Generator[tuple[int, GridScene], None, None] | None = None
+
+    @property
+    def threads(self) -> int:
+        """Chunks that this machine can decode at once."""
+        return thread_count(len(self._chunks))
 
     def grid(self) -> GridScene:
         """The codes of the whole scene; decodes every chunk."""
-        parts = [self._decode(i, False) for i in range(len(self._chunks))]
+        count = len(self._chunks)
+        parts = list(in_order(lambda i: self._decode(i, False), range(count), self.threads))
         if not parts:
             return self._scene(Chunk(0, 0, 0), _nothing(self.sh_degree))
 
@@ -92,7 +101,31 @@ class GridSource(SceneSource):
                 plane[:, place] = values[field]
         return planes
 
+    @contextmanager
+    def whole_in_order(self, threads: int) -> Iterator[None]:
+        """While this lasts, all fields of all rows are read from the first to the last: chunks are decoded ahead.
+
+        Parameters
+        ----------
+        threads : int
+            As many chunks are held beside the one that is read; 1: none.
+        """
+        if threads > 1:
+            self._coming = in_order(lambda i: (i, self._decode(i, False)), range(len(self._chunks)), threads)
+        try:
+            yield
+        finally:
+            if self._coming is not None:
+                self._coming.close()
+                self._coming = None
+
     def _part(self, chunk: int, base_only: bool) -> GridScene:
+        if self._coming is not None and (self._last is None or self._last[0] != chunk):
+            self._last = None
+            for index, part in self._coming:
+                if index == chunk:
+                    self._last = (chunk, False, part)
+                    break
         if self._last is None or self._last[0] != chunk or (self._last[1] and not base_only):
             self._last = None  # before the next one is decoded, not after: one chunk in memory, not two
             self._last = (chunk, base_only, self._decode(chunk, base_only))

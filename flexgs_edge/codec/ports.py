@@ -75,6 +75,12 @@ class CountPort:
         self.raw = np.zeros(len(shapes))
         self.batches: list[Batch] = []
 
+    def add(self, other: CountPort) -> None:
+        """Add another port's counts (whole numbers, so in any order)."""
+        for counts, more in zip(self.counts, other.counts, strict=True):
+            counts += more
+        self.raw += other.raw
+
     def _add(self, alphabet: int, contexts: np.ndarray, symbols: np.ndarray, raw: list[Raw]) -> None:
         counts = self.counts[alphabet]
         place = contexts.astype(np.intp)
@@ -176,6 +182,15 @@ class DecodePort:
         fitted = self.model.groups[group]
         base, contexts = fitted.predict(known, rows, own)
         symbols = self._get(group + SHARED, contexts)
+        last = fitted.symbols - 1
+        if (
+            isinstance(base, float)
+            and not fitted.shift
+            and abs(base) + last <= CODE_LIMIT
+            and not (symbols == last).any()
+        ):
+            # Values of a short alphabet, which most symbols are: no rounding to think of.
+            return symbols.astype(np.int32) + np.int32(base)
         offset = symbols.astype(np.float64)
         if fitted.shift:
             offset *= float(1 << fitted.shift)

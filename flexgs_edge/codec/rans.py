@@ -6,6 +6,7 @@ round the lanes; one vector operation moves all lanes by one symbol, so NumPy pa
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
 import numpy as np
@@ -153,10 +154,19 @@ class Decoder:
         self._states = words[: 2 * lanes].view("<u4").astype(np.uint32)
         self._words = words.astype(np.uint32)
         self._at = 2 * lanes
-        self._move, self._low, self._empty = (
+        # Constants as arrays: NumPy takes half a microsecond to make one of a number, as long as to go through 512 of them.
+        # Low bits are written into the lower halves of wide numbers, which can be added to slots as they are.
+        place = np.zeros(lanes, np.intp)
+        halves = place.itemsize // 4
+        self._work: tuple[np.ndarray, ...] = (
+            place.view(np.uint32)[0 if sys.byteorder == "little" else halves - 1 :: halves],
+            place,
             np.empty(lanes, np.uint32),
             np.empty(lanes, np.uint32),
             np.empty(lanes, bool),
+            np.full(lanes, _LOW),
+            np.full(lanes, _SHIFT),
+            np.full(lanes, _FLOOR),
         )
         if (self._states < FLOOR).any():
             raise StreamError("stream: wanted states of at least 65536")
@@ -170,23 +180,23 @@ class Decoder:
     def get_at(self, tables: Tables, first: np.ndarray) -> np.ndarray:
         """As `get`, with the first slot of each row: row * 2^14 ([m] intp, overwritten)."""
         # Few calls on whole arrays: 512 numbers take a quarter of what NumPy takes to be called.
-        take, move, low, empty = tables.moves.take, self._move, self._low, self._empty
-        words, begin = self._words, self._at
+        take, words, begin = tables.moves.take, self._words, self._at
+        state, (low_half, place, move, low, empty, lows, shifts, floors) = self._states, self._work
         for at in range(0, len(first), self.lanes):
             slot = first[at : at + self.lanes]
-            if len(slot) == self.lanes:
-                state = self._states
-            else:
-                state, move, low, empty = (array[: len(slot)] for array in (self._states, move, low, empty))
-            np.bitwise_and(state, _LOW, low)
-            np.add(slot, low, slot)
+            size = len(slot)
+            if size < self.lanes:
+                low_half, place, move, low, empty = (a[:size] for a in (low_half, place, move, low, empty))
+                state, lows, shifts, floors = (a[:size] for a in (state, lows, shifts, floors))
+            np.bitwise_and(state, lows, low_half)
+            np.add(slot, place, slot)
             take(slot, None, move, "clip")
-            np.right_shift(state, _SHIFT, state)
-            np.bitwise_and(move, _LOW, low)
-            np.right_shift(move, _SHIFT, move)
+            np.right_shift(state, shifts, state)
+            np.bitwise_and(move, lows, low)
+            np.right_shift(move, shifts, move)
             np.multiply(state, move, state)
             np.add(state, low, state)
-            np.less(state, _FLOOR, empty)
+            np.less(state, floors, empty)
             places = empty.nonzero()[0]
             if len(places):
                 end = begin + len(places)

@@ -48,6 +48,8 @@ class OpenCLBackend:
         if self.width not in (16, 8, 4, 1) or (self.form == "gpu" and self.width != 1):
             raise DeviceError(f"vector width {self.width} of the {self.form} form: expected 16, 8, 4 or 1 (gpu: 1)")
         self.name = f"{info.name} ({info.platform})"
+        # Oclgrind's interpreter stops at instructions that only hint.
+        self._simulated = "oclgrind" in info.platform.lower()
         # Blocks of the serial passes: enough to keep every unit busy to the end, few enough for short scans.
         self.sort_blocks = self.tile_blocks = max(8 * info.compute_units, 16) if self.form == "cpu" else 64
         self._kernels: dict[str, cl.Kernel] = {}
@@ -92,6 +94,8 @@ class OpenCLBackend:
         spec = KERNELS[name]
         if name not in self._kernels:
             options = [f"-DW={self.width}"] + ([f"-DSTATS={spec.stats}"] if spec.stats is not None else [])
+            if self._simulated:
+                options.append("-DNO_FETCH")
             source = load_source(spec.file.format(form=self.form))
             self._kernels[name] = self.session.kernel(source, spec.kernel or name, tuple(options), spec.signature)
         local: tuple[int, ...] = (1,) * len(size)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,11 @@ from flexgs_edge.adapt import Measurement, SearchResult, Step, Target
 from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.layers import assign_layers
-from flexgs_edge.best.path import PrunePath
+from flexgs_edge.best.path import PARTS, PrunePath, sums_room
 from flexgs_edge.best.search import MultiplierSearch, Product, RateResult, RateSearch, RateStep
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
+from flexgs_edge.cameras.order import farthest_order
 from flexgs_edge.codec.container2 import coded_parts
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.grid import GridScene
@@ -31,13 +32,19 @@ from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
 
-COPIES = 3
-"""Copies of the scene's planes that the path holds at most: the scene, the snapshots together, and one in work (measured on fox:
-snapshots at 0.8 of each other sum to four scenes less what the smallest ones share)."""
+COST_BYTES = 16
+"""Costs of a row and snapshot beside those of its SH: removal and weight, in double precision."""
+BAND_BYTES = 20
+"""The same for each SH degree: a cost in double precision, a mean colour."""
+WORK_PLANES = 11
+"""What a whole result holds for a moment, in planes of its rows (at degree 3, of 236 bytes): the rows without what was dropped,
+codes, values of codes twice, colours of the last refit and of this one, and sums of the refit twice. With 6, fox at a fidelity
+of 48 dB (nearly all rows stay) had a peak 90 MiB above its limit, with 9 one of 12 MiB."""
 
 
-LAYERS_COST = 1.05
-"""Bytes of a layered file over those of one without, at most: neighbours on the curve are farther apart."""
+LAYERS_COST = 1.06
+"""Bytes of a layered file over those of one without, at most: neighbours on the curve are farther apart (1.052 for fox in four
+layers)."""
 SETTINGS_MOST = 1536
 """Bytes that the settings in the header take at most: the search counts them before they are known."""
 
@@ -47,7 +54,7 @@ Report = Callable[[RateStep], None]
 SearchMaker = Callable[[PrunePath, Measure, Report], MultiplierSearch[Product]]
 
 
-def grid_search(options: CompressOptions) -> SearchMaker[GridScene]:
+def grid_search(options: CompressOptions, search: type[RateSearch] = RateSearch) -> SearchMaker[GridScene]:
     """Searches for the grid of a `.fgs`."""
 
     def size_of(grid: GridScene) -> tuple[int, BitModel]:
@@ -55,7 +62,7 @@ def grid_search(options: CompressOptions) -> SearchMaker[GridScene]:
         return (size if options.layers == 1 else round(LAYERS_COST * size)), bits
 
     plan = EFFORTS[options.effort]
-    return lambda path, measure, report: RateSearch(path, size_of, measure, plan, options.refit, report)
+    return lambda path, measure, report: search(path, size_of, measure, plan, options.refit, report)
 
 
 def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[WrittenFile]:
@@ -64,10 +71,13 @@ def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[Writt
     return lambda path, measure, report: FileSearch(path, files, measure, plan, options.refit, report)
 
 
-def scored_poses(cameras: list[Camera], options: CompressOptions) -> list[Camera]:
-    """As many poses as the effort scores, evenly spread."""
-    count = min(EFFORTS[options.effort].views, len(cameras))
-    return [cameras[i * len(cameras) // count] for i in range(count)]
+def scored_poses(cameras: Sequence[Camera], options: CompressOptions) -> list[Camera]:
+    """As many poses as the effort scores, farthest first.
+
+    Names often go round a scene in rings: 8 of the sample's 70 poses evenly spread by name lost 7.8 dB where these lose 1.0 at
+    the same bytes (docs/performance.md).
+    """
+    return [cameras[i] for i in farthest_order(cameras)[: EFFORTS[options.effort].views]]
 
 
 def search_best(
@@ -92,7 +102,7 @@ def search_best(
     source : SceneSource
         A checked scene; held in memory as a whole.
     cameras : list of Camera
-        Training poses; at most as many as the effort scores are used, evenly spread.
+        Training poses; at most as many as the effort scores are used, farthest first.
     judge : Judge
         Prepared on the views that decide.
 
@@ -103,17 +113,41 @@ def search_best(
     BudgetError
         When the scene does not fit.
     """
+    with open_path(renderer, source, cameras, options, budget, clock, progress) as path, clock.stage("search"):
+        return search_path(make, path, renderer, source, judge, target, options, on_step)
+
+
+@contextmanager
+def open_path(
+    renderer: Renderer,
+    source: SceneSource,
+    cameras: Sequence[Camera],
+    options: CompressOptions,
+    budget: MemoryBudget,
+    clock: Stopwatch,
+    progress: Progress = SILENT,
+    make: Callable[..., PrunePath] = PrunePath,
+) -> Iterator[PrunePath]:
+    """The path that searches walk, at its start; several targets may share it, the weakest compression first.
+
+    Parameters
+    ----------
+    make : callable, optional
+        Builds the path from the arguments of `PrunePath`.
+    """
     scored = scored_poses(cameras, options)
-    size = COPIES * source.count * sum(4 * field.width(source.sh_degree) for field in FIELD.values())
+    size = source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep)
+    largest = max(scored, key=lambda camera: camera.width * camera.height)
+    budget.require(
+        "a search by measured costs", size + renderer.least_bytes(source, largest, sums_room(source.sh_degree))
+    )
     budget.take("the scene and its path", size)
     try:
         planes = source.read(slice(0, source.count), list(FIELD))
-        with ExitStack() as stack:
-            with clock.stage("references"), renderer.load(source) as scene:
-                targets = stack.enter_context(TargetViews(renderer, scene, scored, progress=progress))
+        with TargetViews() as targets:
             with clock.stage("search"):
                 rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
-                path = PrunePath(
+                path = make(
                     renderer,
                     planes,
                     rows,
@@ -124,19 +158,34 @@ def search_best(
                     unseen=options.unseen_share,
                     progress=progress,
                 )
-
-                def measure(kept: dict[str, np.ndarray]) -> Measurement:
-                    with renderer.load(MemorySource(kept, origin=source.origin)) as kept_scene:
-                        return measurement_of(judge.compare(kept_scene))
-
-                def report(step: RateStep) -> None:
-                    if on_step:
-                        on_step(as_step(step, source.count))
-
-                found = make(path, measure, report).run(target, options.best_effort)
-        return found.product, _as_search(found, source.count)
+            del planes  # the path has its own
+            yield path
     finally:
         budget.give(size)
+
+
+def search_path(
+    make: SearchMaker[Product],
+    path: PrunePath,
+    renderer: Renderer,
+    source: SceneSource,
+    judge: Judge,
+    target: Target,
+    options: CompressOptions,
+    on_step: Callable[[Step], None] | None = None,
+) -> tuple[Product, SearchResult]:
+    """`search_best` along a path that is there."""
+
+    def measure(kept: dict[str, np.ndarray]) -> Measurement:
+        with renderer.load(MemorySource(kept, origin=source.origin)) as kept_scene:
+            return measurement_of(judge.compare(kept_scene))
+
+    def report(step: RateStep) -> None:
+        if on_step:
+            on_step(as_step(step, source.count))
+
+    found = make(path, measure, report).run(target, options.best_effort)
+    return found.product, _as_search(found, source.count)
 
 
 def search_files(
@@ -170,6 +219,18 @@ def layered(
     """The grid in as many layers as asked for."""
     poses = scored_poses(cameras, options)
     return assign_layers(grid, options.layers, size_and_bits(grid)[1], renderer, poses, progress)
+
+
+def row_bytes(sh_degree: int, keep: float) -> int:
+    """Bytes that a search holds for each row of its scene, at most, beside what the renderer counts.
+
+    Either snapshots down to nothing, each `keep` of the one before; or, when nearly all is kept, one of them and all that a
+    whole result of it needs. What lies between is between.
+    """
+    planes = sum(4 * field.width(sh_degree) for field in FIELD.values())
+    snapshot = planes + COST_BYTES + BAND_BYTES * sh_degree
+    parts = PARTS * 8 * (2 + 4 * sh_degree)
+    return round(max(snapshot / (1 - keep), snapshot + WORK_PLANES * planes)) + parts
 
 
 def alive(logits: np.ndarray) -> np.ndarray:

@@ -3,21 +3,37 @@
 from __future__ import annotations
 
 import os
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.codec import GridSource
+from flexgs_edge.codec.coder import CHUNK_ROWS
 from flexgs_edge.errors import InputError
 from flexgs_edge.formats import FORMATS, check_converter, converter_bytes, format_of, write_foreign
 from flexgs_edge.pipeline.inputs import load_scene
 from flexgs_edge.pipeline.records import scene_info
 from flexgs_edge.pipeline.workspace import Stopwatch, run_info
 from flexgs_edge.report.result import DecompressResult
-from flexgs_edge.scene import check_writable, inria_dtype, write_ply
+from flexgs_edge.scene import SceneSource, check_writable, inria_dtype, write_ply
 
 WRITE_COPIES = 3
 """Times a chunk's rows that decoding and writing hold at once: codes, planes, rows of the PLY."""
+DECODE_BYTES = 800
+"""Bytes a row that decoding a chunk holds: codes, features, neighbours' weights, sums."""
 
 ANTIALIASED_NOTE = "an antialiased model: the file does not say so; viewers must be told, and here --antialiased"
+
+
+def ahead(source: SceneSource, budget: MemoryBudget) -> AbstractContextManager[None]:
+    """Decoding of the next chunks while one is written, where memory allows."""
+    if not isinstance(source, GridSource):
+        return nullcontext()
+    threads = source.threads
+    chunk = min(source.count, CHUNK_ROWS) * DECODE_BYTES
+    while threads > 1 and budget.free < (threads + 1) * chunk:
+        threads -= 1
+    return source.whole_in_order(threads)
 
 
 def decompress(
@@ -53,7 +69,8 @@ def decompress(
         else:
             row = inria_dtype(scene.source.sh_degree).itemsize
             rows = budget.rows("decoding", WRITE_COPIES * row, minimum=min(scene.source.count, 1024), most=65536)
-            notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
+            with ahead(scene.source, budget):
+                notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
         if scene.settings.get("antialiased") is True:
             notes = (*notes, ANTIALIASED_NOTE)
     size = os.stat(output).st_size

@@ -82,7 +82,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
             {**geometry, **colours},
             *shared,
             rounds=self.effort.refit_rounds,
-            subsets=self.effort.subsets,
+            subsets=self.effort.subsets_of(len(path.cameras)),
             progress=path.progress,
         )
         planes = {**planes, "sh_dc": _put(moved["sh_dc"], rows), "sh_rest": _put(moved["sh_rest"], rows)}
@@ -96,7 +96,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
                 *shared,
                 rounds=1,
                 bands=False,
-                subsets=self.effort.subsets,
+                subsets=self.effort.subsets_of(len(path.cameras)),
                 progress=path.progress,
             )
             planes["sh_dc"] = _put(mended["sh_dc"], rows)

@@ -119,21 +119,22 @@ class Judge:
         for i, camera in enumerate(progress.track(self.cameras, "comparing views", len(self.cameras))):
             image = self.renderer.render(scene, camera)
             error = self._original_error[i] if self.photos is not None else None
-            references = self._original(i), self._photo(i)
+            references = self.original(i), self._photo(i)
             found.append(compare_view(camera.name, image, *references, error, with_ssim, lpips))
         return Quality(tuple(found), self.base_psnr)
 
     def images(self, scene: DeviceScene, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Render of `scene`, render of the original and photo of the view `indices[i]`: [H, W, 3] f32 in [0, 1]."""
         image = _planes(self.renderer.render(scene, self.cameras[i]))
-        return image, _planes(self._original(i)), self._photo(i)
+        return image, _planes(self.original(i)), self._photo(i)
 
     def _keep(self, key: tuple[str, int], image: np.ndarray) -> None:
         if image.nbytes <= self._left:
             self._left -= image.nbytes
             self._kept[key] = image
 
-    def _original(self, i: int) -> np.ndarray:
+    def original(self, i: int) -> np.ndarray:
+        """Render of the original from the view `indices[i]`, [H, W, 3] f32."""
         if ("original", i) in self._kept:
             return self._kept["original", i]
         with self.renderer.load(self.source) as scene:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from flexgs_edge.adapt import REFINE_STEPS, Judge, MaxDrop, MinFidelity, Target, min_ratio
@@ -23,16 +24,31 @@ METHODS = ("best", "paper")
 SELECTS = ("test", "train")
 LAYERS_MOST = 4
 DEFAULT_MAX_DROP = 1.0
-PAPER_ONLY = {
-    "prune_rate": None,
-    "sh_rate": None,
-    "score": "gs",
-    "save_scores": None,
-    "score_cache": None,
-    "bits": "paper",
-    "groups": None,
+METHOD_ONLY: dict[str, tuple[str, object]] = {
+    "prune_rate": ("paper", None),
+    "sh_rate": ("paper", None),
+    "score": ("paper", "gs"),
+    "save_scores": ("paper", None),
+    "score_cache": ("paper", None),
+    "bits": ("paper", "paper"),
+    "groups": ("paper", None),
+    "unseen": ("best", "keep"),
+    "refit": ("best", True),
+    "layers": ("best", 1),
 }
-"""Options that only `--method paper` knows, with their defaults."""
+"""Options that only one `--method` knows, with their defaults."""
+
+
+def check_method(method: str, given: Iterable[str]) -> None:
+    """Raise `InputError` for options that another method than `method` was meant by; none is ignored silently."""
+    for name in given:
+        other = METHOD_ONLY[name][0]
+        if other != method:
+            word = "[no-]refit" if name == "refit" else name.replace("_", "-")
+            raise InputError(
+                f"--{word} belongs to --method {other}, and this run is --method {method}: "
+                f"add --method {other}, or leave --{word} out"
+            )
 
 
 @dataclass(frozen=True)
@@ -97,15 +113,15 @@ class CompressOptions(ViewOptions):
     Parameters
     ----------
     method : {"best", "paper"}
-        Measured costs, one multiplier and the real coder, or the paper's method as it is.
+        Measured costs, one multiplier and the real coder (the default), or the paper's method as it is.
     select : {"test", "train"}
         Views that decide where to stop: the held-out ones, or the training poses.
     score : str
-        `gs`, `meson`, or a .npy/.npz file with one number a Gaussian.
+        `gs`, `meson`, or a .npy/.npz file with one number a Gaussian (`paper`).
     save_scores : str, optional
-        Write the scores here (.npy).
+        Write the scores here, .npy (`paper`).
     score_cache : str, optional
-        Keep the scores here, and take them from here when they are of the same scene, poses and score.
+        Keep the scores here, and take them from here when they are of the same scene, poses and score (`paper`).
     max_drop, min_fidelity : float, optional
         Quality targets, dB.
     max_size : int, optional
@@ -113,11 +129,11 @@ class CompressOptions(ViewOptions):
     min_ratio : float, optional
         Size target, PLY bytes / file bytes.
     prune_rate, sh_rate : float, optional
-        Fixed rates from 0 to 1: no search.
+        Fixed rates from 0 to 1: no search (`paper`).
     bits : str
-        Bits per attribute, `auto`, or `rtn4`, `rtn8`, ...
+        Bits per attribute, `auto`, or `rtn4`, `rtn8`, ... (`paper`).
     groups : int, optional
-        Quantization groups per channel. Default: one for about 512 rows.
+        Quantization groups per channel (`paper`). Default: one for about 512 rows.
     base_psnr : float
         PSNR of the original against its photos that the modelled drop starts from, dB.
     effort : {"fast", "balanced", "thorough"}
@@ -138,7 +154,7 @@ class CompressOptions(ViewOptions):
         Overwrite files that exist.
     """
 
-    method: str = "paper"
+    method: str = "best"
     select: str = "test"
     score: str = "gs"
     save_scores: str | None = None
@@ -176,15 +192,9 @@ class CompressOptions(ViewOptions):
             )
         if self.groups is not None and self.groups < 1:
             raise InputError(f"--groups {self.groups}: expected 1 or more")
-        for name, default in PAPER_ONLY.items():
-            if self.method != "paper" and getattr(self, name) != default:
-                raise InputError(
-                    f"--{name.replace('_', '-')} belongs to --method paper: leave it out, or ask for that method"
-                )
+        check_method(self.method, [name for name in METHOD_ONLY if getattr(self, name) != METHOD_ONLY[name][1]])
         if not 1 <= self.layers <= LAYERS_MOST:
             raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
-        if self.layers > 1 and self.method != "best":
-            raise InputError(f"--layers {self.layers}: only --method best writes layered files")
         if self.score_cache is not None and self.score not in ("gs", "meson"):
             raise InputError(f"--score-cache keeps scores that are computed: leave it out with --score {self.score}")
         self._check_targets()

@@ -39,7 +39,10 @@ class Plan:
         bits, _ = options.bit_spec()
         if views is None:
             if options.method != "paper":
-                raise InputError(f"{WITHOUT_VIEWS}. Views are needed to measure what each Gaussian is worth")
+                raise InputError(
+                    f"{WITHOUT_VIEWS}. Views are needed to measure what each Gaussian is worth; without them only "
+                    "--method paper with fixed rates works"
+                )
             if fixed is None or computes or bits is None:
                 why = (
                     "to score Gaussians and to judge the result"

@@ -18,8 +18,14 @@ from flexgs_edge.scene.source import SceneSource
 CHUNK_ROWS = 1 << 18
 """Most rows of a chunk: 60 MB of planes at SH degree 3, large enough that launches cost nothing."""
 MIN_CHUNK_ROWS = 1 << 10
-SUM_BYTES = 12
-"""Bytes a row of a scoring pass's hits and sums."""
+
+
+def sum_bytes(planes: int) -> int:
+    """Bytes a row of a scoring pass's hits and of so many planes of 64-bit sums."""
+    return 4 + 8 * planes
+
+
+SUM_BYTES = sum_bytes(1)
 
 
 def plane_bytes(sh_degree: int) -> int:
@@ -164,10 +170,20 @@ class DeviceScene:
     budget : MemoryBudget
     antialiased : bool
         How it is drawn: `cov` of the chunks is then the covariance's factor.
+    sum_bytes : int
+        Bytes a row that sums over its views will take on the backend: left free.
+    targets : bool
+        Views will be compared with targets on the backend: room for these is taken with the view's.
     """
 
     def __init__(
-        self, backend: Backend, planes: SourcePlanes | QuantizedPlanes, budget: MemoryBudget, antialiased: bool = False
+        self,
+        backend: Backend,
+        planes: SourcePlanes | QuantizedPlanes,
+        budget: MemoryBudget,
+        antialiased: bool = False,
+        sum_bytes: int = SUM_BYTES,
+        targets: bool = False,
     ) -> None:
         self.backend = backend
         self.count = planes.count
@@ -175,7 +191,9 @@ class DeviceScene:
         self.origin = planes.origin
         self.antialiased = antialiased
         self.statistics: list[Any] = []
-        self.resident = False
+        self.resident, self._streamed = False, False
+        self.targets = targets
+        self._sum_bytes = sum_bytes
         self._planes = planes
         self._budget = budget
         self._resident: list[Chunk] = []
@@ -188,10 +206,14 @@ class DeviceScene:
         """Bytes that drawing must leave to the scene: none once it is loaded, else its smallest chunk."""
         return 0 if self._resident else padded(self._least_rows) * self._chunk_row_bytes
 
+    @property
+    def later_bytes(self) -> int:
+        """Bytes that sums over views will take: none once the first view made them."""
+        return 0 if self.statistics else self._sum_bytes * self.count
+
     def _decide(self) -> None:
         """Load the scene if it fits, else find the rows of a streamed chunk (fixed from then on)."""
-        planes, budget = self._planes, self._budget
-        later = 0 if self.statistics else SUM_BYTES * padded(self.count + LANES)
+        planes, budget, later = self._planes, self._budget, self.later_bytes
         whole = planes.sh_count * plane_bytes(planes.sh_degree) + (self.count - planes.sh_count) * plane_bytes(0)
         most = min(CHUNK_ROWS, max(self.count, 1))
         # Two chunks may be padded at most: the last with SH and the last without.
@@ -203,13 +225,14 @@ class DeviceScene:
             self._rows = max(min(most, spare // per_row - LANES), self._least_rows)
         if fits:
             self._resident = [self._load(*span) for span in self._spans()]
-        self.resident = fits
+        # Not asked again in the middle of a view, when part of what it left free is taken.
+        self.resident, self._streamed = fits, not fits
 
     def evict(self) -> None:
         """Give the memory of a loaded scene back; the next view decides again."""
         for chunk in self._resident:
             chunk.release()
-        self._resident, self.resident = [], False
+        self._resident, self.resident, self._streamed = [], False, False
 
     def _spans(self) -> Iterator[tuple[int, int, int]]:
         """(start, stop, degree): rows with SH first, then the block without."""
@@ -225,7 +248,7 @@ class DeviceScene:
 
     def chunks(self) -> Iterator[Chunk]:
         """The scene's chunks in row order; a streamed chunk lives until the next one is asked for."""
-        if not self.resident:
+        if not self.resident and not self._streamed:
             self._decide()
         if self.resident:
             yield from self._resident

@@ -10,23 +10,34 @@ import numpy as np
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
-from flexgs_edge.constants import DEFAULT_NEAR, FIXED_WEIGHT, JACOBIAN_MARGIN, LANES, TILE
+from flexgs_edge.constants import DEFAULT_NEAR, FIXED_WEIGHT, JACOBIAN_MARGIN, TILE
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels import Backend
 from flexgs_edge.quantize import QuantizedScene
-from flexgs_edge.render.device_scene import DeviceScene, QuantizedPlanes, SourcePlanes, padded
+from flexgs_edge.render.device_scene import (
+    MIN_CHUNK_ROWS,
+    SUM_BYTES,
+    DeviceScene,
+    QuantizedPlanes,
+    SourcePlanes,
+    padded,
+    plane_bytes,
+    upload_bytes,
+)
 from flexgs_edge.scene.source import SceneSource
 
 SORT_DIGIT_BITS = 11
 SORT_DIGITS = 1 << SORT_DIGIT_BITS
+TARGET_BYTES = 6
+"""Bytes a pixel and channel of a target in half precision, and of the residual against it."""
 PAIR_BYTES = 20
 """A pair (8) and its draft (12)."""
 DEFAULT_PAIRS = 1 << 21
 """Pairs of a batch when memory allows: 40 MiB, one batch for most views."""
 PAIR_SHARE = 8
 """The tile lists take at most this part (one in eight) of what is free beyond the least: the scene comes next."""
-SUM_BYTES = 12
-"""Bytes a row of hits and one fixed-point sum."""
+SUM_ROWS = 1 << 18
+"""Rows of sums that are on the host at a time."""
 EXTENTS = ("exact", "inria")
 
 
@@ -82,6 +93,32 @@ def view_key(scene: DeviceScene, camera: Camera) -> tuple[int, int, int]:
     return scene.count, camera.width, camera.height
 
 
+def view_shapes(backend: Backend, count: int, width: int, height: int) -> dict[str, tuple[tuple[int, ...], Any]]:
+    """Shape and type of the buffers of a view, by name; the lists of pairs take what is left."""
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    return {
+        "camera": ((32,), np.float32),
+        "records": ((count, 16), np.float32),
+        "keys": ((count,), np.uint32),
+        "bounds": ((count,), np.uint32),
+        "keys_a": ((count,), np.uint32),
+        "ids_a": ((count,), np.uint32),
+        "keys_b": ((count,), np.uint32),
+        "ids_b": ((count,), np.uint32),
+        "digits": ((SORT_DIGITS * backend.sort_blocks + 1,), np.uint32),
+        "block_pairs": ((backend.sort_blocks,), np.uint64),
+        "room": ((2, backend.tile_blocks), np.uint32),
+        "ends": ((tiles_x * tiles_y * backend.tile_blocks + 1,), np.uint32),
+        "state": ((tiles_x * tiles_y, 4, TILE * TILE), np.float32),
+        "image": ((3, tiles_y * TILE, tiles_x * TILE), np.float32),
+    }
+
+
+def shapes_bytes(shapes: dict[str, tuple[tuple[int, ...], Any]]) -> int:
+    """Bytes of all of `view_shapes`."""
+    return sum(int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
+
+
 class _ViewBuffers:
     """Buffers that live as long as the views have one size and one number of rows."""
 
@@ -93,29 +130,17 @@ class _ViewBuffers:
         self.arrays: list[Any] = []
         self._backend = backend
         self._targets: tuple[Any, Any] | None = None
-        shapes = {
-            "camera": ((32,), np.float32),
-            "records": ((count, 16), np.float32),
-            "keys": ((count,), np.uint32),
-            "bounds": ((count,), np.uint32),
-            "keys_a": ((count,), np.uint32),
-            "ids_a": ((count,), np.uint32),
-            "keys_b": ((count,), np.uint32),
-            "ids_b": ((count,), np.uint32),
-            "digits": ((SORT_DIGITS * backend.sort_blocks + 1,), np.uint32),
-            "block_pairs": ((backend.sort_blocks,), np.uint64),
-            "room": ((2, backend.tile_blocks), np.uint32),
-            "ends": ((self.tiles * backend.tile_blocks + 1,), np.uint32),
-            "state": ((self.tiles, 4, TILE * TILE), np.float32),
-            "image": ((3, self.padded_height, self.padded_width), np.float32),
-        }
-        size = sum(int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
+        shapes = view_shapes(backend, count, width, height)
+        size = shapes_bytes(shapes)
         # One splat may touch every tile, so no batch can be smaller than that. What the scene and the sums of a scoring pass
         # need at the least is checked with the view, so that one message names a limit that does.
-        later = PAIR_BYTES * self.tiles + SUM_BYTES * padded(count + LANES) + scene.least_bytes
+        later = PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + scene.targets * self._target_bytes
         budget.require(f"a view of {count} Gaussians at {width}x{height}", size + later)
         try:
             made = {name: self._array(shape, dtype) for name, (shape, dtype) in shapes.items()}
+            if scene.targets:
+                self.target_arrays()
+                later -= self._target_bytes
             spare = max(budget.free - later, 0) // (PAIR_SHARE * PAIR_BYTES)
             self.capacity = min(self.tiles + spare, max(DEFAULT_PAIRS, self.tiles))
             self.pairs = self._array((self.capacity, 2), np.uint32)
@@ -128,6 +153,10 @@ class _ViewBuffers:
         self.digits, self.block_pairs = made["digits"], made["block_pairs"]
         self.room, self.ends = made["room"], made["ends"]
         self.state, self.image = made["state"], made["image"]
+
+    @property
+    def _target_bytes(self) -> int:
+        return TARGET_BYTES * 3 * self.padded_height * self.padded_width
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> Any:
         made = self._backend.array(shape, dtype)
@@ -201,10 +230,24 @@ class Renderer:
         assert self._buffers is not None
         return self._buffers.camera
 
-    def load(self, source: SceneSource) -> DeviceScene:
-        """Bring a scene to the backend (all of it, or chunk by chunk for each view when it does not fit)."""
+    def load(self, source: SceneSource, sum_bytes: int = SUM_BYTES, targets: bool = False) -> DeviceScene:
+        """Bring a scene to the backend (all of it, or chunk by chunk for each view when it does not fit).
+
+        `sum_bytes` a row, and room for `targets`, are left free for what is added up over the views.
+        """
         self.release()
-        return DeviceScene(self.backend, SourcePlanes(self.backend, source), self.budget, self.antialiased)
+        planes = SourcePlanes(self.backend, source)
+        return DeviceScene(self.backend, planes, self.budget, self.antialiased, sum_bytes, targets)
+
+    def least_bytes(self, source: SceneSource, camera: Camera, sum_bytes: int) -> int:
+        """Bytes that a view of `source` with targets and sums of `sum_bytes` a row needs at the least, nothing being loaded."""
+        tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
+        view = shapes_bytes(view_shapes(self.backend, source.count, camera.width, camera.height))
+        chunk = padded(min(MIN_CHUNK_ROWS, source.count)) * (
+            plane_bytes(source.sh_degree) + upload_bytes(source.sh_degree)
+        )
+        pixels = (PAIR_BYTES + TARGET_BYTES * 3 * TILE * TILE) * tiles
+        return view + pixels + sum_bytes * source.count + chunk
 
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
         """Bring a quantized scene to the backend, dequantized there."""
@@ -227,11 +270,16 @@ class Renderer:
         self._blend(view, "blend")
         return self.backend.read(view.buffers.image)
 
+    def drawn_planes(self) -> np.ndarray:
+        """The view that was drawn last, for an image or for sums, as `render_planes` would give it."""
+        assert self._buffers is not None
+        return self.backend.read(self._buffers.image)
+
     def add_statistics(self, scene: DeviceScene, camera: Camera, statistics: Statistics) -> None:
         """Add one view to `statistics` (hits and weights of every row)."""
         view = self._prepare(scene, camera)
         hits, sums = self._sum_arrays(scene, 1)
-        self._blend(view, "blend_stats", (hits, sums, sums.shape[2], view.buffers.image))
+        self._blend(view, "blend_stats", (hits, sums, view.buffers.image))
         statistics.hits += self.backend.read(hits)
         statistics.weights += self.read_sums(sums, 1, scene.count)[0].view(np.uint64)
 
@@ -241,12 +289,12 @@ class Renderer:
         Returns
         -------
         array of the backend
-            [2, 2, padded N] u32, low and high words in units of 1 / `FIXED_ERROR`; valid until the next sums.
+            [N, 2, 2] u32, low and high words in units of 1 / `FIXED_ERROR`; valid until the next sums.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, 2)
-        self._blend(view, "blend_removal", (hits, sums, sums.shape[2], view.buffers.image), again=True)
+        self._blend(view, "blend_removal", (hits, sums, view.buffers.image), again=True)
         return sums
 
     def residual_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
@@ -260,13 +308,13 @@ class Renderer:
         Returns
         -------
         array of the backend
-            [4, 2, padded N] u32, low and high words of sum(alpha T) and sum(alpha T r) for red, green, blue, in units of
+            [N, 4, 2] u32, low and high words of sum(alpha T) and sum(alpha T r) for red, green, blue, in units of
             1 / `FIXED_WEIGHT`; valid until the next sums.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, 4)
-        self._blend(view, "blend_residual", (hits, sums, sums.shape[2], self._residual(view, target)), again=True)
+        self._blend(view, "blend_residual", (hits, sums, self._residual(view, target)), again=True)
         return sums
 
     def residual_and_removal_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
@@ -275,13 +323,13 @@ class Renderer:
         Returns
         -------
         array of the backend
-            [6, 2, padded N] u32: the planes of `residual_sums`, then those of `removal_sums`; valid until the next sums.
+            [N, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, 6)
         residual = self._residual(view, target)
-        self._blend(view, "blend_both", (hits, sums, sums.shape[2], view.buffers.image, residual), again=True)
+        self._blend(view, "blend_both", (hits, sums, view.buffers.image, residual), again=True)
         return sums
 
     def _residual(self, view: _View, target: np.ndarray) -> Any:
@@ -292,18 +340,22 @@ class Renderer:
 
     def read_sums(self, sums: Any, channels: int, count: int, first: int = 0) -> np.ndarray:
         """[channels, N] i64 from the words of sums, from plane `first` on."""
-        words = np.empty((channels, *sums.shape[1:]), np.uint32)
-        words = self.backend.read(sums, words, first * sums.shape[1] * sums.shape[2])[:, :, :count].astype(np.uint64)
-        return (words[:, 0] | (words[:, 1] << np.uint64(32))).view(np.int64)
+        values = np.empty((channels, count), np.int64)
+        planes = sums.shape[1]
+        for base in range(0, count, SUM_ROWS):
+            rows = min(SUM_ROWS, count - base)
+            words = self.backend.read(sums, np.empty((rows, planes, 2), np.uint32), 2 * planes * base)
+            values[:, base : base + rows] = words.view(np.int64)[:, first : first + channels, 0].T
+        return values
 
     def _sum_arrays(self, scene: DeviceScene, channels: int) -> tuple[Any, Any]:
         held = scene.statistics
-        if held and held[1].shape[0] < channels:
+        if held and held[1].shape[1] != channels:
             for array in held:
                 array.release()
             held = scene.statistics = []
         if not held:
-            shapes = (((scene.count,), np.uint32), ((channels, 2, padded(scene.count + LANES)), np.uint32))
+            shapes = (((scene.count,), np.uint32), ((scene.count, channels, 2), np.uint32))
             held = scene.statistics = [self.backend.array(shape, dtype) for shape, dtype in shapes]
         for array in held:
             self.backend.fill(array, 0)

@@ -22,33 +22,41 @@ class TargetViews:
 
     Parameters
     ----------
-    renderer, scene : Renderer, DeviceScene
-        The original.
-    cameras : sequence of Camera
     scratch : path, optional
         Folder of the scratch file; the system's default otherwise.
     """
 
-    def __init__(
-        self,
+    def __init__(self, scratch: str | Path | None = None) -> None:
+        self._file = tempfile.TemporaryFile(dir=scratch)  # noqa: SIM115 (closed with the object)
+        self._places: dict[int, tuple[int, tuple[int, ...]]] = {}
+        self._end = 0
+
+    @classmethod
+    def of(
+        cls,
         renderer: Renderer,
         scene: DeviceScene,
         cameras: Sequence[Camera],
         scratch: str | Path | None = None,
         progress: Progress = SILENT,
-    ) -> None:
-        self._file = tempfile.TemporaryFile(dir=scratch)  # noqa: SIM115 (closed with the object)
-        self._places: list[tuple[int, tuple[int, ...]]] = []
-        offset = 0
+    ) -> TargetViews:
+        """All views of `scene` from `cameras`."""
+        views = cls(scratch)
         try:
-            for camera in progress.track(cameras, "rendering the original", len(cameras)):
-                planes = renderer.render_planes(scene, camera).astype(np.float16)
-                self._file.write(planes.data)
-                self._places.append((offset, planes.shape))
-                offset += planes.nbytes
+            for view, camera in enumerate(progress.track(cameras, "rendering the original", len(cameras))):
+                views.add(view, renderer.render_planes(scene, camera))
         except BaseException:
-            self._file.close()
+            views.close()
             raise
+        return views
+
+    def add(self, view: int, planes: np.ndarray) -> None:
+        """Keep a view ([3, H, W] f32, as `Renderer.render_planes` gives it)."""
+        half = planes.astype(np.float16)
+        self._file.seek(self._end)
+        self._file.write(half.data)
+        self._places[view] = (self._end, half.shape)
+        self._end += half.nbytes
 
     def __getitem__(self, view: int) -> np.ndarray:
         """[3, H, W] f16, both sides rounded up to whole tiles."""

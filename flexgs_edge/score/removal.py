@@ -39,9 +39,42 @@ class RemovalCosts:
     sh: np.ndarray
     sh_mean: np.ndarray
 
-    def take(self, rows: np.ndarray) -> RemovalCosts:
-        """The costs of some rows."""
-        return RemovalCosts(self.removal[rows], self.weight2[rows], self.sh[:, rows], self.sh_mean[:, :, rows])
+    @classmethod
+    def of(cls, parts: Sequence[CostParts]) -> RemovalCosts:
+        """Costs over all poses, from sums over some of them each."""
+        removal, weight2 = sum(part.removal for part in parts), sum(part.weight2 for part in parts)
+        moments = sum(part.moments for part in parts)
+        assert isinstance(removal, np.ndarray) and isinstance(weight2, np.ndarray) and isinstance(moments, np.ndarray)
+        divisor = np.where(weight2 > 0, weight2, 1.0)
+        # Rounding may leave a variance of nothing slightly below zero.
+        sh = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
+        return cls(removal, weight2, sh, (moments[:, :3] / divisor).astype(np.float32))
+
+
+@dataclass
+class CostParts:
+    """Sums over some poses that costs are made of; sums over others add up with them.
+
+    Attributes
+    ----------
+    removal, weight2 : np.ndarray
+        [N] f64, as in `RemovalCosts`.
+    moments : np.ndarray
+        [D, 4, N] f64: of the colour of the bands above each degree, times the squared weight (three channels), and of its square.
+    """
+
+    removal: np.ndarray
+    weight2: np.ndarray
+    moments: np.ndarray
+
+    def take(self, rows: np.ndarray) -> CostParts:
+        """The sums of some rows."""
+        return CostParts(self.removal[rows], self.weight2[rows], self.moments[:, :, rows])
+
+
+def moment_bytes(sh_degree: int) -> int:
+    """Bytes a row that the moments of `CostSums` take on the backend."""
+    return 32 * sh_degree
 
 
 class _Wide:
@@ -81,11 +114,9 @@ class CostSums:
         self._removal.add(errors)
         self._weight2.add(weights)
 
-    def finish(self) -> RemovalCosts:
-        """The costs over the views added."""
-        weight = self._weight2.value(FIXED_ERROR)
-        sh, sh_mean = self._moments.finish(weight)
-        return RemovalCosts(self._removal.value(FIXED_ERROR), weight, sh, sh_mean)
+    def finish(self) -> CostParts:
+        """The sums over the views added."""
+        return CostParts(self._removal.value(FIXED_ERROR), self._weight2.value(FIXED_ERROR), self._moments.finish())
 
     def release(self) -> None:
         """Free what is held on the backend."""
@@ -113,7 +144,7 @@ def measure_costs(
     try:
         for camera in progress.track(cameras, "measuring costs", len(cameras)):
             costs.add_view(renderer.removal_sums(scene, camera))
-        return costs.finish()
+        return RemovalCosts.of([costs.finish()])
     finally:
         costs.release()
 
@@ -137,22 +168,16 @@ class _Moments:
                 backend.fill(array, 0)
                 self.arrays[chunk.base] = (chunk.count, array)
             backend.launch(
-                "sh_costs", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, sums.shape[2],
+                "sh_costs", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, sums.shape[1],
                 plane, camera, chunk.means, chunk.sh_rest, sums, self.arrays[chunk.base][1],
             )  # fmt: skip
 
-    def finish(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Costs ([D, N]) and mean colours ([D, 3, N]) from the moments and the sum of weights ([N])."""
-        count = self.scene.count
-        costs, means = np.zeros((self.degree, count)), np.zeros((self.degree, 3, count), np.float32)
-        for base, (chunk_count, array) in self.arrays.items():
-            rows = slice(base, base + chunk_count)
-            moments = self.renderer.backend.read(array)[:, :, :chunk_count] / FIXED_WEIGHT
-            divisor = np.where(weight[rows] > 0, weight[rows], 1.0)
-            # Rounding may leave a variance of nothing slightly below zero.
-            costs[:, rows] = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
-            means[:, :, rows] = moments[:, :3] / divisor
-        return costs, means
+    def finish(self) -> np.ndarray:
+        """[D, 4, N] f64."""
+        moments = np.zeros((self.degree, 4, self.scene.count))
+        for base, (count, array) in self.arrays.items():
+            moments[:, :, base : base + count] = self.renderer.backend.read(array)[:, :, :count] / FIXED_WEIGHT
+        return moments
 
     def release(self) -> None:
         for _, array in self.arrays.values():

@@ -105,13 +105,8 @@ def _add_sums(
     if stats == 1:
         np.add.at(hits, rows_of, count)
     for c, name in enumerate(planes):
-        low, high = sums[c].astype(np.uint64)
-        total = (low | high << np.uint64(32)).view(np.int64)
         unit = FIXED_ERROR if name in ("error", "square") else FIXED_WEIGHT
-        np.add.at(total, rows_of[some], _fixed(lanes[name][some], unit))
-        words = total.view(np.uint64)
-        sums[c, 0] = words & np.uint64(0xFFFFFFFF)
-        sums[c, 1] = words >> np.uint64(32)
+        np.add.at(sums.view(np.int64)[:, c, 0], rows_of[some], _fixed(lanes[name][some], unit))
 
 
 def blend(
@@ -132,7 +127,6 @@ def blend(
     image: np.ndarray,
     hits: np.ndarray | None = None,
     sums: np.ndarray | None = None,
-    rows: int = 0,
     target: np.ndarray | None = None,
     rest: np.ndarray | None = None,
     stats: int = 0,

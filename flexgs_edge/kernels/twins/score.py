@@ -14,10 +14,8 @@ def residual(size: tuple[int, ...], count: int, target: np.ndarray, image: np.nd
     out[:] = target.astype(f32) - image.reshape(-1)
 
 
-def _sum_values(words_of: np.ndarray, unit: float) -> np.ndarray:
-    low, high = words_of
-    words = (low.astype(np.uint64) | (high.astype(np.uint64) << np.uint64(32))).view(np.int64)
-    return words.astype(f32) * f32(unit)
+def _sum_values(sums: np.ndarray, unit: float) -> np.ndarray:
+    return sums.view(np.int64)[:, 0].astype(f32) * f32(unit)
 
 
 def _directions(camera: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -36,7 +34,7 @@ def sh_costs(
     stride: int,
     base: int,
     degree: int,
-    rows: int,
+    planes: int,
     plane: int,
     camera: np.ndarray,
     means: np.ndarray,
@@ -45,7 +43,7 @@ def sh_costs(
     moments: np.ndarray,
 ) -> None:
     """Moments w2 d and w2 |d|^2 of the colour d above each lower degree ([degree, 4, stride] i64)."""
-    w2 = _sum_values(sums[plane][:, base : base + count], 1.0 / FIXED_ERROR)
+    w2 = _sum_values(sums[base : base + count, plane], 1.0 / FIXED_ERROR)
     some = np.flatnonzero(w2 > 0)
     basis = sh_basis(degree, *_directions(camera, means[:, some]))
     d = [np.zeros(len(some), f32) for _ in range(3)]
@@ -69,7 +67,7 @@ def sh_residual(
     stride: int,
     base: int,
     degree: int,
-    rows: int,
+    planes: int,
     camera: np.ndarray,
     means: np.ndarray,
     sums: np.ndarray,
@@ -77,7 +75,7 @@ def sh_residual(
 ) -> None:
     """Adds Y_k sum(alpha T r) and |Y_k| sum(alpha T) of one view to `normal` ([K + 1, 4, stride])."""
     span = slice(base, base + count)
-    weight, *seen = (_sum_values(sums[c][:, span], 1.0 / FIXED_WEIGHT) for c in range(4))
+    weight, *seen = (_sum_values(sums[span, c], 1.0 / FIXED_WEIGHT) for c in range(4))
     some = np.flatnonzero(weight > 0)
     basis = sh_basis(degree, *_directions(camera, means[:, some]))
     for k, function in enumerate([np.full(len(some), SH_C0, f32), *basis]):
