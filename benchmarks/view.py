@@ -17,14 +17,8 @@ from benchmarks.harness import SCENES, Bench, backend_of, check, parse, run_modu
 from flexgs_edge.cameras import Camera, read_cameras, split_views
 from flexgs_edge.render import DeviceScene, Renderer, Statistics
 from flexgs_edge.scene.ply import PlySource
+from flexgs_edge.study.timing import STAGES
 
-STAGES = {
-    "projection": ("project",),
-    "sort": ("sort_count_first", "sort_scatter_first", "sort_count", "sort_scatter", "exclusive_scan"),
-    "tile lists": ("tile_room", "tile_count", "tile_scatter"),
-    "blend": ("blend",),
-}
-"""Kernels of each stage (the scans of the tile lists, 0.1 ms, count as sorting)."""
 VIEWS = 10
 
 

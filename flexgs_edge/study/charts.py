@@ -80,8 +80,18 @@ class LineChart:
         A level of y to mark, such as a target.
     doublings : bool
         x in powers of two.
+    megabytes : bool
+        x in MB, in logarithms.
     magnitudes : bool
         y in logarithms, linear from `LINEAR_BELOW` down through zero: losses below and far above 1 dB in one chart.
+    floating : bool
+        y need not start at zero: fidelities.
+    log_x, log_y : bool
+        Plain logarithms, such as of times; all values are above zero then.
+    front : sequence of (x, y)
+        Points that no other beats, joined by steps under the series.
+    upright : (x, str), optional
+        An x to mark, and words for it: a point without a y.
     """
 
     title: str
@@ -91,6 +101,12 @@ class LineChart:
     limit: float | None = None
     doublings: bool = False
     magnitudes: bool = False
+    megabytes: bool = False
+    floating: bool = False
+    log_x: bool = False
+    log_y: bool = False
+    front: Sequence[tuple[float, float]] = ()
+    upright: tuple[float, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -121,7 +137,8 @@ class DotChart:
     groups : sequence of str
         Along the axis.
     dots : dict
-        One value a group, by label; those that are not above zero cannot be shown and stand at the foot as "none".
+        One value a group, by label; those that are not above zero cannot be shown and stand at the foot as "none", those that
+        there are not (None) are left out.
     words : dict
         As `dots`, what is written beside each.
     """
@@ -129,7 +146,7 @@ class DotChart:
     title: str
     y_label: str
     groups: Sequence[str]
-    dots: dict[str, Sequence[float]]
+    dots: dict[str, Sequence[float | None]]
     words: dict[str, Sequence[str]]
 
 
@@ -212,11 +229,12 @@ def draw(chart: Chart) -> Figure:
 
 def _lines(axes: Axes, chart: LineChart) -> None:
     from matplotlib.patheffects import withStroke
-    from matplotlib.ticker import NullLocator
+    from matplotlib.ticker import LogLocator, NullLocator
 
     own = others = 0
     xs = [x for series in chart.series for x in series.x]
-    scale = math.log2 if chart.doublings else float
+    logarithmic = chart.megabytes or chart.log_x
+    scale = math.log2 if chart.doublings or logarithmic else float
     middle = (scale(min(xs)) + scale(max(xs))) / 2
     for series in chart.series:
         points = [(x, y, i) for i, (x, y) in enumerate(zip(series.x, series.y)) if y is not None]
@@ -256,6 +274,20 @@ def _lines(axes: Axes, chart: LineChart) -> None:
     if chart.doublings:
         axes.set_xscale("log", base=2)
         axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}x")
+    if logarithmic:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+        axes.xaxis.set_minor_locator(NullLocator())
+    if chart.front:
+        steps: dict[str, Any] = {"color": INK, "linewidth": 1.0, "linestyle": (0, (2, 2)), "zorder": 1}
+        axes.step(*_split(sorted(chart.front)), where="post", label="Pareto front", **steps)
+    if chart.upright is not None:
+        at, words = chart.upright
+        axes.axvline(at, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
+        axes.annotate(
+            words, (at, 0.02), (-3, 0), ("data", "axes fraction"), "offset points", ha="right", rotation=90, fontsize=8
+        )
     # Losses start at zero, or below where compression helped: no axis makes small ones look large.
     shown = [y for series in chart.series for y in series.y if y is not None]
     low, high = min(shown, default=0.0), max(shown, default=1.0)
@@ -263,7 +295,13 @@ def _lines(axes: Axes, chart: LineChart) -> None:
         axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
         axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)
         axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_ylim(min(low * 1.1, 0.0), max(high, LINEAR_BELOW) * (1.4 if chart.magnitudes else 1.1))
+    if chart.log_y:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
+        axes.yaxis.set_minor_locator(NullLocator())
+    elif not chart.floating:
+        axes.set_ylim(min(low * 1.1, 0.0), max(high, LINEAR_BELOW) * (1.4 if chart.magnitudes else 1.1))
     axes.set_xlabel(chart.x_label)
     axes.set_ylabel(chart.y_label + (", log above 0.1" if chart.magnitudes else ""))
     if any(series.label for series in chart.series):
@@ -272,15 +310,17 @@ def _lines(axes: Axes, chart: LineChart) -> None:
 
 def _dots(axes: Axes, chart: DotChart) -> None:
     axes.set_yscale("log")
-    shown = [value for values in chart.dots.values() for value in values if value > 0]
+    shown = [value for values in chart.dots.values() for value in values if value is not None and value > 0]
     axes.set_ylim(min(shown, default=1.0) / 4, max(shown, default=1.0) * 4)
     foot = axes.get_ylim()[0]
     width = 0.5 / len(chart.dots)
     for number, (label, values) in enumerate(chart.dots.items()):
         x = [group + (number + 0.5) * width - 0.4 for group in range(len(chart.groups))]
-        points = [(at, value) for at, value in zip(x, values) if value > 0]
+        points = [(at, value) for at, value in zip(x, values) if value is not None and value > 0]
         axes.plot(*_split(points), MARKS[number], color=COLOURS[number], markersize=7, label=label)
         for at, value, words in zip(x, values, chart.words[label]):
+            if value is None:
+                continue
             place = (at, value) if value > 0 else (at, foot)
             text = words if value > 0 else f"none: {words}"
             axes.annotate(text, place, (6, 0), textcoords="offset points", va="center", fontsize=8)

@@ -13,17 +13,14 @@ from typing import Any
 from flexgs_edge._version import __version__
 from flexgs_edge.errors import InputError
 from flexgs_edge.pipeline.options import CompressOptions
-from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.report.result import RunInfo, SceneInfo, ViewsInfo
-from flexgs_edge.report.summary import device_words
 from flexgs_edge.study import pruning, quantization, whole
 from flexgs_edge.study.bench import Bench, open_bench, scene_names
-from flexgs_edge.study.charts import picture, require_matplotlib
+from flexgs_edge.study.charts import require_matplotlib
 from flexgs_edge.study.experiment import Experiment
 from flexgs_edge.study.folder import atomic_folder, check_folder
-from flexgs_edge.study.page import Section, study_page
-from flexgs_edge.study.tables import json_bytes
+from flexgs_edge.study.page import study_page
+from flexgs_edge.study.results import SceneStudy, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -38,29 +35,6 @@ EXPERIMENTS: tuple[Callable[[Bench], Experiment], ...] = (
     whole.rates,
     whole.times,
 )
-
-
-@dataclass(frozen=True)
-class SceneStudy:
-    """What was found on one scene."""
-
-    name: str
-    scene: SceneInfo
-    views: ViewsInfo
-    decided_by: str
-    experiments: tuple[Experiment, ...]
-    run: RunInfo
-
-    def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
-        return {
-            "name": self.name,
-            "input": self.scene.to_json(),
-            "views": self.views.to_json(),
-            "decided_by": self.decided_by,
-            "experiments": [experiment.to_json() for experiment in self.experiments],
-            "run": self.run.to_json(),
-        }
 
 
 @dataclass(frozen=True)
@@ -81,13 +55,7 @@ class PaperStudy:
 
     def to_text(self) -> str:
         """The findings, for people."""
-        lines = []
-        for scene in self.scenes:
-            lines.append(f"{scene.name}: {scene.scene.count} Gaussians; {scene.decided_by}")
-            for experiment in scene.experiments:
-                lines.append(f"  {experiment.title}")
-                lines += [f"    {words}" for words in experiment.findings]
-                lines += [f"    {b.what}: {b.here}; paper: {b.paper}" for b in experiment.beside]
+        lines = [line for scene in self.scenes for line in scene.to_lines()]
         return "\n".join([*lines, f"wrote {os.path.join(self.output, 'index.html')}"]) + "\n"
 
 
@@ -119,7 +87,7 @@ def study_paper(
     FlexGSError
         `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
     """
-    options = replace(options or CompressOptions(), **words)
+    options = replace(options or CompressOptions(), **{**words, "method": "paper"})
     if not scenes:
         raise InputError("no scene: give one or more .ply, .fgs or model folders")
     # Loaded before the memory is planned, so that its bytes count as taken.
@@ -145,14 +113,7 @@ def _study_scene(path: str | Path, name: str, options: CompressOptions, progress
             LOG.info("%s: experiment %d of %d, %s", name, number, len(EXPERIMENTS), make.__name__)
             experiments.append(make(bench))
             LOG.info("%s: %s: %.1f s", name, experiments[-1].key, time.perf_counter() - started)
-        return SceneStudy(
-            name,
-            scene_info(bench.scene),
-            views_info(bench.views),
-            bench.decided_by,
-            tuple(experiments),
-            bench.workspace.run_info(),
-        )
+        return SceneStudy.of(bench, experiments)
 
 
 def _write(folder: Path, scenes: Sequence[SceneStudy]) -> None:
@@ -160,19 +121,7 @@ def _write(folder: Path, scenes: Sequence[SceneStudy]) -> None:
     for scene in scenes:
         place = folder / scene.name
         place.mkdir()
-        drawn = []
-        for experiment in scene.experiments:
-            png, svg = picture(experiment.chart)
-            record = {"scene": scene.name, "decided_by": scene.decided_by, **experiment.to_json()}
-            for suffix, data in (
-                ("csv", experiment.table.to_csv()),
-                ("json", json_bytes(record)),
-                ("png", png),
-                ("svg", svg),
-            ):
-                (place / f"{experiment.key}.{suffix}").write_bytes(data)
-            drawn.append((experiment, svg))
-        sections.append(Section(scene.name, _facts(scene), drawn))
+        sections.append(write_scene(place, scene))
     intro = (
         "The experiments of the FlexGaussian paper (Tian et al., ACM MM 2025), made again by flexgs-edge with its own programs, "
         "containers and quality figures. Sizes are bytes of the finished file; ratios are to the PLY as INRIA writes it. The "
@@ -180,23 +129,3 @@ def _write(folder: Path, scenes: Sequence[SceneStudy]) -> None:
     )
     page = study_page("The paper's evaluation", intro, sections)
     (folder / "index.html").write_text(page, encoding="utf-8")
-
-
-def _facts(scene: SceneStudy) -> list[tuple[str, str]]:
-    views = scene.views
-    facts = [
-        ("file", scene.scene.path),
-        (
-            "Gaussians",
-            f"{scene.scene.count}, SH degree {scene.scene.sh_degree}, PLY {scene.scene.ply_bytes / 1e6:.1f} MB",
-        ),
-        (
-            "views",
-            f"{views.total} of {views.width}x{views.height}, {views.train} training and {views.held_out} held out",
-        ),
-        ("decided by", scene.decided_by),
-    ]
-    facts += [("note", note) for note in (*scene.scene.notes, *views.notes)]
-    if scene.run.device is not None:
-        facts.append(("device", device_words(scene.run.device)))
-    return facts

@@ -11,7 +11,7 @@ from flexgs_edge.cli import words
 
 @click.command(cls=words.SectionCommand)
 @click.argument("scenes", metavar="SCENE...", type=click.Path(), nargs=-1, required=True)
-@words.option("Output", "-o", "--output", metavar="DIR", required=True, help="Folder for the results; made if missing.")
+@words.results_option
 @words.option(
     "Search",
     "--max-drop",
@@ -21,18 +21,7 @@ from flexgs_edge.cli import words
     show_default=True,
     help="Drop that the search on the plane of the rates aims at: against the photos where there are photos, else modelled.",
 )
-@words.base_psnr_option
-@words.cameras_option
-@words.images_option
-@words.holdout_option
-@words.select_option
-@words.drawing_options
-@words.drop_invalid_option
-@words.device_option
-@words.memory_option
-@words.force_option
-@words.json_option
-@words.talk_options
+@words.study_options
 def command(scenes: tuple[str, ...], output: str, json_path: str | None, quiet: bool, **options: Any) -> None:
     """Make the FlexGaussian paper's evaluation on your own scenes.
 

@@ -1,0 +1,139 @@
+"""The blend beside what this machine can do: its arithmetic alone, over data in the nearest cache, and the share of views in it.
+
+python -m benchmarks.peak [--scene fox|sample] [--device SPEC] [--repeats N]
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness import SCENES, Bench, backend_of, check, parse
+from flexgs_edge.cameras import read_cameras
+from flexgs_edge.constants import TILE
+from flexgs_edge.kernels.opencl import OpenCLBackend
+from flexgs_edge.kernels.source import load_source
+from flexgs_edge.render import Renderer, Statistics
+from flexgs_edge.scene.ply import PlySource
+
+SPLATS, BLOCKS, ROUNDS, ITEMS = 8, 4, 4000, 16
+VIEWS = 10
+
+ARITHMETIC = f"""
+__kernel void peak(const uint rounds, __global const float *records, __global float *out) {{
+  FW red[{BLOCKS}], green[{BLOCKS}], blue[{BLOCKS}], trans[{BLOCKS}], xs[{BLOCKS}];
+  const FW y = TO_F(LANE_INDEX >> 2);
+  for (int k = 0; k < {BLOCKS}; ++k) {{
+    red[k] = green[k] = blue[k] = (FW)0.0f;
+    trans[k] = (FW)1.0f;
+    xs[k] = TO_F((LANE_INDEX & 3) + 4 * k);
+  }}
+  for (uint n = 0; n < rounds; ++n) {{
+    __global const float *r = records + (n & {SPLATS - 1}) * 16;
+    const FW mx = (FW)r[0], my = (FW)r[1], ca = (FW)r[2], cb = (FW)r[3], cc = (FW)r[4], level = (FW)r[5];
+    const FW cr = (FW)r[6], cg = (FW)r[7], cbl = (FW)r[8];
+#pragma unroll
+    for (int k = 0; k < {BLOCKS}; ++k) {{
+      FW dx = xs[k] - mx, dy = y - my;
+      FW q = fma(fma(ca, dx, cb * dy), dx, (cc * dy) * dy);
+      FW alpha = smaller(fexp2_number(level - larger(q, (FW)0.0f)), (FW)ALPHA_MAX);
+      FW t = trans[k];
+      FW next = t * ((FW)1.0f - alpha);
+      IW seen = MASK(alpha >= (FW)ALPHA_MIN);
+      IW hit = seen & MASK(next >= (FW)TRANSMITTANCE_MIN);
+      FW weight = pick(hit, alpha * t, (FW)0.0f);
+      red[k] = fma(weight, cr, red[k]);
+      green[k] = fma(weight, cg, green[k]);
+      blue[k] = fma(weight, cbl, blue[k]);
+      trans[k] = pick(hit, next, pick(seen, -fabs(t), t));
+    }}
+  }}
+  FW all = (FW)0.0f;
+  for (int k = 0; k < {BLOCKS}; ++k) all += red[k] + green[k] + blue[k] + trans[k];
+  STOREF(all, out, get_global_id(0) * W);
+}}
+"""
+"""The blend's step for vectors of which every lane counts; splats, pixels and colours never leave the nearest cache."""
+
+
+def bench_peak(bench: Bench, backend: OpenCLBackend) -> float:
+    """Lanes a second of the arithmetic alone, on all cores."""
+    session, width = backend.session, backend.width
+    source = load_source("activate.cl") + ARITHMETIC  # that file for the constants and helpers before it
+    kernel = session.kernel(source, "peak", (f"-DW={width}",), "ubb")
+    records = np.zeros((SPLATS, 16), np.float32)
+    records[:, 0], records[:, 1] = np.arange(SPLATS) * 2, 1.5
+    records[:, 2] = records[:, 4] = 0.01
+    records[:, 5], records[:, 6:9] = -6.0, 0.5
+    held, out = backend.array(records.shape, np.float32), backend.array((ITEMS * width,), np.float32)
+    backend.write(held, records)
+
+    def run() -> None:
+        session.launch("peak", kernel, (ITEMS,), (1,), (ROUNDS, held, out))
+        session.finish()
+
+    run()
+    sums = backend.read(out)
+    check(bool(np.isfinite(sums).all() and (sums > 0).all()), "sums of light of the arithmetic alone")
+    lanes = ITEMS * ROUNDS * BLOCKS * width
+    seconds = []
+    for _ in range(bench.repeats):
+        start = time.perf_counter()
+        run()
+        seconds.append(time.perf_counter() - start)
+    bench.add("arithmetic alone", [lanes / s / 1e9 for s in seconds], "G lanes/s", f"W = {width}, all cores")
+    held.release()
+    out.release()
+    return lanes / min(seconds)
+
+
+def bench_share(bench: Bench, backend: OpenCLBackend, renderer: Renderer, folder: Path, peak: float) -> None:
+    """The blend of real views, lane by lane."""
+    cameras = read_cameras(folder / "cameras.json")
+    cameras = cameras[:: max(len(cameras) // VIEWS, 1)][:VIEWS]
+    with renderer.load(PlySource(folder / "point_cloud.ply")) as scene:
+        statistics = Statistics.zeros(scene.count)
+        pairs = blended = 0
+        for camera in cameras:
+            renderer.add_statistics(scene, camera, statistics)
+            buffers = renderer._buffers
+            assert buffers is not None
+            count = int(backend.read(buffers.ends)[-1])
+            masks = backend.read(buffers.pairs)[:count, 1].astype(np.uint16)
+            pairs += count
+            blended += int(np.unpackbits(masks.view(np.uint8)).sum()) * 16
+        hits = int(statistics.hits.sum())
+        seconds = []
+        for _ in range(bench.repeats):
+            backend.profile = defaultdict(float)
+            for camera in cameras:
+                renderer.render(scene, camera)
+            seconds.append(backend.profile["blend"])
+        backend.profile = None
+    cores = len(os.sched_getaffinity(0))
+    listed = pairs * TILE * TILE
+    each = [s * 1e9 * cores / listed for s in seconds]
+    bench.add("blend, by listed tile pixel and core", each, "ns", f"{len(cameras)} views, {cores} cores")
+    bench.add("lanes of listed blocks, of listed tile pixels", [blended / listed], "share")
+    bench.add("useful lanes (blended pixels), of lanes of listed blocks", [hits / blended], "share")
+    bench.add("blend: useful lanes, of the arithmetic alone", [hits / s / peak for s in seconds], "share")
+
+
+def main() -> None:
+    options = parse(__doc__, repeats=7)
+    backend, budget = backend_of(options)
+    check(isinstance(backend, OpenCLBackend), "an OpenCL device")
+    assert isinstance(backend, OpenCLBackend)
+    bench = Bench(backend.name, options.repeats)
+    peak = bench_peak(bench, backend)
+    renderer = Renderer(backend, budget)
+    bench_share(bench, backend, renderer, SCENES[options.scene], peak)
+    renderer.release()
+
+
+if __name__ == "__main__":
+    main()

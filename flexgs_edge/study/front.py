@@ -1,0 +1,15 @@
+"""The Pareto front: what no other point beats in both respects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def front(costs: Sequence[float], worths: Sequence[float]) -> list[bool]:
+    """For each point whether no other costs as little and is worth as much, and differs from it.
+
+    >>> front([1.0, 2.0, 3.0, 3.0], [5.0, 4.0, 6.0, 6.0])
+    [True, False, True, True]
+    """
+    points = list(zip(costs, worths))
+    return [not any(c <= cost and w >= worth and (c, w) != (cost, worth) for c, w in points) for cost, worth in points]

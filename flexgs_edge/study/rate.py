@@ -1,0 +1,146 @@
+"""`study rate`: bytes against quality of every method and format, and of the measured method without each of its parts."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from flexgs_edge._version import __version__
+from flexgs_edge.best.effort import EFFORTS
+from flexgs_edge.errors import InputError
+from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.study import trade
+from flexgs_edge.study.ablations import WHOLE, parts_of
+from flexgs_edge.study.bench import Bench, open_bench, scene_names
+from flexgs_edge.study.charts import require_matplotlib
+from flexgs_edge.study.experiment import Experiment
+from flexgs_edge.study.folder import atomic_folder, check_folder
+from flexgs_edge.study.page import study_page
+from flexgs_edge.study.points import best_points, paper_points, peer_points
+from flexgs_edge.study.results import SceneStudy, write_scene
+
+LOG = logging.getLogger("flexgs_edge")
+
+RATIOS = (8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
+ABLATED = (16.0, 64.0)
+ABLATION_EFFORT = "fast"
+
+
+@dataclass(frozen=True)
+class RateStudy:
+    """What `study rate` found and wrote."""
+
+    output: str
+    scene: SceneStudy
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {
+            "program": f"flexgs-edge {__version__}",
+            "command": "study rate",
+            "output": self.output,
+            **self.scene.to_json(),
+        }
+
+    def to_text(self) -> str:
+        """The findings, for people."""
+        return "\n".join([*self.scene.to_lines(), f"wrote {os.path.join(self.output, 'index.html')}"]) + "\n"
+
+
+def study_rate(
+    scene: str | Path,
+    output: str | Path,
+    options: CompressOptions | None = None,
+    progress: Progress = SILENT,
+    ratios: Sequence[float] = RATIOS,
+    ablations: Sequence[float] = ABLATED,
+    ablation_effort: str = ABLATION_EFFORT,
+    **words: Any,
+) -> RateStudy:
+    """Measure bytes and quality of every method on a scene and write them to a folder.
+
+    Parameters
+    ----------
+    scene : path
+        What `compress` takes.
+    output : path
+        Folder of the results: index.html, and rate, fidelity and parts as .csv, .json, .png and .svg. It appears when
+        everything is done; `force` lets it replace files of these names in a folder that is there.
+    options : CompressOptions, optional
+        Views, drawing, memory and device as for `compress`; `effort` is that of the curves.
+    progress : Progress, optional
+        Bars on long work.
+    ratios : sequence of float
+        PLY bytes to file bytes, for the curves.
+    ablations : sequence of float
+        The same for the points without a part; none leaves them out.
+    ablation_effort : str
+        Of these points, and of the curve that they are held against.
+    **words
+        Single options by the names of `CompressOptions`.
+
+    Raises
+    ------
+    FlexGSError
+        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
+    """
+    options = replace(options or CompressOptions(), **{**words, "method": "best"})
+    _check(ratios, ablations, ablation_effort)
+    # Loaded before the memory is planned, so that its bytes count as taken.
+    require_matplotlib()
+    check_folder(output, options.force)
+    with atomic_folder(output, options.force) as folder:
+        (name,) = scene_names([scene])
+        with open_bench(scene, name, options, progress) as bench:
+            made = _experiments(bench, folder, sorted({*ratios, *ablations}), sorted(set(ablations)), ablation_effort)
+            found = SceneStudy.of(bench, made)
+        page = study_page("Bytes and quality", _INTRO, [write_scene(folder, found)])
+        (folder / "index.html").write_text(page, encoding="utf-8")
+    LOG.info("wrote %s", Path(output) / "index.html")
+    return RateStudy(os.fspath(output), found)
+
+
+_INTRO = (
+    "What flexgs-edge makes of a scene at many sizes, beside the paper's method and the formats of other programs. Sizes are "
+    "bytes of the finished file; ratios are to the PLY as INRIA writes it. All methods are judged by the same renderer over "
+    "the same views."
+)
+
+
+def _check(ratios: Sequence[float], ablations: Sequence[float], effort: str) -> None:
+    for word, values in (("--ratios", ratios), ("--ablations", ablations)):
+        bad = [value for value in values if not (math.isfinite(value) and value >= 1.0)]
+        if bad:
+            raise InputError(f"{word} {bad[0]:g}: expected ratios of 1 or more, such as 8,16,32")
+    if not ratios:
+        raise InputError("--ratios: expected one ratio or more, such as 8,16,32")
+    if effort not in EFFORTS:
+        raise InputError(f"--ablation-effort {effort!r}: expected one of {', '.join(EFFORTS)}")
+
+
+def _experiments(
+    bench: Bench, folder: Path, ratios: Sequence[float], ablations: Sequence[float], ablation_effort: str
+) -> list[Experiment]:
+    effort = bench.options.effort
+    recode = ablations if ablation_effort == effort else ()
+    found = best_points(bench, WHOLE, effort, ratios, recode) + paper_points(bench, ratios)
+    with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder) as place:
+        found += peer_points(bench, Path(place))
+    variants = parts_of(bench.orders["gs"], bench.scene.source.sh_degree) if ablations else ()
+    if ablations and ablation_effort != effort:
+        found += best_points(bench, WHOLE, ablation_effort, ratios, ablations)
+    for variant in variants:
+        found += best_points(bench, variant, ablation_effort, ablations)
+    made = [trade.rate(bench, found.points, found.missing, effort)]
+    if bench.plan.judge == "drop":
+        made.append(trade.fidelity(bench, found.points, effort))
+    if ablations:
+        made.append(trade.parts(bench, found.points, variants, ablation_effort, ablations))
+    return made
