@@ -2,30 +2,74 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
+from click.core import ParameterSource
 
 from flexgs_edge.cli import words
+from flexgs_edge.errors import InputError
 
 
 @click.command(cls=words.SectionCommand)
 @click.argument("file", metavar="FILE", type=click.Path())
-@words.force_option
-@words.json_option
-@words.talk_options
-def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
+@words.option(
+    "Errors",
+    "--errors",
+    is_flag=True,
+    help="Also measure what each channel and SH degree of a .fgs is worth: the bytes saved and the quality lost with one bit "
+    "less of it, and without it. Takes as long as drawing the views some 15 times.",
+)
+@words.option(
+    "Errors",
+    "--picture",
+    metavar="FILE",
+    help="Draw what --errors measures as a .png or .svg (needs pip install 'flexgs-edge[charts]').",
+)
+@words.cameras_option
+@words.holdout_option
+@words.drawing_options
+@words.run_options
+def command(
+    file: str, errors: bool, picture: str | None, force: bool, json_path: str | None, quiet: bool, **options: Any
+) -> None:
     """Show what a scene file holds.
 
     For a .fgs: Gaussians, SH degree, bits and bytes of every channel and SH degree, layers, the settings it was made with
     and the target it reached (files of --method best are decoded for this; use verify to check every byte). For other
     scene files and model folders: counts, and what lies beside it.
 
+    --errors draws the file's own views again with less of each channel: the held-out ones of the cameras beside the file or
+    given, else of automatic ones. All options of views, device and memory are for it.
+
     \b
     Examples:
       flexgs-edge info scene.fgs
       flexgs-edge info scene.fgs --json - 2>/dev/null
+      flexgs-edge info scene.fgs --errors --picture scene.png
+          what each channel is worth
     """
-    words.start(quiet, json_path, force)
-    from flexgs_edge.pipeline.info import info, info_text
+    progress = words.start(quiet, json_path, force)
+    if not errors:
+        context = click.get_current_context()
+        for name in ("picture", *options):
+            if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+                word = "--" + name.replace("_", "-")
+                raise InputError(f"{word} is for --errors: add --errors, or leave {word} out")
+        from flexgs_edge.pipeline.info import info, info_text
 
-    found = info(file)
-    words.emit(info_text(found), found, json_path, force)
+        found = info(file)
+        words.emit(info_text(found), found, json_path, force)
+        return
+    from flexgs_edge.pipeline.info import info_text
+    from flexgs_edge.pipeline.options import ViewOptions
+    from flexgs_edge.pipeline.worth import worth, worth_text
+
+    if picture is not None:
+        from flexgs_edge.study.channels import check_picture, write_picture
+
+        check_picture(picture, force)
+    found = worth(file, ViewOptions(**options), progress)
+    if picture is not None:
+        write_picture(found, picture, force)
+    words.emit(info_text(found) + worth_text(found), found, json_path, force)
