@@ -39,8 +39,7 @@ __kernel void peak(const uint rounds, __global const float *records, __global fl
 #pragma unroll
     for (int k = 0; k < {BLOCKS}; ++k) {{
       FW dx = xs[k] - mx, dy = y - my;
-      FW q = fma(fma(ca, dx, cb * dy), dx, (cc * dy) * dy);
-      FW alpha = smaller(fexp2_number(level - larger(q, (FW)0.0f)), (FW)ALPHA_MAX);
+      FW alpha = splat_alpha(dx, dy, ca, cb, cc, level);
       FW t = trans[k];
       FW next = t * ((FW)1.0f - alpha);
       IW seen = MASK(alpha >= (FW)ALPHA_MIN);

@@ -8,17 +8,6 @@
 #define BLOCK_VECTORS (16 / W)   // vectors of a 4x4 block
 #define BLOCKS 16                // blocks of a tile
 #define RETIRE_EVERY 16          // splats between two looks for blocks whose pixels have all ended
-#define AHEAD 8                  // splats
-
-// Records and sums lie in row order, so a tile's are all over the memory: without this a third of the blend waits for them.
-#if defined(__has_builtin) && !defined(NO_FETCH)
-#if __has_builtin(__builtin_prefetch)
-#define FETCH(p) __builtin_prefetch(p)
-#endif
-#endif
-#ifndef FETCH
-#define FETCH(p)
-#endif
 
 #ifndef STATS
 #error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs) must be defined"
@@ -159,6 +148,19 @@ __kernel void blend(
   ends += (size_t)(blocks - 1) * get_global_size(0);
   const uint first = tile ? ends[tile - 1] : 0u, last = ends[tile];
   uint live = 0xFFFFu;
+  // Pixels of block columns and rows: worked out anew for each block they took a tenth of the blend.
+#if W == 1
+  float x_of[TILE];
+  for (int x = 0; x < TILE; ++x) x_of[x] = (float)(tile_px + x);
+#define X_OF(b, v) x_of[BLOCK * ((b) & 3) + ((v) & 3)]
+#else
+  FW x_of[4];
+  for (int column = 0; column < 4; ++column) x_of[column] = lane_x() + (FW)(float)(tile_px + BLOCK * column);
+#define X_OF(b, v) x_of[(b) & 3]
+#endif
+  FW y_of[4 * BLOCK_VECTORS];
+  for (int k = 0; k < 4 * BLOCK_VECTORS; ++k)
+    y_of[k] = lane_y(k % BLOCK_VECTORS) + (FW)(float)(tile_py + BLOCK * (k / BLOCK_VECTORS));
   for (uint n = first; n < last; ++n) {
     if (((n - first) & (RETIRE_EVERY - 1)) == 0) {
       for (int b = 0; b < BLOCKS; ++b) {
@@ -191,14 +193,12 @@ __kernel void blend(
     while (mask) {
       const int b = 31 - (int)clz(mask & (0u - mask));
       mask &= mask - 1;
-      const float bx = (float)(tile_px + BLOCK * (b & 3)), by = (float)(tile_py + BLOCK * (b >> 2));
       // W 8 or 4: without it lane_y is worked out anew for each vector, a fifth of the blend.
 #pragma unroll
       for (int v = 0; v < BLOCK_VECTORS; ++v) {
         const int k = b * BLOCK_VECTORS + v;
-        FW dx = (lane_x_at(v) + (FW)bx) - mx, dy = (lane_y(v) + (FW)by) - my;
-        FW q = fma(fma(ca, dx, cb * dy), dx, (cc * dy) * dy);
-        FW alpha = smaller(fexp2_number(level - larger(q, (FW)0.0f)), (FW)ALPHA_MAX);
+        FW dx = X_OF(b, v) - mx, dy = y_of[(b >> 2) * BLOCK_VECTORS + v] - my;
+        FW alpha = splat_alpha(dx, dy, ca, cb, cc, level);
         FW t = trans[k];
         FW next = t * ((FW)1.0f - alpha);
         IW seen = MASK(alpha >= (FW)ALPHA_MIN);

@@ -102,8 +102,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
       int hit = 0;
       if (list[n].y >> b & 1u) {
         const float dx = (float)px - splats[n][0], dy = (float)py - splats[n][1];
-        const float q = fma(fma(splats[n][2], dx, splats[n][3] * dy), dx, (splats[n][4] * dy) * dy);
-        alpha = fmin(fexp2_number(splats[n][5] - fmax(q, 0.0f)), ALPHA_MAX);
+        alpha = splat_alpha(dx, dy, splats[n][2], splats[n][3], splats[n][4], splats[n][5]);
         const float next = t * (1.0f - alpha);
         const int seen = alpha >= ALPHA_MIN;
         hit = seen && next >= TRANSMITTANCE_MIN;

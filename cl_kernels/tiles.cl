@@ -119,6 +119,7 @@ __kernel void tile_count(
   for (int tile = 0; tile < tiles_x * tiles_y; ++tile) own[tile] = 0;
 #define DRAFT_PAIR(tile, mask) (vstore3((uint3)(ids[n], (uint)(tile), mask), 0, draft), draft += 3, own[tile] += 1)
   for (uint n = start; n < end; ++n) {
+    FETCH(records + (size_t)ids[min(n + AHEAD, end - 1)] * 16);
     FOR_EACH_TILE(DRAFT_PAIR)
   }
   room[get_global_size(0) + get_global_id(0)] = (uint)((draft - first_draft) / 3);

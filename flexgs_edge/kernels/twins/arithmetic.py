@@ -6,7 +6,7 @@ from typing import Any, Union
 
 import numpy as np
 
-from flexgs_edge.constants import EXP2_HIGH, EXP2_LOW, EXP2_MAGIC, EXP2_POLY, LOG2_PIVOT, LOG2_POLY
+from flexgs_edge.constants import ALPHA_MAX, EXP2_HIGH, EXP2_LOW, EXP2_MAGIC, EXP2_POLY, LOG2_PIVOT, LOG2_POLY
 
 f32 = np.float32
 Values = Union[np.ndarray, "np.floating[Any]"]
@@ -39,13 +39,12 @@ def fma(a: Values, b: Values, c: Values) -> np.ndarray:
 
 def fexp2(x: np.ndarray) -> np.ndarray:
     """2^x, as `fexp2` in common.clh: NaN passes."""
-    return np.where(x == x, fexp2_number(x), x)
+    return np.where(x == x, fexp2_low(np.where(x > f32(EXP2_HIGH), f32(EXP2_HIGH), x)), x)
 
 
-def fexp2_number(x: np.ndarray) -> np.ndarray:
-    """2^x of numbers, as `fexp2_number` in common.clh."""
+def fexp2_low(x: np.ndarray) -> np.ndarray:
+    """2^x of numbers of at most EXP2_HIGH, as `fexp2_low` in common.clh."""
     x = np.where(x < f32(EXP2_LOW), f32(EXP2_LOW), x)
-    x = np.where(x > f32(EXP2_HIGH), f32(EXP2_HIGH), x)
     t = x + f32(EXP2_MAGIC)
     i = np.left_shift(t.view(np.int32), 23)
     f = x - (t - f32(EXP2_MAGIC))
@@ -69,3 +68,11 @@ def dot3(*parts: np.ndarray) -> np.ndarray:
     """Dot product of (ax, ay, az) and (bx, by, bz), given in this order, with two fused steps, as `dot3` in common.clh."""
     ax, ay, az, bx, by, bz = parts
     return fma(az, bz, fma(ay, by, ax * bx))
+
+
+def splat_alpha(*parts: np.ndarray) -> np.ndarray:
+    """Opacity of a splat, of (dx, dy, ca, cb, cc, level) given in this order, as `splat_alpha` in common.clh."""
+    dx, dy, ca, cb, cc, level = parts
+    q = fma(fma(ca, dx, cb * dy), dx, (cc * dy) * dy)
+    less = level - q
+    return np.fmin(fexp2_low(np.where(less < level, less, level)), f32(ALPHA_MAX))

@@ -11,7 +11,6 @@ from functools import partial
 import numpy as np
 
 from flexgs_edge.constants import (
-    ALPHA_MAX,
     ALPHA_MIN,
     BLOCK,
     FIXED_ERROR,
@@ -20,7 +19,7 @@ from flexgs_edge.constants import (
     TILE,
     TRANSMITTANCE_MIN,
 )
-from flexgs_edge.kernels.twins.arithmetic import f32, fexp2_number, fma
+from flexgs_edge.kernels.twins.arithmetic import f32, fma, splat_alpha
 
 TILES_AT_ONCE = 256
 """Bounds the twin's memory: block lists and, for statistics, one float a pixel of each listed block."""
@@ -187,8 +186,7 @@ def _blend_blocks(
         entry = lists.starts[units] + step
         r = records[rows_of[lists.pair[entry]]]
         dx, dy = pixels[0][units] - r[:, 0:1], pixels[1][units] - r[:, 1:2]
-        q = fma(fma(r[:, 2:3], dx, r[:, 3:4] * dy), dx, (r[:, 4:5] * dy) * dy)
-        alpha = np.fmin(fexp2_number(r[:, 5:6] - np.fmax(q, f32(0))), f32(ALPHA_MAX))
+        alpha = splat_alpha(dx, dy, r[:, 2:3], r[:, 3:4], r[:, 4:5], r[:, 5:6])
         t = trans[units]
         after = t * (f32(1) - alpha)
         seen = alpha >= f32(ALPHA_MIN)
