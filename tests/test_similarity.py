@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.invariance import LEAST_SAME, MOST_BYTES, Similarity, compare, turn_of_band
+from benchmarks.invariance import LEAST_SAME, Similarity, compare, turn_of_band
+from flexgs_edge.best.steps import probe_slopes
 from flexgs_edge.cameras import read_cameras
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.render import Renderer
 from flexgs_edge.scene import open_scene
+from flexgs_edge.scene.fields import FIELD
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, random_scene
 from tiny_project import make_project
@@ -49,10 +51,27 @@ def test_moved_scenes_are_drawn_alike(factor: float) -> None:
     assert np.abs(planes - scene.read(slice(0, scene.count), ["sh_rest"])["sh_rest"]).max() > 0.1
 
 
+def test_slopes_of_a_moved_scene_are_the_same() -> None:
+    """Errors of rotations about the world's axes gave slopes 8 % off; of positions on a grid of the world, up to 20 %."""
+    scene = random_scene(400, 5, 3, size=-3.0)
+    move = Similarity.drawn(FACTOR, 3)
+    rotation, translation = look_from(1)
+    camera = make_camera(90, 70, rotation=rotation, translation=translation)
+    slopes = []
+    for source, view, scale in ((scene, camera, 1.0), (move.scene(scene), move.camera(camera), FACTOR)):
+        renderer = Renderer(open_form("w8"), large_budget(), near=DEFAULT_NEAR * scale)
+        found = probe_slopes(renderer, source.read(slice(0, source.count), list(FIELD)), source.origin, [view]).per_row
+        slopes.append({**found, "position": found["position"] * scale**2})
+        renderer.release()
+    assert slopes[1] == pytest.approx(slopes[0], rel=0.01)
+
+
 def test_moved_scenes_are_compressed_alike(tmp_path: Path) -> None:
     project = make_project(tmp_path / "tiny")
     words = {"effort": "fast", "max_drop": 1.0, "holdout": 4}
     found, note = compare(project, tmp_path, FACTOR, **words)
     assert open_scene(tmp_path / "moved" / "point_cloud.ply").count == open_scene(project / "point_cloud.ply").count
     assert len(read_cameras(tmp_path / "moved" / "cameras.json")) == 9
-    assert found.same >= LEAST_SAME and abs(found.bytes_ratio - 1) <= MOST_BYTES, note
+    assert found.choice >= LEAST_SAME, note
+    # `fast` ends anywhere within 8 % of the target's loss, and rounding moves the drop of some 300 Gaussians by as much.
+    assert found.same >= 0.95 and abs(found.bytes_ratio - 1) <= 0.06, note
