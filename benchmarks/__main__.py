@@ -1,6 +1,6 @@
 """All benchmarks, each in a process of its own: JSON lines to a file, a table to the terminal.
 
-python -m benchmarks [view quantize codec coder search compress twins] [--json FILE]
+python -m benchmarks [view splats peak quantize codec coder search twins compress] [--json FILE]
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks.harness import run_module, table
 
-ALL = ("view", "quantize", "codec", "coder", "search", "twins", "compress")
+ALL = ("view", "splats", "peak", "quantize", "codec", "coder", "search", "twins", "compress")
 
 
 def main() -> None:
