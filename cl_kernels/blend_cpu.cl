@@ -216,7 +216,7 @@ __kernel void blend(
 #endif
 #if STATS == 2 || STATS == 4
         // What the pixel would change by without this splat: its own light goes, what lies behind it gets brighter.
-        const FW ratio = pick(hit, alpha / ((FW)1.0f - alpha), (FW)0.0f);
+        const FW ratio = pick(hit, alpha * reciprocal((FW)1.0f - alpha), (FW)0.0f);
         const FW er = fma(weight, cr, -(ratio * (target_r[k] - red[k])));
         const FW eg = fma(weight, cg, -(ratio * (target_g[k] - green[k])));
         const FW eb = fma(weight, cbl, -(ratio * (target_b[k] - blue[k])));

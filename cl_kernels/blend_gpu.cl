@@ -115,7 +115,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
 #if STATS
       if (p == 0) counts = 0;
 #if STATS == 2 || STATS == 4
-      const float ratio = hit ? alpha / (1.0f - alpha) : 0.0f;
+      const float ratio = hit ? alpha * reciprocal(1.0f - alpha) : 0.0f;
       const float er = fma(weight, splats[n][6], -(ratio * (target_r - red)));
       const float eg = fma(weight, splats[n][7], -(ratio * (target_g - green)));
       const float eb = fma(weight, splats[n][8], -(ratio * (target_b - blue)));

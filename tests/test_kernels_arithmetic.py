@@ -10,7 +10,7 @@ import pytest
 import flexgs_edge.constants as constants
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.kernels.source import constants_header, kernel_dir
-from flexgs_edge.kernels.twins.arithmetic import fexp2, flog2, fma
+from flexgs_edge.kernels.twins.arithmetic import fexp2, flog2, fma, reciprocal
 from kernel_fixtures import FORMS, open_form, same_bits
 
 EXP2_ERROR = 2.15e-7
@@ -71,6 +71,14 @@ def test_exp2_over_its_whole_range(form: str) -> None:
     exact = np.exp2(np.clip(x[known].astype(np.float64), -126, 127))
     assert (abs(y[known] - exact) <= EXP2_ERROR * exact).all()
     assert (y[known] > 0).all() and np.isfinite(y[known]).all()
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_reciprocal_over_its_range(form: str) -> None:
+    x = np.linspace(2.0**-10, 1, 1 << 18, dtype=np.float32)
+    (y,) = run_probe(form, "STOREF(reciprocal(LOADF(x0, i)), y0, i);", [x])
+    assert same_bits(y, reciprocal(x))
+    assert np.abs(y * x.astype(np.float64) - 1).max() < 6.1e-8
 
 
 @pytest.mark.parametrize("form", FORMS)

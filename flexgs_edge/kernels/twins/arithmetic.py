@@ -6,7 +6,16 @@ from typing import Any, Union
 
 import numpy as np
 
-from flexgs_edge.constants import ALPHA_MAX, EXP2_HIGH, EXP2_LOW, EXP2_MAGIC, EXP2_POLY, LOG2_PIVOT, LOG2_POLY
+from flexgs_edge.constants import (
+    ALPHA_MAX,
+    EXP2_HIGH,
+    EXP2_LOW,
+    EXP2_MAGIC,
+    EXP2_POLY,
+    LOG2_PIVOT,
+    LOG2_POLY,
+    RECIPROCAL_PIVOT,
+)
 
 f32 = np.float32
 Values = Union[np.ndarray, "np.floating[Any]"]
@@ -76,3 +85,11 @@ def splat_alpha(*parts: np.ndarray) -> np.ndarray:
     q = fma(fma(ca, dx, cb * dy), dx, (cc * dy) * dy)
     less = level - q
     return np.fmin(fexp2_low(np.where(less < level, less, level)), f32(ALPHA_MAX))
+
+
+def reciprocal(x: np.ndarray) -> np.ndarray:
+    """1 / x of 2^-10 <= x <= 1, as `reciprocal` in common.clh."""
+    r = (np.int32(RECIPROCAL_PIVOT) - x.view(np.int32)).view(f32)
+    for _ in range(3):
+        r = fma(r, fma(-x, r, f32(1)), r)
+    return r

@@ -19,7 +19,7 @@ from flexgs_edge.constants import (
     TILE,
     TRANSMITTANCE_MIN,
 )
-from flexgs_edge.kernels.twins.arithmetic import f32, fma, splat_alpha
+from flexgs_edge.kernels.twins.arithmetic import f32, fma, reciprocal, splat_alpha
 
 TILES_AT_ONCE = 256
 """Bounds the twin's memory: block lists and, for statistics, one float a pixel of each listed block."""
@@ -200,7 +200,7 @@ def _blend_blocks(
         entries.hit[entry], entries.weight[entry] = hit, weight
         if stats in (2, 4):
             assert target is not None
-            ratio = np.where(hit, alpha / (f32(1) - alpha), f32(0))
+            ratio = np.where(hit, alpha * reciprocal(f32(1) - alpha), f32(0))
             behind = (target[c, units] - colour[c, units] for c in range(3))
             er, eg, eb = (fma(weight, r[:, 6 + c : 7 + c], -(ratio * rest)) for c, rest in enumerate(behind))
             entries.error[entry] = fma(eb, eb, fma(eg, eg, er * er))
