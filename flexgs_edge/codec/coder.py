@@ -178,7 +178,11 @@ def decode_chunk(
     stream = Decoder(data, lane_count(rows))
     codes = walk_chunk(rows, model.depth, model.sh_degree, DecodePort(model, stream, cost), None, base_only)
     if not base_only:
-        used = stream.finish()
-        if any(data[used:]) or (len(data) > used and len(data) != least_bytes(rows)):
-            raise StreamError(f"stream: wanted {used} bytes, got {len(data)}")
+        check_end(data, rows, stream.finish())
     return codes
+
+
+def check_end(data: bytes, rows: int, used: int) -> None:
+    """Raise `StreamError` unless `used` bytes are the whole stream, or zeros fill it up to the least bytes of a chunk."""
+    if any(data[used:]) or (len(data) > used and len(data) != least_bytes(rows)):
+        raise StreamError(f"stream: wanted {used} bytes, got {len(data)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
@@ -29,6 +29,8 @@ from flexgs_edge.grid import GridScene
 from flexgs_edge.scene.atomic import atomic_write
 
 VERSION = 2
+
+Result = TypeVar("Result")
 
 
 def write_grid(
@@ -207,6 +209,20 @@ class GridContainer(SectionFile):
     def decode(self, model: Model, chunk: Chunk, entry: ChunkEntry, base_only: bool = False) -> ChunkCodes:
         """The codes of a chunk, checked."""
         return self._decode(model, chunk, entry, base_only, None)
+
+    def decode_on(
+        self,
+        decode: Callable[[list[tuple[int, bytes]]], Sequence[Result | ValueError]],
+        chunks: Sequence[tuple[Chunk, ChunkEntry]],
+    ) -> list[Result]:
+        """What `decode` makes of the rows and bytes of some chunks; an error of a chunk is raised in its name."""
+        jobs = [(chunk.stop - chunk.start, self.read_chunk(entry)) for chunk, entry in chunks]
+        results: list[Result] = []
+        for (_, entry), result in zip(chunks, decode(jobs), strict=True):
+            if isinstance(result, ValueError):
+                raise format_error(self.path, entry.section.offset, f"{entry.section.name}: {result}")
+            results.append(result)
+        return results
 
     def cost(self, model: Model, chunk: Chunk, entry: ChunkEntry, cost: np.ndarray) -> ChunkCodes:
         """Decode a chunk, and add the bits of every alphabet in it to `cost`."""

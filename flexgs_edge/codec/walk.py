@@ -74,6 +74,13 @@ class ChunkCodes:
     cells: np.ndarray  # [r] u64, Morton index of every row's cell
     base: dict[str, np.ndarray]  # each [r]
     sh: tuple[np.ndarray, ...]
+    coordinates: np.ndarray | None = None
+    """[3, r] i32 of the cells, where a decoder made them on its way."""
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3, r] i32: coordinates of the rows' cells."""
+        return unmorton(self.cells) if self.coordinates is None else self.coordinates
 
 
 class Port(Protocol):

@@ -390,7 +390,7 @@ class _Job:
             scores_saved=options.save_scores,
             score_cache=options.score_cache if plan.computes_scores else None,
             scores_reused=self.scores_reused,
-            run=run_info(self.budget, self.clock, self.workspace),
+            run=run_info(self.budget, self.clock, self.workspace.backend if self.workspace else None),
             format=self.format.suffix[1:] if self.format else "fgs",
             file_sh_degree=scene.sh_degree,
         )

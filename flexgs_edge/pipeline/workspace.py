@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from types import TracebackType
 
 from flexgs_edge.budget import MemoryBudget, current_rss, peak_rss
-from flexgs_edge.kernels import open_backend
+from flexgs_edge.kernels import Backend, open_backend
 from flexgs_edge.pipeline.options import ViewOptions
 from flexgs_edge.render import Renderer
 from flexgs_edge.report.result import RunInfo
@@ -61,12 +61,7 @@ class Workspace:
         assert options.extent is not None and options.antialiased is not None
         self.budget = budget
         self.clock = clock
-        before = current_rss()
-        with clock.stage("device"):
-            self.backend = open_backend(options.device, budget)
-        if not self.backend.is_numpy:
-            # The runtime and its compiler stay loaded: 80 MiB for PoCL with its kernels cached, 210 MiB without.
-            budget.take("the OpenCL runtime", max(current_rss() - before, 0) + BUILD_BYTES)
+        self.backend = counted_backend(options.device, budget, clock)
         self.renderer = Renderer(
             self.backend, budget, options.near, options.background, options.extent, options.antialiased
         )
@@ -82,12 +77,22 @@ class Workspace:
 
     def run_info(self) -> RunInfo:
         """What this run took and ran on (never stored in files)."""
-        return run_info(self.budget, self.clock, self)
+        return run_info(self.budget, self.clock, self.backend)
 
 
-def run_info(budget: MemoryBudget, clock: Stopwatch, workspace: Workspace | None = None) -> RunInfo:
+def counted_backend(device: str | None, budget: MemoryBudget, clock: Stopwatch) -> Backend:
+    """The backend that `device` names (stage `device`), and what its runtime holds taken from the budget."""
+    before = current_rss()
+    with clock.stage("device"):
+        backend = open_backend(device, budget)
+    if not backend.is_numpy:
+        # The runtime and its compiler stay loaded: 80 MiB for PoCL with its kernels cached, 210 MiB without.
+        budget.take("the OpenCL runtime", max(current_rss() - before, 0) + BUILD_BYTES)
+    return backend
+
+
+def run_info(budget: MemoryBudget, clock: Stopwatch, backend: Backend | None = None) -> RunInfo:
     """Seconds, memory and device of a run."""
-    backend = workspace.backend if workspace else None
     return RunInfo(
         seconds=clock.total,
         stages=dict(clock.stages),
