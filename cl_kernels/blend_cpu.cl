@@ -10,16 +10,6 @@
 #define RETIRE_EVERY 16          // splats between two looks for blocks whose pixels have all ended
 #define AHEAD 8                  // splats
 
-// Records and sums lie in row order, so a tile's are all over the memory: without this a third of the blend waits for them.
-#if defined(__has_builtin) && !defined(NO_FETCH)
-#if __has_builtin(__builtin_prefetch)
-#define FETCH(p) __builtin_prefetch(p)
-#endif
-#endif
-#ifndef FETCH
-#define FETCH(p)
-#endif
-
 #ifndef STATS
 #error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs) must be defined"
 #endif
@@ -170,6 +160,7 @@ __kernel void blend(
     }
     const uint2 pair = pairs[n];
     const size_t ahead = pairs[min(n + AHEAD, last - 1)].x;
+    // Records and sums lie in row order, so a tile's are all over the memory: without this a third of the blend waits for them.
     FETCH(records + ahead * 16);
 #if STATS
     FETCH(sums + ahead * (2 * SUMS));

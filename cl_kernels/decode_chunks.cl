@@ -29,13 +29,14 @@ typedef ulong16 UL16;
 
 #define PAD 16  // spare numbers before the rows that neighbours are looked up in
 #define TERMS 13
+#define FETCH_ROWS 4096  // where a batch has as many rows, most lines of the tables are looked at
 #define ROUND 6755399441055744.0  // 1.5 * 2^52
 
 // Numbers of an alphabet's record.
 enum {
   START_LOW, START_HIGH, SHIFT, SYMBOLS, MEAN_CUTS, ERROR_CUTS, RESIDUAL, FEATURES,
   MEAN_CUT = 8, ERROR_CUT = 23, SLOT = 38, ENTRY = SLOT + 64, MEAN_WEIGHT = ENTRY + 64, ERROR_WEIGHT = MEAN_WEIGHT + 17,
-  RECORD = ERROR_WEIGHT + 17
+  FIRST_SLOT = ERROR_WEIGHT + 17, SLOTS, RECORD
 };
 // Of a chunk's.
 enum { ROWS, LANE_COUNT, WORDS, STATUS, FOUND, FOUND_HIGH, WANTED, AT, INFO };
@@ -104,6 +105,11 @@ inline bool get_batch(Chunk *c, uint alphabet, uint count) {
   __global const ushort *words = c->words;
   const uint lanes = c->lanes, end = c->end;
   uint at = c->at;
+  // The tables, which predictions have pushed out of the near caches.
+  if (count >= FETCH_ROWS) {
+    __global const int *record = c->records + alphabet * RECORD;
+    for (int slot = 0; slot < record[SLOTS]; slot += 64) FETCH(slots + record[FIRST_SLOT] + slot);
+  }
   for (uint first = 0; first < count; first += lanes) {
     __global uint *states = c->states;
     __global const uchar *context = c->bytes + (size_t)CONTEXT * c->stride + first;

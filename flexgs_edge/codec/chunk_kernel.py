@@ -26,7 +26,7 @@ _SPARE = 96
 _ROWS, _LANES, _WORDS, _STATUS, _FOUND, _FOUND_HIGH, _WANTED, _AT, _INFO = range(9)
 _NO_WORDS, _NO_CHILDREN, _NODES, _REPEATS, _CODES, _DEGREES, _LANES_END = range(1, 8)
 # Places in the record of an alphabet.
-_MEAN_CUT, _ERROR_CUT, _SLOT, _ENTRY, _MEAN_WEIGHT, _ERROR_WEIGHT, _RECORD = 8, 23, 38, 102, 166, 183, 200
+_MEAN_CUT, _ERROR_CUT, _SLOT, _ENTRY, _MEAN_WEIGHT, _ERROR_WEIGHT, _SLOTS, _RECORD = 8, 23, 38, 102, 166, 183, 200, 202
 _PLANES = {"cells": (2, "u8"), "weights": (8, "u2"), "bytes": (4, "u1"), "ints": (4, "i4"), "floats": (44, "f4")}
 """Work planes of a chunk."""
 
@@ -242,12 +242,13 @@ def pack_model(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Returns
     -------
     tuple of np.ndarray
-        [alphabets, 200] i32 records; [tables, 2^14] u8 symbols of all slots; [symbols of all tables] u32 entries.
+        [alphabets, 202] i32 records; [tables, 2^14] u8 symbols of all slots; [symbols of all tables] u32 entries.
     """
     records = np.zeros((len(model.tables), _RECORD), np.int32)
     tables_before = entries_before = 0
     for i, (record, mapping, tables) in enumerate(zip(records, model.mappings, model.tables, strict=True)):
         record[3] = tables.size
+        record[_SLOTS:] = tables_before << PRECISION, len(tables.freqs) << PRECISION
         record[_SLOT : _SLOT + len(mapping)] = (tables_before + mapping.astype(np.int64)) << PRECISION
         record[_ENTRY : _ENTRY + len(mapping)] = entries_before + mapping.astype(np.int64) * tables.size
         if i >= SHARED:
