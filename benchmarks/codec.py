@@ -3,8 +3,8 @@
 python -m benchmarks.codec [--scene fox|sample] [--rows N] [--repeats N] [--device SPEC]
 
 Rows are copies of the scene's larger Gaussians side by side with a little noise, half of them with SH as a search would
-leave them; `--rows 0` takes these rows once. Everything is NumPy, but for "decode on the device" and "file to PLY"; the rates of
-these leave out the seconds that opening the device and building its kernels took.
+leave them; `--rows 0` takes these rows once. Everything is NumPy, but for what is "on the device" and "file to PLY"; the
+rate of the last leaves out the seconds that opening the device and building its kernels took.
 """
 
 from __future__ import annotations
@@ -99,6 +99,10 @@ def main() -> None:
         rate("codec: positions only", lambda: GridSource(path).read(slice(0, count), ["means"]))
         rate("codec: decode", lambda: GridSource(path).grid())
         if backend.threads:
+            check(
+                write_grid(path, grid, {}, force=True, device=backend) == size, "bytes of the file coded on the device"
+            )
+            rate("codec: encode on the device", lambda: write_grid(path, grid, {}, force=True, device=backend))
             source = GridSource(path)
             with source.on_device(backend, source.threads):
                 source.read(slice(0, 1), ["means"])  # the first launch builds

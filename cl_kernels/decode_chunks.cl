@@ -36,11 +36,11 @@ typedef ulong16 UL16;
 enum {
   START_LOW, START_HIGH, SHIFT, SYMBOLS, MEAN_CUTS, ERROR_CUTS, RESIDUAL, FEATURES,
   MEAN_CUT = 8, ERROR_CUT = 23, SLOT = 38, ENTRY = SLOT + 64, MEAN_WEIGHT = ENTRY + 64, ERROR_WEIGHT = MEAN_WEIGHT + 17,
-  FIRST_SLOT = ERROR_WEIGHT + 17, SLOTS, RECORD
+  FIRST_SLOT = ERROR_WEIGHT + 17, SLOTS, FIRST_COUNT, RECORD
 };
 // Of a chunk's.
 enum { ROWS, LANE_COUNT, WORDS, STATUS, FOUND, FOUND_HIGH, WANTED, AT, INFO };
-enum { GOOD, NO_WORDS, NO_CHILDREN, NODES, REPEATS, CODES, DEGREES, LANES_END };
+enum { GOOD, NO_WORDS, NO_CHILDREN, NODES, REPEATS, CODES, DEGREES, LANES_END, NO_ROOM };
 // Planes of numbers that a chunk needs.
 enum { X, Y, Z, KNOWN, OTHER = KNOWN + 1, VALUE, SPARE, NEAR, NEAR_SH, BASE, STEADY = BASE + 21, BEFORE = STEADY + 7, FLOATS = BEFORE + 7 };
 enum { ROUNDED, RAW, SUBSET, CAME_FROM, INTS };
@@ -60,6 +60,11 @@ typedef struct {
   __global int *ints;
   __global float *floats;
   uint clipped;
+  // When counting instead: symbols of all batches, raw bytes, and alphabet, size and escapes of every batch.
+  bool counting;
+  __global uint *counts, *batches;
+  __global uchar *log_contexts, *log_symbols, *log_raw;
+  uint logged, raw_logged, raw_most, batch_count;
   uint status;
   long found;
   int wanted;
@@ -310,6 +315,53 @@ inline bool finish_pass(Chunk *c, uint alphabet, uint size) {
   return wrong ? failed(c, CODES, 0, alphabet) : true;
 }
 
+// Symbols of a pass from its codes, counted and noted.
+inline bool count_pass(Chunk *c, uint alphabet, uint size, __global const int *from, uint step) {
+  __global const int *record = c->records + alphabet * RECORD;
+  __global const uchar *context = c->bytes + (size_t)CONTEXT * c->stride;
+  __global const int *rounded = c->ints + (size_t)ROUNDED * c->stride;
+  __global float *value = plane(c, VALUE) + PAD;
+  __global uchar *contexts = c->log_contexts + c->logged, *symbols = c->log_symbols + c->logged;
+  __global uint *counts = c->counts + record[FIRST_COUNT];
+  const long start = (long)record[START_HIGH] << 32 | (uint)record[START_LOW];
+  const int last = record[SYMBOLS] - 1, shift = record[SHIFT], keep = record[RESIDUAL] ? -1 : 0;
+  uint escapes = 0;
+  for (uint j = 0; j < size; ++j) {
+    const int code = from[j << step];
+    const long symbol = (code - start - (rounded[j] & keep)) >> shift;
+    const bool escaped = symbol < 0 || symbol >= last;
+    const uint noted = escaped ? (uint)last : (uint)symbol;
+    escapes += escaped;
+    contexts[j] = context[j];
+    symbols[j] = (uchar)noted;
+    ++counts[context[j] * (uint)(last + 1) + noted];
+    value[j] = clamp((float)code, -VALUE_LIMIT, VALUE_LIMIT);
+  }
+  __global uint *batch = c->batches + 3 * c->batch_count++;
+  batch[0] = alphabet;
+  batch[1] = size;
+  batch[2] = escapes;
+  c->logged += size;
+  if (!shift && !escapes) return true;
+  const uint plain = size - escapes, pieces = (shift + 7) / 8;
+  if (plain * pieces + 4 * escapes > c->raw_most - c->raw_logged) return failed(c, NO_ROOM, 0, 0);
+  __global uchar *raw = c->log_raw + c->raw_logged, *far = raw + plain * pieces;
+  c->raw_logged += plain * pieces + 4 * escapes;
+  for (uint j = 0; j < size; ++j) {
+    const long offset = from[j << step] - start - (rounded[j] & keep);
+    const bool escaped = symbols[j] == last;
+    for (uint piece = 0; piece < (escaped ? 4 : pieces); ++piece) {
+      const uint bits = escaped ? 8 : min(shift - 8 * (int)piece, 8);
+      (escaped ? far + piece * escapes : raw + piece * plain)[0] = (uchar)(offset >> (8 * piece) & ((1 << bits) - 1));
+    }
+    if (escaped)
+      ++far;
+    else
+      ++raw;
+  }
+  return true;
+}
+
 // Known rows and those of the pass in turn.
 inline void interleave(__global const float *known, uint before, __global const float *value, uint size, __global float *to) {
   for (uint j = 0; j < size; j += W) {
@@ -346,7 +398,12 @@ inline bool get_channel(Chunk *c, uint alphabet, uint count, uint reach, __globa
       repeat_ends(known, begin);
       predict(c, alphabet, terms, begin, size, reach, weights, known, mean_out);
     }
-    if (!get_batch(c, alphabet, size) || !finish_pass(c, alphabet, size)) return false;
+    const uint offset = first ? 0 : 1 << k, step = first ? k : k + 1;
+    if (c->counting) {
+      if (!count_pass(c, alphabet, size, out + offset, step)) return false;
+    } else if (!get_batch(c, alphabet, size) || !finish_pass(c, alphabet, size)) {
+      return false;
+    }
     if (away_out) {
       for (uint j = 0; j < size; j += W) {
         const FW v = LOAD(value, j) * (FW)256.0f;
@@ -356,13 +413,12 @@ inline bool get_channel(Chunk *c, uint alphabet, uint count, uint reach, __globa
       }
     }
     // Codes come into the order of rows with their values, but for those that values do not hold.
-    if (c->clipped && !scattered) {
+    if (c->clipped && !scattered && !c->counting) {
       for (uint j = 0; j < begin; ++j) out[j << (k + 1)] = (int)known[j];
       scattered = true;
     }
-    const uint offset = first ? 0 : 1 << k, step = first ? k : k + 1;
     for (uint j = 0; j < size && scattered; ++j) out[offset + (j << step)] = code[j];
-    if (!k && !scattered) {
+    if (!k && !scattered && !c->counting) {
       if (first)
         for (uint j = 0; j < size; ++j) out[j] = code[j];
       else
@@ -529,11 +585,9 @@ inline bool get_coefficient(Chunk *c, uint alphabet, uint count, __global const 
   return true;
 }
 
-inline bool get_chunk(Chunk *c, uint rows, uint depth, int sh_degree, bool base_only, __global ulong *cells, __global ushort *weights,
-                      __global int *out) {
+// All channels: into `out`, or from there when counting.
+inline bool get_channels(Chunk *c, uint rows, int sh_degree, bool base_only, __global ushort *weights, __global int *out) {
   const uint stride = c->stride;
-  if (!get_positions(c, rows, depth, cells, out)) return false;
-  out += 3 * stride;
   __global int *subset = c->ints + (size_t)SUBSET * stride;
   for (uint i = 0; i < rows; ++i) subset[i] = (int)i;
   plan_passes(c, rows, 4, weights, plane(c, NEAR));
@@ -543,7 +597,7 @@ inline bool get_chunk(Chunk *c, uint rows, uint depth, int sh_degree, bool base_
   __global int *degrees = out + DEGREE * stride;
   for (uint channel = 0; channel < CHANNELS; ++channel) {
     if (channel == DEGREE && !sh_degree) {
-      for (uint i = 0; i < rows; ++i) degrees[i] = 0;
+      for (uint i = 0; i < rows && !c->counting; ++i) degrees[i] = 0;
       continue;
     }
     if (!get_base(c, channel, rows, weights, sources[channel], counts[channel], out)) return false;
@@ -567,7 +621,7 @@ inline bool get_chunk(Chunk *c, uint rows, uint depth, int sh_degree, bool base_
       if (!get_coefficient(c, alphabet, count, weights, coefficients * stride, to + (size_t)i * stride)) return false;
     }
   }
-  for (uint lane = 0; lane < c->lanes; ++lane)
+  for (uint lane = 0; lane < c->lanes && !c->counting; ++lane)
     if (c->states[lane] != RANS_FLOOR) return failed(c, LANES_END, 0, 0);
   return true;
 }
@@ -611,10 +665,70 @@ __kernel void decode_chunks(
   c.status = GOOD;
   c.found = 0;
   c.wanted = 0;
-  get_chunk(&c, about[ROWS], depth, (int)sh_degree, base_only, cells + i * 2 * stride, weights + i * 8 * stride, out + i * out_planes * stride);
+  c.counting = false;
+  const uint rows = about[ROWS];
+  __global int *to = out + i * out_planes * stride;
+  if (get_positions(&c, rows, depth, cells + i * 2 * stride, to))
+    get_channels(&c, rows, (int)sh_degree, base_only, weights + i * 8 * stride, to + 3 * stride);
   about[STATUS] = (int)c.status;
   about[FOUND] = (int)(c.found & 0xffffffff);
   about[FOUND_HIGH] = (int)(c.found >> 32);
   about[WANTED] = c.wanted;
   about[AT] = (int)c.at;
+}
+
+// The other way round: symbols and contexts of all channels of chunks, their counts, and raw bits.
+__kernel void count_chunks(
+    const uint stride,                 // as above
+    const uint planes,                 // 11, and one for each SH coefficient and colour
+    const uint sh_degree,
+    const uint log_most,               // symbols of a chunk
+    const uint raw_most,               // room for its raw bytes
+    const uint count_most,             // counts of all groups
+    const uint batch_most,             // passes of all channels
+    __global int *info,                // [chunks, INFO]: afterwards AT holds the batches, WORDS the raw bytes
+    __global const int *records,       // [alphabets, RECORD]
+    __global const ulong *cells,       // [chunks, stride]
+    __global int *codes,               // [chunks, planes, stride]
+    __global ushort *weights,          // [chunks, 8, stride]
+    __global uchar *bytes,             // [chunks, BYTES, stride]
+    __global int *ints,                // [chunks, INTS, stride]
+    __global float *floats,            // [chunks, FLOATS, stride]
+    __global uchar *contexts,          // [chunks, log_most]
+    __global uchar *symbols,           // [chunks, log_most]
+    __global uchar *raw,               // [chunks, raw_most]
+    __global uint *counts,             // [chunks, count_most]
+    __global uint *batches)            // [chunks, batch_most, 3] alphabet, symbols, escapes
+{
+  const size_t i = get_global_id(0);
+  __global int *about = info + i * INFO;
+  const uint rows = about[ROWS];
+  Chunk c;
+  c.stride = stride;
+  c.lanes = 0;
+  c.records = records;
+  c.bytes = bytes + i * BYTES * stride;
+  c.ints = ints + i * INTS * stride;
+  c.floats = floats + i * FLOATS * stride;
+  c.status = GOOD;
+  c.counting = true;
+  c.counts = counts + i * count_most;
+  c.batches = batches + i * 3 * batch_most;
+  c.log_contexts = contexts + i * log_most;
+  c.log_symbols = symbols + i * log_most;
+  c.log_raw = raw + i * raw_most;
+  c.logged = c.raw_logged = c.batch_count = 0;
+  c.raw_most = raw_most;
+  for (uint n = 0; n < count_most; ++n) c.counts[n] = 0;
+  __global float *x = plane(&c, X), *y = plane(&c, Y), *z = plane(&c, Z);
+  for (uint row = 0; row < rows; ++row) {
+    const ulong cell = cells[i * stride + row];
+    x[row] = (float)every_third(cell >> 2);
+    y[row] = (float)every_third(cell >> 1);
+    z[row] = (float)every_third(cell);
+  }
+  get_channels(&c, rows, (int)sh_degree, false, weights + i * 8 * stride, codes + i * planes * stride);
+  about[STATUS] = (int)c.status;
+  about[AT] = (int)c.batch_count;
+  about[WORDS] = (int)c.raw_logged;
 }

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,20 +14,21 @@ import pytest
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.codec import GridSource, write_grid
 from flexgs_edge.codec.chunk_kernel import ChunkKernel
-from flexgs_edge.codec.coder import CHUNK_ROWS, decode_chunk
-from flexgs_edge.codec.container2 import GridContainer
+from flexgs_edge.codec.coder import CHUNK_ROWS, decode_chunk, encode_grid
+from flexgs_edge.codec.container2 import GridContainer, coded_parts
+from flexgs_edge.codec.encode_kernels import CountKernel, device_bytes
 from flexgs_edge.codec.model import Model
 from flexgs_edge.codec.walk import ChunkCodes
 from flexgs_edge.device.select import DeviceInfo
 from flexgs_edge.errors import FormatError
 from flexgs_edge.grid import CODE_LIMIT, GridScene, Steps, from_grid
-from flexgs_edge.pipeline import decompress as decompress_module
+from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.pipeline.decompress import ahead, decoder, decompress
-from flexgs_edge.pipeline.workspace import Stopwatch
+from flexgs_edge.pipeline.workspace import DEVICE_ROWS, Stopwatch, coding_device
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from grid_scenes import STEPS, assert_same_grid, make_grid
-from kernel_fixtures import large_budget, open_form
+from kernel_fixtures import default_device, large_budget, open_form
 
 FINE = Steps(0.05, 2.0**-14, 2.0**-9, 2.0**-12, 2.0**-10, (2.0**-9, 0.25, 2.0**-8, 0.3))
 """Steps at which alphabets have raw low bits."""
@@ -106,6 +108,73 @@ def test_the_same_codes(name: str, form: str, files: dict[str, Path]) -> None:
                 for (rows, data), codes in zip(some, kernel.codes(some, base_only), strict=True):
                     assert isinstance(codes, ChunkCodes), codes
                     assert same_codes(codes, decode_chunk(model, rows, data, base_only))
+
+
+@pytest.mark.parametrize(("name", "form"), [*((name, "w16") for name in GRIDS), ("both", "w4"), ("both", "w1")])
+def test_the_same_file(name: str, form: str, files: dict[str, Path], tmp_path: Path) -> None:
+    grid, rows = GRIDS[name]
+    size = write_grid(tmp_path / "a.fgs", grid, {}, chunk_rows=rows, device=open_form(form))
+    assert (tmp_path / "a.fgs").read_bytes() == files[name].read_bytes()
+    assert coded_parts(grid, {}, rows, open_form(form))[0] == size
+
+
+def test_no_rows(tmp_path: Path) -> None:
+    empty = make_grid(0, 0)
+    assert write_grid(tmp_path / "a.fgs", empty, {}) == write_grid(
+        tmp_path / "b.fgs", empty, {}, device=open_form("w16")
+    )
+    assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
+    source = GridSource(tmp_path / "a.fgs")
+    with source.on_device(open_form("w16"), 1):
+        assert source.grid().count == 0
+
+
+def test_a_chunk_of_many_escapes_is_left_to_numpy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fitted to the first chunk alone, whose values say nothing of the others'."""
+    monkeypatch.setattr("flexgs_edge.codec.coder.SAMPLE_CHUNKS", 1)
+    grid = make_grid(3000, 2)
+    scale = grid.scale.copy()
+    scale[:, 1000:2000] += np.arange(1000, dtype=np.int32) * 300
+    grid = replace(grid, scale=scale)
+    done = []
+    count = CountKernel.count
+
+    def noted(self: CountKernel, *arguments: Any) -> list[bool]:
+        done.extend(count(self, *arguments))
+        return done[-len(arguments[0]) :]
+
+    monkeypatch.setattr(CountKernel, "count", noted)
+    write_grid(tmp_path / "a.fgs", grid, {}, chunk_rows=1000)
+    write_grid(tmp_path / "b.fgs", grid, {}, chunk_rows=1000, device=open_form("w16"))
+    assert done == [True, False, True]
+    assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
+
+
+def test_when_a_device_codes() -> None:
+    grid = replace(GRIDS["one row"][0], count=DEVICE_ROWS)
+    backend = open_form("w16")
+    assert coding_device(backend, large_budget(), grid) is backend
+    assert coding_device(backend, MemoryBudget(1 << 20), grid) is None
+    assert coding_device(backend, large_budget(), replace(grid, count=DEVICE_ROWS - 1)) is None
+    for other in (None, open_form("gpu"), open_form("numpy")):
+        assert coding_device(other, large_budget(), grid) is None
+
+
+@pytest.mark.parametrize("name", ["both", "degree 4"])
+def test_work_of_coding_stays_below_what_is_declared(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    grid, _ = GRIDS[name]
+    budget = MemoryBudget(1 << 40)
+    taken = []
+    watched = OpenCLBackend(default_device(), budget, width=16)
+    take = budget.take
+
+    def noted(stage: str, size: int) -> None:
+        take(stage, size)
+        taken.append(budget.used)
+
+    monkeypatch.setattr(budget, "take", noted)
+    assert len(list(encode_grid(grid, device=watched).streams())) == 1
+    assert budget.used == 0 and 0 < max(taken) <= device_bytes(grid.count, grid.sh_degree)
 
 
 def test_the_grids_have_what_their_names_say(files: dict[str, Path]) -> None:
@@ -251,7 +320,7 @@ def test_which_device_decodes(files: dict[str, Path], monkeypatch: pytest.Monkey
     planes = MemorySource(from_grid(GRIDS["odd"][0]))
     assert decoder(None, source, budget, clock) is None
     assert decoder("cpu", planes, budget, clock) is None
-    monkeypatch.setattr(decompress_module, "DEVICE_ROWS", 1000)
+    monkeypatch.setattr("flexgs_edge.pipeline.decompress.DEVICE_ROWS", 1000)
     backend = decoder(None, source, budget, clock)
     assert backend is not None and backend.threads >= 1
     assert decoder("numpy", source, budget, clock) is None

@@ -127,6 +127,8 @@ def chunks(width: int) -> None:
         # Two passes, raw bits, and the end of the planes: as many rows as vectors are whole.
         steps = replace(STEPS, scale=2.0**-11, sh=(2.0**-9, 0.2))
         write_grid(path, make_grid(272, 2, steps=steps), {})
+        write_grid(path.with_name("b.fgs"), make_grid(272, 2, steps=steps), {}, device=counting)
+        assert path.read_bytes() == path.with_name("b.fgs").read_bytes()
         plain, source = GridSource(path), GridSource(path)
         container = plain.container
         table = np.zeros((272, 17 + 24), np.float32)

@@ -6,45 +6,22 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from threading import Lock
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from flexgs_edge.codec.coder import check_end
-from flexgs_edge.codec.groups import Group
 from flexgs_edge.codec.model import SHARED, Model
 from flexgs_edge.codec.octree import TooManyNodes
 from flexgs_edge.codec.rans import PRECISION, StreamError, first_states, lane_count
+from flexgs_edge.codec.records import INFO, PLACES, PLANES, RECORD, Device, pack_group, padded
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds
 from flexgs_edge.constants import CODE_LIMIT, RANS_LANES
 from flexgs_edge.grid import Steps
 from flexgs_edge.scene.fields import sh_rest_count
 
-_SPARE = 96
-"""Numbers of every plane behind those of the rows: what vectors load and store beyond them."""
-# Of a chunk: what is wanted and found; as in the kernel.
-_ROWS, _LANES, _WORDS, _STATUS, _FOUND, _FOUND_HIGH, _WANTED, _AT, _INFO = range(9)
+_ROWS, _LANES, _WORDS, _STATUS, _FOUND, _FOUND_HIGH, _WANTED, _AT = range(len(INFO))
 _NO_WORDS, _NO_CHILDREN, _NODES, _REPEATS, _CODES, _DEGREES, _LANES_END = range(1, 8)
-# Places in the record of an alphabet.
-_MEAN_CUT, _ERROR_CUT, _SLOT, _ENTRY, _MEAN_WEIGHT, _ERROR_WEIGHT, _SLOTS, _RECORD = 8, 23, 38, 102, 166, 183, 200, 202
-_PLANES = {"cells": (2, "u8"), "weights": (8, "u2"), "bytes": (4, "u1"), "ints": (4, "i4"), "floats": (44, "f4")}
-"""Work planes of a chunk."""
-
-
-class Device(Protocol):
-    """What of a kernel backend is used here."""
-
-    def array(self, shape: tuple[int, ...], dtype: Any) -> Any:
-        """An array, not initialised."""
-
-    def write(self, array: Any, values: np.ndarray, offset: int = 0) -> None:
-        """Copy values into an array."""
-
-    def read(self, array: Any, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
-        """Copy an array out."""
-
-    def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
-        """Run a kernel."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +59,7 @@ class ChunkKernel:
 
     def __init__(self, device: Device, model: Model, rows: int, data_bytes: int, chunks: int) -> None:
         self.device, self.model, self.rows, self.chunks = device, model, rows, chunks
-        self._stride = _stride(rows)
+        self._stride = padded(rows)
         self._word_stride = -(-data_bytes // 2) + RANS_LANES
         self._out_planes = _out_planes(model.sh_degree)
         self._arrays: dict[str, Any] = {}
@@ -91,10 +68,10 @@ class ChunkKernel:
             stack.callback(self.close)
             for name, values in zip(("records", "slots", "entries"), pack_model(model), strict=True):
                 device.write(self._array(name, values.shape, values.dtype), values)
-            self._array("info", (chunks, _INFO), np.int32)
+            self._array("info", (chunks, len(INFO)), np.int32)
             self._array("states", (chunks, RANS_LANES), np.uint32)
             self._array("words", (chunks, self._word_stride), np.uint16)
-            for name, (planes, kind) in _PLANES.items():
+            for name, (planes, kind) in PLANES.items():
                 self._array(name, (chunks, planes, self._stride), np.dtype(kind))
             self._array("out", (chunks, self._out_planes, self._stride), np.int32)
             stack.pop_all()
@@ -102,8 +79,8 @@ class ChunkKernel:
     @staticmethod
     def bytes_of(rows: int, sh_degree: int) -> int:
         """Bytes that a chunk of so many rows takes on the device, its stream and table of values aside."""
-        work = sum(planes * np.dtype(kind).itemsize for planes, kind in _PLANES.values())
-        return _stride(rows) * (work + 4 * _out_planes(sh_degree))
+        work = sum(planes * np.dtype(kind).itemsize for planes, kind in PLANES.values())
+        return padded(rows) * (work + 4 * _out_planes(sh_degree))
 
     def _array(self, name: str, shape: tuple[int, ...], dtype: Any) -> Any:
         if name not in self._arrays:
@@ -156,7 +133,7 @@ class ChunkKernel:
 
     def _decode(self, chunks: Sequence[tuple[int, bytes]], base_only: bool) -> list[Any]:
         """Leave the codes of chunks on the device; what is wrong with each, or None."""
-        info = np.zeros((len(chunks), _INFO), np.int32)
+        info = np.zeros((len(chunks), len(INFO)), np.int32)
         errors: list[ValueError | None] = [None] * len(chunks)
         arrays = self._arrays
         for i, (rows, data) in enumerate(chunks):
@@ -181,7 +158,7 @@ class ChunkKernel:
             self.model.depth,
             self.model.sh_degree,
             int(base_only),
-            *(arrays[name] for name in ("info", "states", "words", "records", "slots", "entries", *_PLANES, "out")),
+            *(arrays[name] for name in ("info", "states", "words", "records", "slots", "entries", *PLANES, "out")),
         )
         self.device.read(arrays["info"], info)
         for i, ((rows, data), found) in enumerate(zip(chunks, info.tolist(), strict=True)):
@@ -227,10 +204,6 @@ class ChunkKernel:
         )
 
 
-def _stride(rows: int) -> int:
-    return -(-rows // 16) * 16 + _SPARE
-
-
 def _out_planes(sh_degree: int) -> int:
     """Positions, base channels, SH."""
     return 3 + len(base_kinds()) + 3 * sh_rest_count(sh_degree)
@@ -242,29 +215,19 @@ def pack_model(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Returns
     -------
     tuple of np.ndarray
-        [alphabets, 202] i32 records; [tables, 2^14] u8 symbols of all slots; [symbols of all tables] u32 entries.
+        [alphabets, 203] i32 records; [tables, 2^14] u8 symbols of all slots; [symbols of all tables] u32 entries.
     """
-    records = np.zeros((len(model.tables), _RECORD), np.int32)
+    records = np.zeros((len(model.tables), RECORD), np.int32)
     tables_before = entries_before = 0
     for i, (record, mapping, tables) in enumerate(zip(records, model.mappings, model.tables, strict=True)):
-        record[3] = tables.size
-        record[_SLOTS:] = tables_before << PRECISION, len(tables.freqs) << PRECISION
-        record[_SLOT : _SLOT + len(mapping)] = (tables_before + mapping.astype(np.int64)) << PRECISION
-        record[_ENTRY : _ENTRY + len(mapping)] = entries_before + mapping.astype(np.int64) * tables.size
+        record[PLACES["symbols"]] = tables.size
+        record[PLACES["tables"] : PLACES["counts"]] = tables_before << PRECISION, len(tables.freqs) << PRECISION
+        slot, entry = PLACES["slots"], PLACES["entries"]
+        record[slot : slot + len(mapping)] = (tables_before + mapping.astype(np.int64)) << PRECISION
+        record[entry : entry + len(mapping)] = entries_before + mapping.astype(np.int64) * tables.size
         if i >= SHARED:
-            _pack_group(record, model.groups[i - SHARED])
+            pack_group(record, model.groups[i - SHARED])
         tables_before += len(tables.freqs)
         entries_before += tables.entries.size
     slots = np.concatenate([tables.slots for tables in model.tables])
     return records, slots, np.concatenate([tables.entries for tables in model.tables])
-
-
-def _pack_group(record: np.ndarray, group: Group) -> None:
-    start = group.start
-    record[:3] = np.int64(start).astype(np.int32), start >> 32, group.shift
-    record[4:8] = len(group.cuts[0]), len(group.cuts[1]), group.kind.residual, group.kind.features
-    for place, cuts in zip((_MEAN_CUT, _ERROR_CUT), group.cuts, strict=True):
-        # Contexts count the cuts reached: their order says nothing, and the kernel looks at the lowest first.
-        record[place : place + len(cuts)] = np.sort(cuts)
-    for place, weights in zip((_MEAN_WEIGHT, _ERROR_WEIGHT), group.weights, strict=True):
-        record[place : place + len(weights)] = weights

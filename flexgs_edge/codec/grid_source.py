@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.codec.chunk_kernel import ChunkKernel, Device, RowSteps
+from flexgs_edge.codec.chunk_kernel import ChunkKernel, RowSteps
 from flexgs_edge.codec.coder import Chunk
 from flexgs_edge.codec.container2 import GridContainer
+from flexgs_edge.codec.records import Device
 from flexgs_edge.codec.sections import ChunkEntry
 from flexgs_edge.codec.source import by_chunk
 from flexgs_edge.codec.threads import in_order, thread_count

@@ -101,6 +101,11 @@ class Encoder:
             raise AssertionError("a symbol without a frequency")
         self._batches.append(entries)
 
+    @property
+    def batches(self) -> list[np.ndarray]:
+        """Frequency and start of every symbol of the batches so far ([m] u32 each)."""
+        return self._batches
+
     def finish(self) -> bytes:
         """The stream: the states of all lanes as u32, then words as u16."""
         # Doubles hold states exactly, and their division is a vector instruction: a state and a frequency differ too

@@ -129,7 +129,7 @@ def walk_chunk(
     ChunkCodes
         The codes; without SH if `base_only`.
     """
-    cells = _walk_positions(rows, depth, port, codes)
+    cells = walk_positions(rows, depth, port, codes)
     position = unmorton(cells)
     plan = plan_passes(position, REACH[0], port.stride)
     features = Features(3 * len(_SOURCES), rows)
@@ -188,7 +188,7 @@ def _walk_channel(
     return result, values
 
 
-def _walk_positions(rows: int, depth: int, port: Port, codes: ChunkCodes | None) -> np.ndarray:
+def walk_positions(rows: int, depth: int, port: Port, codes: ChunkCodes | None) -> np.ndarray:
     """[r] u64 cells of all rows: the octree, then how often each cell is taken again."""
     if codes is None:
         unique = walk_octree(depth, rows, port.occupancy)

@@ -62,6 +62,8 @@ KERNELS: dict[str, KernelSpec] = {
 
 CODEC_KERNELS: dict[str, KernelSpec] = {
     "decode_chunks": KernelSpec("decode_chunks.cl", "uuuuuu" + 12 * "b"),
+    "count_chunks": KernelSpec("decode_chunks.cl", "uuuuuuu" + 13 * "b"),
+    "encode_chunks": KernelSpec("encode_chunks.cl", "uubbbbbb"),
     "grid_rows": KernelSpec("grid_rows.cl", "uuuuuiiibbbb"),
 }
 """Kernels that a codec launches; what they do in NumPy is the codec's own code, not a twin."""

@@ -15,7 +15,7 @@ from flexgs_edge.formats import FORMATS, check_converter, converter_bytes, forma
 from flexgs_edge.kernels import Backend
 from flexgs_edge.pipeline.inputs import load_scene
 from flexgs_edge.pipeline.records import scene_info
-from flexgs_edge.pipeline.workspace import Stopwatch, counted_backend, run_info
+from flexgs_edge.pipeline.workspace import DEVICE_ROWS, Stopwatch, counted_backend, run_info
 from flexgs_edge.report.result import DecompressResult
 from flexgs_edge.scene import SceneSource, check_writable, inria_dtype, write_ply
 
@@ -23,9 +23,6 @@ WRITE_COPIES = 3
 """Times a chunk's rows that decoding and writing hold at once: codes, planes, rows of the PLY."""
 DECODE_BYTES = 800
 """Bytes a row that decoding a chunk holds: codes, features, neighbours' weights, sums."""
-
-DEVICE_ROWS = 200_000
-"""Scenes of fewer Gaussians are decoded before a device is open and its kernels are built."""
 
 ANTIALIASED_NOTE = "an antialiased model: the file does not say so; viewers must be told, and here --antialiased"
 
