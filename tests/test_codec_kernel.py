@@ -346,8 +346,26 @@ def test_as_many_chunks_on_the_device_as_the_budget_allows(
     monkeypatch.setattr(GridSource, "on_device", noted)
     backend = open_form("w16")
     monkeypatch.setattr(backend, "threads", 2)
-    need = source.device_bytes
-    for limit in (need // 2, need, 2 * need, 9 * need):
+    need, more = source.device_bytes(1), source.device_bytes(2)
+    for limit in (need - 1, need, more - 1, more, 9 * more):
         with ahead(source, MemoryBudget(limit), backend):
             assert (source._kernel is not None) == (limit >= need)
-    assert asked == [1, 2, 2]
+    assert asked == [1, 1, 2, 2]
+
+
+@pytest.mark.parametrize("name", ["degree 4", "layers", "one row"])
+def test_work_of_decoding_stays_below_what_is_declared(
+    name: str, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    budget, taken = MemoryBudget(1 << 40), []
+    take = budget.take
+
+    def noted(stage: str, size: int) -> None:
+        take(stage, size)
+        taken.append(budget.used)
+
+    monkeypatch.setattr(budget, "take", noted)
+    source = GridSource(files[name])
+    with source.on_device(OpenCLBackend(default_device(), budget, width=16), 2):
+        source.read_table(slice(0, 1), np.zeros((1, 17 + source.width("sh_rest")), np.float32))
+    assert budget.used == 0 and 0 < max(taken) <= source.device_bytes(2)

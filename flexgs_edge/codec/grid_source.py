@@ -131,7 +131,7 @@ class GridSource(SceneSource):
         device : Device
             A kernel backend whose work-items run as threads of a processor do.
         chunks : int
-            Each holds `device_bytes` on the device.
+            See `device_bytes`.
         """
         longest = max((entry.section.length for entry in self._entries), default=0)
         self._kernel = ChunkKernel(device, self._model, self._most_rows, longest, chunks)
@@ -142,11 +142,13 @@ class GridSource(SceneSource):
             self._kernel = None
             self._ready.clear()
 
-    @property
-    def device_bytes(self) -> int:
-        """Bytes that decoding a chunk to a PLY takes on a device, and for its rows in host memory, stream and model aside."""
-        rows, row = self._most_rows, 4 * (17 + self.width("sh_rest"))
-        return ChunkKernel.bytes_of(rows, self.sh_degree) + 3 * rows * row
+    def device_bytes(self, chunks: int) -> int:
+        """Bytes that decoding so many chunks at once to a PLY takes on a device, and for their rows in host memory."""
+        table = 4 * self._most_rows * (17 + self.width("sh_rest"))
+        longest = max((entry.section.length for entry in self._entries), default=0)
+        each = ChunkKernel.bytes_of(self._most_rows, self.sh_degree) + 3 * table + longest + (1 << 14)
+        model = sum(tables.slots.nbytes + tables.entries.nbytes for tables in self._model.tables)
+        return model + table + chunks * each + (1 << 16)
 
     @property
     def _most_rows(self) -> int:

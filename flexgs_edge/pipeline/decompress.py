@@ -59,7 +59,9 @@ def ahead(source: SceneSource, budget: MemoryBudget, backend: Backend | None = N
     if not isinstance(source, GridSource):
         yield
         return
-    if backend is not None and (at_once := min(backend.threads, source.threads, budget.free // source.device_bytes)):
+    most = 0 if backend is None else min(backend.threads, source.threads)
+    at_once = max((n for n in range(1, most + 1) if source.device_bytes(n) <= budget.free), default=0)
+    if backend is not None and at_once:
         with source.on_device(backend, at_once), source.whole_in_order(at_once):
             yield
         return
