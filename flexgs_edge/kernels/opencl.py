@@ -52,8 +52,9 @@ class OpenCLBackend:
         self._simulated = "oclgrind" in info.platform.lower()
         # Blocks of the serial passes: enough to keep every unit busy to the end, few enough for short scans.
         self.sort_blocks = self.tile_blocks = max(8 * info.compute_units, 16) if self.form == "cpu" else 64
-        doubles = info.handle is not None and info.handle.double_fp_config != 0
-        self.threads = info.compute_units if self.form == "cpu" and doubles else 0
+        # The codec's kernels take doubles, and put two numbers into one of twice their width.
+        able = info.handle is not None and info.handle.double_fp_config != 0 and info.handle.endian_little
+        self.threads = info.compute_units if self.form == "cpu" and able else 0
         self._kernels: dict[str, cl.Kernel] = {}
         self.startup_seconds = time.perf_counter() - start
 
