@@ -172,6 +172,7 @@ __kernel void blend(
     }
     const uint2 pair = pairs[n];
     const size_t ahead = pairs[min(n + AHEAD, last - 1)].x;
+    // Records and sums lie in row order, so a tile's are all over the memory: without this a third of the blend waits for them.
     FETCH(records + ahead * 16);
 #if STATS
     FETCH(sums + ahead * (2 * SUMS));

@@ -133,6 +133,26 @@ same bits. A pixel's weight is at most 1; errors get finer units since those of 
 FIXED_LARGEST: Final = 2.0**62
 """Values are clamped to this before they become integers."""
 
+# --- container version 2 ----------------------------------------------------------------------
+RANS_PRECISION: Final = 14
+"""Probabilities count in 1/2^14."""
+RANS_TOTAL: Final = 1 << RANS_PRECISION
+"""Frequencies of a table add up to this."""
+RANS_FLOOR: Final = 1 << 16
+"""Smallest state between symbols, and the first state of every lane."""
+RANS_LANES: Final = 512
+"""Lanes of a stream at most."""
+LEVEL_CLASSES: Final = 6
+"""Octree levels by their distance from the cells; all coarser ones count as the last: they have few nodes."""
+CHILD_CLASSES: Final = 5
+"""Octree nodes by how many children the parent has: none (the root), 1, 2, 3, more."""
+COARSE_ROWS: Final = 256
+"""The first pass over a chunk has at most this many rows; they have no neighbours yet."""
+VALUE_LIMIT: Final = 16383.0
+"""Values count as at most this large in predictions: sums of 256 of them stay exact in float32."""
+CODE_LIMIT: Final = 1 << 24
+"""Codes lie within +-this: float32 holds all of them exactly."""
+
 # --- method (FlexGaussian, ACM MM 2025) -------------------------------------------------------
 VOLUME_POWER: Final = 0.1
 """Exponent of the Gaussian's volume in the gs and meson scores."""

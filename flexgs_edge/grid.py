@@ -13,13 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.constants import MAX_SH_DEGREE
+from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.rotations import canonical_axes
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 
-CODE_LIMIT = 1 << 24
-"""Codes lie within +-this: float32 holds all of them exactly."""
 POSITION_BITS = 21
 """Cells along an axis of a scene as a power of two: three of them fill a 63-bit curve index."""
 _BLOCK_ROWS = 16384

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -116,7 +117,8 @@ def test_no_chunk_is_decoded_ahead_without_room(
     write_grid(tmp_path / "a.fgs", grid, {}, chunk_rows=CHUNK)
     use_threads(monkeypatch, 2)
     asked = []
-    monkeypatch.setattr(GridSource, "whole_in_order", lambda self, threads: asked.append(threads))
+    monkeypatch.setattr(GridSource, "whole_in_order", lambda self, threads: nullcontext(asked.append(threads)))
     for limit in (2**20, 2**30):
-        ahead(GridSource(tmp_path / "a.fgs"), MemoryBudget(limit))
+        with ahead(GridSource(tmp_path / "a.fgs"), MemoryBudget(limit)):
+            pass
     assert asked == [1, 2]

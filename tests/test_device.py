@@ -17,7 +17,7 @@ from flexgs_edge.device.select import DeviceInfo, choose_device, list_devices
 from flexgs_edge.device.session import Session
 from flexgs_edge.errors import BudgetError, DeviceError
 from flexgs_edge.kernels import open_backend
-from flexgs_edge.kernels.backend import KERNELS, TwinBackend
+from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from kernel_fixtures import default_device, large_budget
 
@@ -219,7 +219,7 @@ def test_every_signature_fits_its_kernel() -> None:
 
     session = Session(default_device(), large_budget())
     for form, width in (("cpu", 8), ("gpu", 1)):
-        for name, spec in KERNELS.items():
+        for name, spec in {**KERNELS, **CODEC_KERNELS}.items():
             options = [f"-DW={width}"] + ([f"-DSTATS={spec.stats}"] if spec.stats is not None else [])
             source = load_source(spec.file.format(form=form))
             kernel = session.kernel(source, spec.kernel or name, tuple(options), spec.signature)

@@ -10,19 +10,25 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pytest
 
 from flexgs_edge.cameras import Camera
-from flexgs_edge.kernels.backend import KERNELS, TwinBackend
+from flexgs_edge.codec import GridSource, write_grid
+from flexgs_edge.codec.chunk_kernel import ChunkKernel
+from flexgs_edge.codec.coder import decode_chunk
+from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.refit import refit_colours
 from flexgs_edge.render import Renderer, Statistics, device_scene, renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.score.removal import measure_costs
+from grid_scenes import STEPS, make_grid
 from kernel_fixtures import default_device, large_budget, same_bits
 from quantized_scenes import quantize_all
 from synthetic import make_camera, random_scene
@@ -112,6 +118,41 @@ def lane(width: int, form: str) -> None:
     print(MARK, compared)
 
 
+def chunks(width: int) -> None:
+    """Body of a subprocess: decode chunks, sound and damaged, as NumPy does."""
+    simulated = OpenCLBackend(default_device(), large_budget(), width=width, form="cpu")
+    counting: Any = _Counting(simulated)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a.fgs"
+        # Two passes, raw bits, and the end of the planes: as many rows as vectors are whole.
+        steps = replace(STEPS, scale=2.0**-11, sh=(2.0**-9, 0.2))
+        write_grid(path, make_grid(272, 2, steps=steps), {})
+        write_grid(path.with_name("b.fgs"), make_grid(272, 2, steps=steps), {}, device=counting)
+        assert path.read_bytes() == path.with_name("b.fgs").read_bytes()
+        plain, source = GridSource(path), GridSource(path)
+        container = plain.container
+        table = np.zeros((272, 17 + 24), np.float32)
+        with source.on_device(counting, 1):
+            assert source.read_table(slice(0, 272), table).tobytes() == plain.read_table(slice(0, 272), table).tobytes()
+        model, data = container.read_model(), container.read_chunk(container.read_table()[0])
+    assert any(group.shift for group in model.groups)
+    kernel = ChunkKernel(counting, model, 272, len(data), 1)
+    wrong = 0
+    for trial in range(6):
+        damaged = bytearray(data)
+        damaged[4 * trial : 4 * trial + 2] = b"\xff\x80"
+        if trial % 2:
+            del damaged[100 * trial :]
+        got = kernel.codes([(272, bytes(damaged))], False)[0]
+        try:
+            decode_chunk(model, 272, bytes(damaged))
+        except ValueError as error:
+            assert str(got) == str(error)
+            wrong += 1
+    assert wrong > 3 and set(counting.launched) == set(CODEC_KERNELS)
+    print(MARK, wrong)
+
+
 def faulty(fault: str) -> None:
     """A kernel that breaks one rule, to see that the simulator says so."""
     backend = OpenCLBackend(default_device(), large_budget(), width=1, form="cpu")
@@ -154,6 +195,11 @@ def simulate(call: str, folder: Path) -> str:
 @pytest.mark.parametrize(("width", "form"), [(4, "cpu"), (1, "cpu"), (1, "gpu")])
 def test_kernels_break_no_rule(width: int, form: str, tmp_path: Path) -> None:
     assert simulate(f"lane({width}, '{form}')", tmp_path) == ""
+
+
+@pytest.mark.parametrize("width", [4, 1])
+def test_decoding_kernels_break_no_rule(width: int, tmp_path: Path) -> None:
+    assert simulate(f"chunks({width})", tmp_path) == ""
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,26 @@ from flexgs_edge.cli import words
 @words.option(
     "Output", "-o", "--output", metavar="OUT", required=True, help="File to write: .ply, .spz, .sog or .compressed.ply."
 )
+@words.option(
+    "Run",
+    "--device",
+    metavar="SPEC",
+    help="What decodes a large .fgs of --method best: an OpenCL processor (its number, part of its name, or cpu), or numpy: the "
+    "same bits, four times slower. Default: the first CPU, where there are enough Gaussians to make up for opening it.",
+)
 @words.memory_option
 @words.force_option
 @words.json_option
 @words.talk_options
-def command(input: str, output: str, memory_limit: int | None, force: bool, json_path: str | None, quiet: bool) -> None:
+def command(
+    input: str,
+    output: str,
+    device: str | None,
+    memory_limit: int | None,
+    force: bool,
+    json_path: str | None,
+    quiet: bool,
+) -> None:
     """Decode a .fgs file to a PLY that every viewer opens, or convert between formats.
 
     INPUT is a .fgs, .ply, .spz, .sog or .compressed.ply, or a model folder. A .ply is written in INRIA's layout: x y z, normals
@@ -35,5 +50,5 @@ def command(input: str, output: str, memory_limit: int | None, force: bool, json
     from flexgs_edge.pipeline.decompress import decompress
     from flexgs_edge.report.summary import decompress_text
 
-    result = decompress(input, output, force, memory_limit)
+    result = decompress(input, output, force, memory_limit, device)
     words.emit(decompress_text(result), result.to_json(), json_path, force)

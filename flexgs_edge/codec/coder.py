@@ -7,13 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexgs_edge.codec.groups import fit_group
+from flexgs_edge.codec.encode_kernels import CountKernel, encode_streams
+from flexgs_edge.codec.groups import Group, fit_group
 from flexgs_edge.codec.model import SHARED, Model, group_kinds, tables_of
 from flexgs_edge.codec.ports import UNIFORM, Batch, CountPort, DecodePort, FitPort
 from flexgs_edge.codec.rans import PRECISION, Decoder, Encoder, StreamError, lane_count
+from flexgs_edge.codec.records import Device
 from flexgs_edge.codec.tables import merge_contexts, to_levels
 from flexgs_edge.codec.threads import in_order, thread_count
-from flexgs_edge.codec.walk import ChunkCodes, base_kinds, walk_chunk
+from flexgs_edge.codec.walk import ChunkCodes, base_kinds, walk_chunk, walk_positions
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import POSITION_BITS, GridScene, morton
 
@@ -81,6 +83,8 @@ class Encoded:
     chunks: list[Chunk]
     batches: list[list[Batch]]
     bits: np.ndarray
+    device: Device | None = None
+    """What writes the streams; None: NumPy."""
 
     @property
     def sh_bytes(self) -> float:
@@ -94,13 +98,17 @@ class Encoded:
         """The bytes of every chunk in order, each made when it is asked for or one before."""
         sizes = [chunk.stop - chunk.start for chunk in self.chunks]
         pairs = list(zip(sizes, self.batches, strict=True))
+        if self.device is not None and self.device.threads:
+            yield from _streams_on(self.device, self.model, pairs)
+            return
         yield from in_order(lambda pair: encode_chunk(self.model, *pair), pairs, thread_count(len(pairs)))
 
 
-def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS) -> Encoded:
+def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS, device: Device | None = None) -> Encoded:
     """Fit a model to a scene and count its symbols; `Encoded.streams` gives the chunks.
 
-    Holds two or three bytes a coded number beside the grid itself.
+    Holds two or three bytes a coded number beside the grid itself; with a device, which gives the same result, a kilobyte
+    a row of as many chunks as it works on at once.
     """
     cells, low, depth = cells_of(grid)
     layers = np.bincount(grid.layer, minlength=1).tolist()
@@ -119,7 +127,12 @@ def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS) -> Encoded:
 
     count = CountPort(groups)
     batches = []
-    for port in in_order(counted, chunks, thread_count(len(chunks))):
+    ports = (
+        _counted_on(device, grid, cells, chunks, depth, groups)
+        if device is not None and device.threads
+        else in_order(counted, chunks, thread_count(len(chunks)))
+    )
+    for port in ports:
         batches.append(port.batches)
         count.add(port)
     merged = [merge_contexts(counts) for counts in count.counts]
@@ -134,7 +147,34 @@ def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS) -> Encoded:
     costs = (
         float((n * (PRECISION - np.log2(np.maximum(t.freqs, 1)))).sum()) for (_, n), t in zip(merged, model.tables)
     )
-    return Encoded(model, low, layers, chunks, batches, count.raw + np.array(list(costs)))
+    return Encoded(model, low, layers, chunks, batches, count.raw + np.array(list(costs)), device)
+
+
+def _counted_on(
+    device: Device, grid: GridScene, cells: np.ndarray, chunks: list[Chunk], depth: int, groups: list[Group]
+) -> Iterator[CountPort]:
+    """Ports of all chunks, their channels counted by a device."""
+    at_once = thread_count(len(chunks))
+    rows = max((chunk.stop - chunk.start for chunk in chunks), default=0)
+    kernel = CountKernel(device, groups, grid.sh_degree, rows, at_once)
+
+    def counted(first: int) -> list[CountPort]:
+        some = chunks[first : first + at_once]
+        codes = [chunk_codes(grid, cells, chunk) for chunk in some]
+        ports = [CountPort(groups) for _ in some]
+        for part, port in zip(codes, ports, strict=True):
+            walk_positions(len(part.cells), depth, port, part)
+        for i, done in enumerate(kernel.count(codes, ports)):
+            if not done:
+                ports[i] = CountPort(groups)
+                _walk(grid, cells, some[i], depth, ports[i])
+        return ports
+
+    try:
+        for ports in in_order(counted, range(0, len(chunks), at_once), 1):
+            yield from ports
+    finally:
+        kernel.close()
 
 
 def _walk(grid: GridScene, cells: np.ndarray, chunk: Chunk, depth: int, port: FitPort | CountPort) -> None:
@@ -144,12 +184,29 @@ def _walk(grid: GridScene, cells: np.ndarray, chunk: Chunk, depth: int, port: Fi
 
 def encode_chunk(model: Model, rows: int, batches: list[Batch]) -> bytes:
     """The stream of a chunk: at least a bit a row, so that a file's size bounds the rows that it can claim."""
+    return _fill_encoder(model, rows, batches).finish().ljust(least_bytes(rows), b"\0")
+
+
+def _fill_encoder(model: Model, rows: int, batches: list[Batch]) -> Encoder:
     encoder = Encoder(lane_count(rows))
     for alphabet, contexts, symbols, raw in batches:
         encoder.put(model.tables[alphabet], model.mappings[alphabet][contexts], symbols)
         for bits, values in raw:
             encoder.put(UNIFORM[bits], np.zeros(len(values), np.uint8), values)
-    return encoder.finish().ljust(least_bytes(rows), b"\0")
+    return encoder
+
+
+def _streams_on(device: Device, model: Model, pairs: list[tuple[int, list[Batch]]]) -> Iterator[bytes]:
+    """`encode_chunk` of all chunks (rows and batches of each) by a device."""
+    at_once = thread_count(len(pairs))
+    groups = [pairs[first : first + at_once] for first in range(0, len(pairs), at_once)]
+
+    def filled(group: list[tuple[int, list[Batch]]]) -> list[Encoder]:
+        return [_fill_encoder(model, *pair) for pair in group]
+
+    for group, encoders in zip(groups, in_order(filled, groups, 1, always=True), strict=True):
+        for (rows, _), stream in zip(group, encode_streams(device, encoders), strict=True):
+            yield stream.ljust(least_bytes(rows), b"\0")
 
 
 def least_bytes(rows: int) -> int:
@@ -178,7 +235,11 @@ def decode_chunk(
     stream = Decoder(data, lane_count(rows))
     codes = walk_chunk(rows, model.depth, model.sh_degree, DecodePort(model, stream, cost), None, base_only)
     if not base_only:
-        used = stream.finish()
-        if any(data[used:]) or (len(data) > used and len(data) != least_bytes(rows)):
-            raise StreamError(f"stream: wanted {used} bytes, got {len(data)}")
+        check_end(data, rows, stream.finish())
     return codes
+
+
+def check_end(data: bytes, rows: int, used: int) -> None:
+    """Raise `StreamError` unless `used` bytes are the whole stream, or zeros fill it up to the least bytes of a chunk."""
+    if any(data[used:]) or (len(data) > used and len(data) != least_bytes(rows)):
+        raise StreamError(f"stream: wanted {used} bytes, got {len(data)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from flexgs_edge.codec.layout import PREAMBLE_BYTES, Section, format_error
 from flexgs_edge.codec.layout2 import HEADER_MOST, GridHeader, decode_header, encode_header
 from flexgs_edge.codec.octree import TooManyNodes
 from flexgs_edge.codec.rans import StreamError
+from flexgs_edge.codec.records import Device
 from flexgs_edge.codec.sections import ChunkEntry, SectionFile, Verification, checked, preamble
 from flexgs_edge.codec.walk import ChunkCodes
 from flexgs_edge.errors import InputError, TargetError
@@ -29,6 +30,8 @@ from flexgs_edge.grid import GridScene
 from flexgs_edge.scene.atomic import atomic_write
 
 VERSION = 2
+
+Result = TypeVar("Result")
 
 
 def write_grid(
@@ -38,6 +41,7 @@ def write_grid(
     *,
     force: bool = False,
     chunk_rows: int = CHUNK_ROWS,
+    device: Device | None = None,
 ) -> int:
     """Encode a grid scene into a file, which appears under its name only when it is complete.
 
@@ -53,13 +57,15 @@ def write_grid(
         Replace a file that exists.
     chunk_rows : int, optional
         Rows of a chunk, at most 65536.
+    device : Device, optional
+        Counts symbols, with the same result.
 
     Returns
     -------
     int
         Bytes of the file, as `coded_size` predicts.
     """
-    encoded = encode_grid(grid, chunk_rows)
+    encoded = encode_grid(grid, chunk_rows, device)
     model = encoded.model.to_bytes()
     header = _header(grid, encoded, len(model), settings, chunk_rows)
     with atomic_write(path, force) as file:
@@ -73,18 +79,22 @@ def write_grid(
         return _finish(file, header, entries)
 
 
-def coded_size(grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS) -> int:
+def coded_size(
+    grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS, device: Device | None = None
+) -> int:
     """Exact bytes of the file that `write_grid` makes of these arguments."""
-    return coded_parts(grid, settings, chunk_rows)[0]
+    return coded_parts(grid, settings, chunk_rows, device)[0]
 
 
-def coded_parts(grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS) -> tuple[int, float]:
+def coded_parts(
+    grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS, device: Device | None = None
+) -> tuple[int, float]:
     """Exact bytes of the file that `write_grid` makes of these arguments, and how many of them the SH take.
 
     The SH take the information in their symbols and in the degrees of the rows, and their groups' part of the model:
     what coding the scene again without them would save, but for the header's and the lanes' bytes.
     """
-    encoded = encode_grid(grid, chunk_rows)
+    encoded = encode_grid(grid, chunk_rows, device)
     model_bytes = len(encoded.model.to_bytes())
     header = _header(grid, encoded, model_bytes, settings, chunk_rows)
     size = header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes
@@ -207,6 +217,20 @@ class GridContainer(SectionFile):
     def decode(self, model: Model, chunk: Chunk, entry: ChunkEntry, base_only: bool = False) -> ChunkCodes:
         """The codes of a chunk, checked."""
         return self._decode(model, chunk, entry, base_only, None)
+
+    def decode_on(
+        self,
+        decode: Callable[[list[tuple[int, bytes]]], Sequence[Result | ValueError]],
+        chunks: Sequence[tuple[Chunk, ChunkEntry]],
+    ) -> list[Result]:
+        """What `decode` makes of the rows and bytes of some chunks; an error of a chunk is raised in its name."""
+        jobs = [(chunk.stop - chunk.start, self.read_chunk(entry)) for chunk, entry in chunks]
+        results: list[Result] = []
+        for (_, entry), result in zip(chunks, decode(jobs), strict=True):
+            if isinstance(result, ValueError):
+                raise format_error(self.path, entry.section.offset, f"{entry.section.name}: {result}")
+            results.append(result)
+        return results
 
     def cost(self, model: Model, chunk: Chunk, entry: ChunkEntry, cost: np.ndarray) -> ChunkCodes:
         """Decode a chunk, and add the bits of every alphabet in it to `cost`."""

@@ -13,13 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.codec.features import Features
+from flexgs_edge.constants import COARSE_ROWS, VALUE_LIMIT
 
-COARSE_ROWS = 256
-"""The first pass has at most this many rows; they have no neighbours yet."""
 REACH = (4, 2)
 """Neighbours on each side for the base channels, and for SH: they are many, and half the reach costs 1 % of their bits."""
-VALUE_LIMIT = 16383.0
-"""Values count as at most this large in predictions: sums of 256 of them stay exact in float32."""
 ONE = 256
 """Features count in 1/256 of a code."""
 

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from flexgs_edge.codec.chunk_kernel import ChunkKernel, RowSteps
 from flexgs_edge.codec.coder import Chunk
 from flexgs_edge.codec.container2 import GridContainer
-from flexgs_edge.codec.octree import unmorton
+from flexgs_edge.codec.records import Device
+from flexgs_edge.codec.sections import ChunkEntry
 from flexgs_edge.codec.source import by_chunk
 from flexgs_edge.codec.threads import in_order, thread_count
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds
@@ -58,6 +60,9 @@ class GridSource(SceneSource):
         self._starts = np.array([chunk.start for chunk in self._chunks], np.int64)
         self._last: tuple[int, bool, GridScene] | None = None
         self._coming: Generator[tuple[int, GridScene], None, None] | None = None
+        self._kernel: ChunkKernel | None = None
+        self._tables: Generator[list[tuple[int, np.ndarray]], None, None] | None = None
+        self._ready: dict[int, np.ndarray] = {}
 
     @property
     def threads(self) -> int:
@@ -67,7 +72,10 @@ class GridSource(SceneSource):
     def grid(self) -> GridScene:
         """The codes of the whole scene; decodes every chunk."""
         count = len(self._chunks)
-        parts = list(in_order(lambda i: self._decode(i, False), range(count), self.threads))
+        if self._kernel is None:
+            parts = list(in_order(lambda i: self._decode(i, False), range(count), self.threads))
+        else:
+            parts = [part for group in self._groups() for part in self._decode_group(group, False)]
         if not parts:
             return self._scene(Chunk(0, 0, 0), _nothing(self.sh_degree))
 
@@ -101,6 +109,51 @@ class GridSource(SceneSource):
                 plane[:, place] = values[field]
         return planes
 
+    def read_table(self, rows: slice, out: np.ndarray) -> np.ndarray:
+        """See `SceneSource.read_table`; a device makes the values of whole chunks."""
+        if self._kernel is None:
+            return super().read_table(rows, out)
+        for chunk, wanted, place in by_chunk(rows, self._starts):
+            assert isinstance(wanted, slice)
+            first = self._chunks[chunk].start
+            table = self._table(chunk)[wanted.start - first : wanted.stop - first]
+            if len(table) == rows.stop - rows.start:
+                return table
+            out[place] = table
+        return out[: rows.stop - rows.start]
+
+    @contextmanager
+    def on_device(self, device: Device, chunks: int) -> Iterator[None]:
+        """While this lasts, a device decodes: as many chunks at once as are given; the results are the same.
+
+        Parameters
+        ----------
+        device : Device
+            A kernel backend whose work-items run as threads of a processor do.
+        chunks : int
+            See `device_bytes`.
+        """
+        longest = max((entry.section.length for entry in self._entries), default=0)
+        self._kernel = ChunkKernel(device, self._model, self._most_rows, longest, chunks)
+        try:
+            yield
+        finally:
+            self._kernel.close()
+            self._kernel = None
+            self._ready.clear()
+
+    def device_bytes(self, chunks: int) -> int:
+        """Bytes that decoding so many chunks at once to a PLY takes on a device, and for their rows in host memory."""
+        table = 4 * self._most_rows * (17 + self.width("sh_rest"))
+        longest = max((entry.section.length for entry in self._entries), default=0)
+        each = ChunkKernel.bytes_of(self._most_rows, self.sh_degree) + 3 * table + longest + (1 << 14)
+        model = sum(tables.slots.nbytes + tables.entries.nbytes for tables in self._model.tables)
+        return model + table + chunks * each + (1 << 16)
+
+    @property
+    def _most_rows(self) -> int:
+        return max((chunk.stop - chunk.start for chunk in self._chunks), default=0)
+
     @contextmanager
     def whole_in_order(self, threads: int) -> Iterator[None]:
         """While this lasts, all fields of all rows are read from the first to the last: chunks are decoded ahead.
@@ -108,16 +161,19 @@ class GridSource(SceneSource):
         Parameters
         ----------
         threads : int
-            As many chunks are held beside the one that is read; 1: none.
+            As many chunks are held beside the one that is read; 1: none. A device decodes as many ahead as it does at once.
         """
-        if threads > 1:
+        if self._kernel is not None:
+            self._tables = in_order(self._tables_of, self._groups(), 1, always=True)
+        elif threads > 1:
             self._coming = in_order(lambda i: (i, self._decode(i, False)), range(len(self._chunks)), threads)
         try:
             yield
         finally:
-            if self._coming is not None:
-                self._coming.close()
-                self._coming = None
+            for coming in (self._coming, self._tables):
+                if coming is not None:
+                    coming.close()
+            self._coming = self._tables = None
 
     def _part(self, chunk: int, base_only: bool) -> GridScene:
         if self._coming is not None and (self._last is None or self._last[0] != chunk):
@@ -131,7 +187,44 @@ class GridSource(SceneSource):
             self._last = (chunk, base_only, self._decode(chunk, base_only))
         return self._last[2]
 
+    def _groups(self) -> list[range]:
+        """Chunks that the device decodes at once."""
+        assert self._kernel is not None
+        count, size = len(self._chunks), self._kernel.chunks
+        return [range(start, min(start + size, count)) for start in range(0, count, size)]
+
+    def _of(self, group: Sequence[int]) -> list[tuple[Chunk, ChunkEntry]]:
+        return [(self._chunks[i], self._entries[i]) for i in group]
+
+    def _decode_group(self, group: Sequence[int], base_only: bool) -> list[GridScene]:
+        kernel = self._kernel
+        assert kernel is not None
+        codes = self.container.decode_on(lambda jobs: kernel.codes(jobs, base_only), self._of(group))
+        return [self._scene(self._chunks[i], part) for i, part in zip(group, codes, strict=True)]
+
+    def _tables_of(self, group: Sequence[int]) -> list[tuple[int, np.ndarray]]:
+        kernel, header = self._kernel, self.container.header
+        assert kernel is not None
+        steps = RowSteps(header.low, header.grid_steps)
+        tables = self.container.decode_on(lambda jobs: kernel.tables(jobs, steps), self._of(group))
+        return list(zip(group, tables, strict=True))
+
+    def _table(self, chunk: int) -> np.ndarray:
+        if chunk not in self._ready:
+            # Kept no longer than it takes: the next ones are in work.
+            self._ready.clear()
+            while self._tables is not None and chunk not in self._ready:
+                coming = next(self._tables, None)
+                if coming is None:
+                    break
+                self._ready = dict(coming)
+            if chunk not in self._ready:
+                self._ready = dict(self._tables_of([chunk]))
+        return self._ready[chunk]
+
     def _decode(self, index: int, base_only: bool) -> GridScene:
+        if self._kernel is not None:
+            return self._decode_group([index], base_only)[0]
         chunk = self._chunks[index]
         codes = self.container.decode(self._model, chunk, self._entries[index], base_only)
         return self._scene(chunk, codes)
@@ -145,7 +238,7 @@ class GridSource(SceneSource):
             self.sh_degree,
             self.origin,
             header.grid_steps,
-            np.clip(unmorton(codes.cells) + low, -CODE_LIMIT, CODE_LIMIT),
+            np.clip(codes.position + low, -CODE_LIMIT, CODE_LIMIT),
             np.stack([values[f"scale {axis}"] for axis in "xyz"]),
             np.stack([values[f"rotation {axis}"] for axis in "xyz"]),
             values["opacity"],

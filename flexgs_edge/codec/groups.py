@@ -86,6 +86,11 @@ class Group:
         means = 2 if self.kind.residual else len(self.cuts[0]) + 1
         return means * (len(self.cuts[1]) + 1)
 
+    @property
+    def start(self) -> int:
+        """What is added to every symbol: the code of symbol 0, and in groups of residuals the centre."""
+        return self.centre * self.kind.residual + self.low
+
     def known(self, terms: Sequence[Term], count: int, before: Sums | None = None) -> Sums:
         """The part of the prediction of `count` rows that features known for all of them make, added to a part before."""
         weights = self.weights.astype(np.float64)
@@ -107,7 +112,7 @@ class Group:
         # A threshold that float32 rounds lies beyond every sum that it holds.
         spread = _bucket(error, [1024.0 * cut for cut in self.cuts[1].tolist()])
         levels = np.uint8(len(self.cuts[1]) + 1)
-        start = float(self.centre * self.kind.residual + self.low)
+        start = float(self.start)
         if not self.kind.residual:
             place = _bucket(mean, [4096.0 * cut for cut in self.cuts[0].tolist()])
             place *= levels

@@ -6,12 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from flexgs_edge.constants import CHILD_CLASSES, LEVEL_CLASSES
 from flexgs_edge.grid import POSITION_BITS, morton
 
-LEVEL_CLASSES = 6
-"""Levels by their distance from the cells; all coarser ones count as the last: they have few nodes."""
-CHILD_CLASSES = 5
-"""By how many children the parent has: none (the root), 1, 2, 3, more."""
 CONTEXTS = LEVEL_CLASSES * CHILD_CLASSES
 
 _CHILDREN = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)

@@ -11,12 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-PRECISION = 14
-TOTAL = 1 << PRECISION
-"""Frequencies of a table add up to this."""
-FLOOR = 1 << 16
-"""Smallest state between symbols, and the first state of every lane."""
-LANES_MOST = 512
+from flexgs_edge.constants import RANS_FLOOR as FLOOR
+from flexgs_edge.constants import RANS_LANES as LANES_MOST
+from flexgs_edge.constants import RANS_PRECISION as PRECISION
+from flexgs_edge.constants import RANS_TOTAL as TOTAL
 
 _LOW, _SHIFT, _WORD = np.uint32(TOTAL - 1), np.uint32(PRECISION), np.uint32(16)
 _FLOOR = np.uint32(FLOOR)
@@ -103,6 +101,11 @@ class Encoder:
             raise AssertionError("a symbol without a frequency")
         self._batches.append(entries)
 
+    @property
+    def batches(self) -> list[np.ndarray]:
+        """Frequency and start of every symbol of the batches so far ([m] u32 each)."""
+        return self._batches
+
     def finish(self) -> bytes:
         """The stream: the states of all lanes as u32, then words as u16."""
         # Doubles hold states exactly, and their division is a vector instruction: a state and a frequency differ too
@@ -135,6 +138,16 @@ class Encoder:
         return np.concatenate(words[::-1]).tobytes()
 
 
+def first_states(data: bytes, lanes: int) -> np.ndarray:
+    """[lanes] u32 states at the head of a stream, checked."""
+    if len(data) < 4 * lanes or len(data) % 2:
+        raise StreamError(f"stream: wanted an even number of at least {4 * lanes} bytes, got {len(data)}")
+    states = np.frombuffer(data, "<u4", lanes).astype(np.uint32)
+    if (states < FLOOR).any():
+        raise StreamError("stream: wanted states of at least 65536")
+    return states
+
+
 class Decoder:
     """Reads what `Encoder` wrote, batch by batch.
 
@@ -147,11 +160,9 @@ class Decoder:
     """
 
     def __init__(self, data: bytes, lanes: int) -> None:
-        if len(data) < 4 * lanes or len(data) % 2:
-            raise StreamError(f"stream: wanted an even number of at least {4 * lanes} bytes, got {len(data)}")
+        self._states = first_states(data, lanes)
         words = np.frombuffer(data, "<u2")
         self.lanes = lanes
-        self._states = words[: 2 * lanes].view("<u4").astype(np.uint32)
         self._words = words.astype(np.uint32)
         self._at = 2 * lanes
         # Constants as arrays: NumPy takes half a microsecond to make one of a number, as long as to go through 512 of them.
@@ -168,8 +179,6 @@ class Decoder:
             np.full(lanes, _SHIFT),
             np.full(lanes, _FLOOR),
         )
-        if (self._states < FLOOR).any():
-            raise StreamError("stream: wanted states of at least 65536")
 
     def get(self, tables: Tables, rows: np.ndarray) -> np.ndarray:
         """[m] symbols of the next batch (u8 or u16), each coded by row `rows` [m] of `tables`."""

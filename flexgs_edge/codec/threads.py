@@ -24,12 +24,14 @@ def thread_count(chunks: int) -> int:
     return max(min(THREADS_MOST, processors, chunks), 1)
 
 
-def in_order(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Generator[Result, None, None]:
+def in_order(
+    work: Callable[[Item], Result], items: Iterable[Item], threads: int, always: bool = False
+) -> Generator[Result, None, None]:
     """`work` of every item, in order; at most `threads` of them are in work or finished before they are asked for.
 
-    With one thread no other one is started.
+    With one thread no other one is started, unless `always` asks for it.
     """
-    if threads <= 1:
+    if threads <= 1 and not always:
         yield from map(work, items)
         return
     with ThreadPoolExecutor(threads) as pool:

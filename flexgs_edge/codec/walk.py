@@ -74,6 +74,13 @@ class ChunkCodes:
     cells: np.ndarray  # [r] u64, Morton index of every row's cell
     base: dict[str, np.ndarray]  # each [r]
     sh: tuple[np.ndarray, ...]
+    coordinates: np.ndarray | None = None
+    """[3, r] i32 of the cells, where a decoder made them on its way."""
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3, r] i32: coordinates of the rows' cells."""
+        return unmorton(self.cells) if self.coordinates is None else self.coordinates
 
 
 class Port(Protocol):
@@ -122,7 +129,7 @@ def walk_chunk(
     ChunkCodes
         The codes; without SH if `base_only`.
     """
-    cells = _walk_positions(rows, depth, port, codes)
+    cells = walk_positions(rows, depth, port, codes)
     position = unmorton(cells)
     plan = plan_passes(position, REACH[0], port.stride)
     features = Features(3 * len(_SOURCES), rows)
@@ -181,7 +188,7 @@ def _walk_channel(
     return result, values
 
 
-def _walk_positions(rows: int, depth: int, port: Port, codes: ChunkCodes | None) -> np.ndarray:
+def walk_positions(rows: int, depth: int, port: Port, codes: ChunkCodes | None) -> np.ndarray:
     """[r] u64 cells of all rows: the octree, then how often each cell is taken again."""
     if codes is None:
         unique = walk_octree(depth, rows, port.occupancy)

@@ -60,6 +60,14 @@ KERNELS: dict[str, KernelSpec] = {
 }
 """Every kernel by the name that `Backend.launch` and the twins share."""
 
+CODEC_KERNELS: dict[str, KernelSpec] = {
+    "decode_chunks": KernelSpec("decode_chunks.cl", "uuuuuu" + 12 * "b"),
+    "count_chunks": KernelSpec("decode_chunks.cl", "uuuuuuu" + 13 * "b"),
+    "encode_chunks": KernelSpec("encode_chunks.cl", "uubbbbbb"),
+    "grid_rows": KernelSpec("grid_rows.cl", "uuuuuiiibbbb"),
+}
+"""Kernels that a codec launches; what they do in NumPy is the codec's own code, not a twin."""
+
 
 class Array(Protocol):
     """An array in the backend's memory."""
@@ -76,6 +84,8 @@ class Backend(Protocol):
 
     name: str
     is_numpy: bool
+    threads: int
+    """Work-items that run side by side as threads of a processor do, with double precision; 0 where none do."""
     sort_blocks: int
     tile_blocks: int
     startup_seconds: float
@@ -130,6 +140,7 @@ class TwinBackend:
 
     name = "numpy"
     is_numpy = True
+    threads = 0
     sort_blocks = 4
     tile_blocks = 4
 

@@ -13,7 +13,7 @@ from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.device.select import DeviceInfo
 from flexgs_edge.device.session import DeviceArray, Session
 from flexgs_edge.errors import DeviceError
-from flexgs_edge.kernels.backend import KERNELS
+from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS
 from flexgs_edge.kernels.source import load_source
 
 GPU_GROUP = 64
@@ -52,6 +52,9 @@ class OpenCLBackend:
         self._simulated = "oclgrind" in info.platform.lower()
         # Blocks of the serial passes: enough to keep every unit busy to the end, few enough for short scans.
         self.sort_blocks = self.tile_blocks = max(8 * info.compute_units, 16) if self.form == "cpu" else 64
+        # The codec's kernels take doubles, and put two numbers into one of twice their width.
+        able = info.handle is not None and info.handle.double_fp_config != 0 and info.handle.endian_little
+        self.threads = info.compute_units if self.form == "cpu" and able else 0
         self._kernels: dict[str, cl.Kernel] = {}
         self.startup_seconds = time.perf_counter() - start
 
@@ -91,7 +94,7 @@ class OpenCLBackend:
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
         """Enqueue the kernel `name` over `size` rows, items or tiles."""
-        spec = KERNELS[name]
+        spec = KERNELS.get(name) or CODEC_KERNELS[name]
         if name not in self._kernels:
             options = [f"-DW={self.width}"] + ([f"-DSTATS={spec.stats}"] if spec.stats is not None else [])
             if self._simulated:

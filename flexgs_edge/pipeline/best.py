@@ -20,11 +20,12 @@ from flexgs_edge.cameras.order import farthest_order
 from flexgs_edge.codec.container2 import coded_parts
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.grid import GridScene
+from flexgs_edge.kernels import Backend
 from flexgs_edge.pipeline.foreign import FileMaker, WrittenFile, search_pruned_files
 from flexgs_edge.pipeline.foreign_best import FileSearch
 from flexgs_edge.pipeline.judge import Judge, measurement_of
 from flexgs_edge.pipeline.options import CompressOptions
-from flexgs_edge.pipeline.workspace import Stopwatch
+from flexgs_edge.pipeline.workspace import Stopwatch, coding_device
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice
 from flexgs_edge.render import Renderer
@@ -54,11 +55,14 @@ Report = Callable[[RateStep], None]
 SearchMaker = Callable[[PrunePath, Measure, Report], MultiplierSearch[Product]]
 
 
-def grid_search(options: CompressOptions, search: type[RateSearch] = RateSearch) -> SearchMaker[GridScene]:
-    """Searches for the grid of a `.fgs`."""
+def grid_search(
+    options: CompressOptions, search: type[RateSearch] = RateSearch, renderer: Renderer | None = None
+) -> SearchMaker[GridScene]:
+    """Searches for the grid of a `.fgs`; the renderer's device codes where it can."""
 
     def size_of(grid: GridScene) -> tuple[int, BitModel]:
-        size, bits = size_and_bits(grid)
+        device = None if renderer is None else coding_device(renderer.backend, renderer.budget, grid)
+        size, bits = size_and_bits(grid, device)
         return (size if options.layers == 1 else round(LAYERS_COST * size)), bits
 
     plan = EFFORTS[options.effort]
@@ -218,7 +222,14 @@ def layered(
 ) -> GridScene:
     """The grid in as many layers as asked for."""
     poses = scored_poses(cameras, options)
-    return assign_layers(grid, options.layers, size_and_bits(grid)[1], renderer, poses, progress)
+    return assign_layers(
+        grid,
+        options.layers,
+        size_and_bits(grid, coding_device(renderer.backend, renderer.budget, grid))[1],
+        renderer,
+        poses,
+        progress,
+    )
 
 
 def row_bytes(sh_degree: int, keep: float) -> int:
@@ -238,12 +249,12 @@ def alive(logits: np.ndarray) -> np.ndarray:
     return logits >= np.float32(-np.log(1 / ALPHA_MIN - 1) - 1e-3)
 
 
-def size_and_bits(grid: GridScene) -> tuple[int, BitModel]:
+def size_and_bits(grid: GridScene, device: Backend | None = None) -> tuple[int, BitModel]:
     """Exact bytes of a grid's file, and what its Gaussians cost.
 
     The bytes of the SH are shared among their coefficients; the rest among the rows.
     """
-    size, sh = coded_parts(grid, {})
+    size, sh = coded_parts(grid, {}, device=device)
     size += SETTINGS_MOST
     base = size - sh
     rows = [int(np.count_nonzero(grid.sh_degrees >= level)) for level in range(1, grid.sh_degree + 1)]

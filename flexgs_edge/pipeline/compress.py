@@ -30,7 +30,7 @@ from flexgs_edge.pipeline.outputs import check_outputs, temporary_name
 from flexgs_edge.pipeline.plan import Plan, make_settings
 from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.pipeline.report import Reporter
-from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, run_info
+from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, coding_device, run_info
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice, nonzero_sh, order_from_scores
 from flexgs_edge.quantize import QuantizedScene
@@ -194,7 +194,7 @@ class _Job:
             return self._run_files(self.format, output, None, decide, report)
         LOG.info("searching for %s", plan.target.describe())
         grid, search = search_best(
-            grid_search(options),
+            grid_search(options, renderer=renderer),
             renderer,
             self.source,
             self.views.of(self.views.train),
@@ -212,17 +212,18 @@ class _Job:
             with self.clock.stage("layers"):
                 grid = layered(grid, renderer, self.views.of(self.views.train), options, self.progress)
         settings = make_settings(options, plan, self.scene, self.views, search, None)
+        device = coding_device(self.workspace.backend, self.budget, grid)
         if output is None:
             if self.reporter is not None:
-                self.reporter.read_contents_of(lambda place: write_grid(place, grid, settings))
+                self.reporter.read_contents_of(lambda place: write_grid(place, grid, settings, device=device))
             size, quality = (
-                coded_size(grid, settings),
+                coded_size(grid, settings, device=device),
                 self._measure_source(MemorySource(from_grid(grid), origin=grid.origin), report),
             )
         else:
             with temporary_name(output, options.force) as place:
                 with self.clock.stage("write"):
-                    size = write_grid(place, grid, settings)
+                    size = write_grid(place, grid, settings, device=device)
                 if search.reached and plan.target.limit_bytes is not None and size > plan.target.limit_bytes:
                     raise TargetError(
                         f"{plan.target.describe()}: {options.layers} layers make the file {size} bytes; ask for fewer layers"
@@ -390,7 +391,7 @@ class _Job:
             scores_saved=options.save_scores,
             score_cache=options.score_cache if plan.computes_scores else None,
             scores_reused=self.scores_reused,
-            run=run_info(self.budget, self.clock, self.workspace),
+            run=run_info(self.budget, self.clock, self.workspace.backend if self.workspace else None),
             format=self.format.suffix[1:] if self.format else "fgs",
             file_sh_degree=scene.sh_degree,
         )

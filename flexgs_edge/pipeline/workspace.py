@@ -8,11 +8,16 @@ from contextlib import contextmanager
 from types import TracebackType
 
 from flexgs_edge.budget import MemoryBudget, current_rss, peak_rss
-from flexgs_edge.kernels import open_backend
+from flexgs_edge.codec.coder import CHUNK_ROWS
+from flexgs_edge.codec.encode_kernels import device_bytes
+from flexgs_edge.grid import GridScene
+from flexgs_edge.kernels import Backend, open_backend
 from flexgs_edge.pipeline.options import ViewOptions
 from flexgs_edge.render import Renderer
 from flexgs_edge.report.result import RunInfo
 
+DEVICE_ROWS = 200_000
+"""Scenes of fewer Gaussians are coded and decoded before the kernels for it are built."""
 BUILD_BYTES = 24 * 2**20
 """What building our kernels adds to the loaded compiler (measured with PoCL, nothing cached: 19 MiB)."""
 
@@ -61,12 +66,7 @@ class Workspace:
         assert options.extent is not None and options.antialiased is not None
         self.budget = budget
         self.clock = clock
-        before = current_rss()
-        with clock.stage("device"):
-            self.backend = open_backend(options.device, budget)
-        if not self.backend.is_numpy:
-            # The runtime and its compiler stay loaded: 80 MiB for PoCL with its kernels cached, 210 MiB without.
-            budget.take("the OpenCL runtime", max(current_rss() - before, 0) + BUILD_BYTES)
+        self.backend = counted_backend(options.device, budget, clock)
         self.renderer = Renderer(
             self.backend, budget, options.near, options.background, options.extent, options.antialiased
         )
@@ -82,12 +82,29 @@ class Workspace:
 
     def run_info(self) -> RunInfo:
         """What this run took and ran on (never stored in files)."""
-        return run_info(self.budget, self.clock, self)
+        return run_info(self.budget, self.clock, self.backend)
 
 
-def run_info(budget: MemoryBudget, clock: Stopwatch, workspace: Workspace | None = None) -> RunInfo:
+def counted_backend(device: str | None, budget: MemoryBudget, clock: Stopwatch) -> Backend:
+    """The backend that `device` names (stage `device`), and what its runtime holds taken from the budget."""
+    before = current_rss()
+    with clock.stage("device"):
+        backend = open_backend(device, budget)
+    if not backend.is_numpy:
+        # The runtime and its compiler stay loaded: 80 MiB for PoCL with its kernels cached, 210 MiB without.
+        budget.take("the OpenCL runtime", max(current_rss() - before, 0) + BUILD_BYTES)
+    return backend
+
+
+def coding_device(backend: Backend | None, budget: MemoryBudget, grid: GridScene) -> Backend | None:
+    """The backend, where it codes large scenes well and memory has room for its work; None: NumPy does, with the same bytes."""
+    if backend is None or not backend.threads or grid.count < DEVICE_ROWS:
+        return None
+    return backend if backend.threads * device_bytes(CHUNK_ROWS, grid.sh_degree) <= budget.free else None
+
+
+def run_info(budget: MemoryBudget, clock: Stopwatch, backend: Backend | None = None) -> RunInfo:
     """Seconds, memory and device of a run."""
-    backend = workspace.backend if workspace else None
     return RunInfo(
         seconds=clock.total,
         stages=dict(clock.stages),

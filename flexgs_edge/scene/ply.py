@@ -24,8 +24,6 @@ _BLOCK_ROWS = 4096
 """Rows read at a time: 1 MB at SH degree 3, so that the gather runs in the cache."""
 _SPAN = 4
 """A list of rows is read as one span of the file while the span has at most this many rows a row asked for."""
-_TURN_ROWS = 1024
-"""Rows written from planes at a time: 250 kB at SH degree 3; columns of a whole chunk would leave the cache each time."""
 _ORIGIN_ROWS = 65536
 _ORIGIN_QUANTILES = (0.05, 0.95)
 _ORIGIN_FAR = 16.0
@@ -295,28 +293,21 @@ def write_ply(
     kinds = {"<f4": "float", "<f8": "double"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {source.count}"]
     lines += [f"property {kinds[dtype[name].str]} {name}" for name in dtype.names or ()]
-    fields = [field.name for field in FIELDS]
     with atomic_write(path, force) as file:
         file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
-        block = np.zeros(min(source.count, chunk_rows), dtype)
-        # Everything but the positions: one table of floats.
-        start = 3 * dtype["x"].itemsize
-        floats = block.view(np.uint8).reshape(len(block), dtype.itemsize)[:, start:].view("<f4")
+        table = np.zeros((min(source.count, chunk_rows), len(lines) - 3), np.float32)
+        block = np.zeros(len(table), dtype) if wide else None
         for rows in source.chunks(chunk_rows):
-            planes = source.read(rows, fields)
-            part = block[: rows.stop - rows.start]
-            for axis, name in enumerate(FIELD["means"].ply):
-                part[name] = planes["means"][axis]
-                if wide:
-                    part[name] += source.origin[axis]
-            for at in range(0, len(part), _TURN_ROWS):
-                end, column = min(at + _TURN_ROWS, len(part)), 3  # behind the normals
-                for field in FIELDS:
-                    if field.name != "means":
-                        plane = planes[field.name][:, at:end]
-                        floats[at:end, column : column + len(plane)] = plane.T
-                        column += len(plane)
-            file.write(part.view(np.uint8).data)
+            part = source.read_table(rows, table)
+            if block is not None:
+                # Everything but the positions: one table of floats.
+                whole = block[: len(part)]
+                whole.view(np.uint8).reshape(len(part), -1)[:, 3 * dtype["x"].itemsize :].view("<f4")[:] = part[:, 3:]
+                for axis, name in enumerate(FIELD["means"].ply):
+                    whole[name] = part[:, axis] + source.origin[axis]
+                file.write(whole.view(np.uint8).data)
+            else:
+                file.write(part.astype("<f4", copy=False).data)
     where = ", ".join(f"{value:g}" for value in source.origin)
     return (f"positions written as double: the scene is far from zero (origin {where})",) if wide else ()
 

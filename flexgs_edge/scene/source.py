@@ -17,6 +17,9 @@ Planes = dict[str, np.ndarray]
 Rows = slice | np.ndarray
 """`slice(start, stop)` or a sorted int64 array."""
 
+_TURN_ROWS = 1024
+"""Rows turned from planes at a time: 250 kB at SH degree 3; columns of a whole chunk would leave the cache each time."""
+
 REST_WIDTHS: dict[int, int] = {3 * sh_rest_count(degree): degree for degree in range(MAX_SH_DEGREE + 1)}
 """SH degree by the number of `sh_rest` channels: 0, 9, 24, 45, 72."""
 
@@ -75,6 +78,31 @@ class SceneSource(ABC):
         ValueError
             When a field is unknown or an array of `out` does not fit.
         """
+
+    def read_table(self, rows: slice, out: np.ndarray) -> np.ndarray:
+        """Read all fields of some rows as INRIA's PLY has them, row by row.
+
+        Parameters
+        ----------
+        rows : slice
+            `slice(start, stop)` without a step.
+        out : np.ndarray
+            [at least n, columns] f32 of zeros in columns 3 to 5: may be filled.
+
+        Returns
+        -------
+        np.ndarray
+            [n, columns] f32, C-contiguous, valid until the next call: means, three zeros (normals), the other fields in the
+            order of `FIELDS`. The first rows of `out`, or an array that the source has at hand.
+        """
+        planes = self.read(rows, [field.name for field in FIELDS])
+        part = out[: rows.stop - rows.start]
+        for at in range(0, len(part), _TURN_ROWS):
+            end, column = min(at + _TURN_ROWS, len(part)), 0
+            for name, values in planes.items():
+                part[at:end, column : column + len(values)] = values[:, at:end].T
+                column += len(values) + (3 if name == "means" else 0)
+        return part
 
     def width(self, field: str) -> int:
         """Channels of `field` in this scene."""

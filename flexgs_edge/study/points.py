@@ -170,7 +170,7 @@ def best_points(
     ) as path:
         for ratio in sorted(ratios):
             target = _target(bench, ratio)
-            make = grid_search(options, variant.search)
+            make = grid_search(options, variant.search, workspace.renderer)
             with workspace.clock.stage("search"):
                 grid, search = search_path(make, path, workspace.renderer, source, bench.judge, target, options)
             seconds = time.perf_counter() - started
