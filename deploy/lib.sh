@@ -5,6 +5,7 @@ ROOT=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 VENV=${FLEXGS_VENV:-$ROOT/.venv}
 # shellcheck disable=SC2034
 NO_DEVICE=4 # exit code of `flexgs-edge devices`, and of setup.sh, when no OpenCL device passes the self-test
+FAILED=1 # exit code of die; a script that passes other programs' codes on takes another
 
 say() { printf '==> %s\n' "$*"; }
 
@@ -12,7 +13,7 @@ die() {
   printf 'error: %s\n' "$1" >&2
   shift
   if [ $# -gt 0 ]; then printf '       %s\n' "$@" >&2; fi
-  exit 1
+  exit "$FAILED"
 }
 
 # Sets AS_ROOT to the words that run a command as root; fails where that would need a password.
