@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from flexgs_edge.pipeline.options import CompressOptions, ViewOptions
     from flexgs_edge.pipeline.render import render_views
     from flexgs_edge.pipeline.score import score_gaussians
+    from flexgs_edge.pipeline.synth import synth
     from flexgs_edge.pipeline.trim import trim
     from flexgs_edge.pipeline.worth import worth
     from flexgs_edge.progress import Progress
@@ -44,6 +45,7 @@ _HOMES = {
     "info": "pipeline.info",
     "verify": "pipeline.info",
     "trim": "pipeline.trim",
+    "synth": "pipeline.synth",
     "worth": "pipeline.worth",
     "list_devices": "device.select",
     "read_scene": "pipeline.inputs",
@@ -73,6 +75,7 @@ __all__ = [
     "info",
     "verify",
     "trim",
+    "synth",
     "worth",
     "list_devices",
     "read_scene",

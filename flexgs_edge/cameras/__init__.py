@@ -7,7 +7,7 @@ from pathlib import Path
 
 from flexgs_edge.cameras.camera import Camera, limit_width, split_views
 from flexgs_edge.cameras.colmap import find_model, read_colmap
-from flexgs_edge.cameras.inria import cameras_of_list, read_inria
+from flexgs_edge.cameras.inria import cameras_of_list, inria_json, read_inria
 from flexgs_edge.cameras.json_values import load_json
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.transforms import cameras_of_frames, read_transforms
@@ -22,6 +22,7 @@ __all__ = [
     "Camera",
     "Photos",
     "find_cameras",
+    "inria_json",
     "limit_width",
     "read_cameras",
     "read_colmap",

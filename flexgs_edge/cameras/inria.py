@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,24 @@ def cameras_of_list(path: Path, entries: Any) -> list[Camera]:
     cameras = [_camera(Entry(f"{path}: camera {index}", entry)) for index, entry in enumerate(entries)]
     check_names(path, [camera.name for camera in cameras], "cameras", "img_name")
     return cameras
+
+
+def inria_json(cameras: Sequence[Camera]) -> str:
+    """The text of INRIA's cameras.json, a camera a line; principal points and distortion have no place in it."""
+    entries = [
+        {
+            "id": number,
+            "img_name": camera.name,
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.center.tolist(),
+            "rotation": camera.rotation.T.tolist(),
+            "fy": camera.fy,
+            "fx": camera.fx,
+        }
+        for number, camera in enumerate(cameras)
+    ]
+    return "[\n" + ",\n".join(json.dumps(entry) for entry in entries) + "\n]\n"
 
 
 def _camera(entry: Entry) -> Camera:

@@ -26,6 +26,7 @@ COMMANDS = {
     "evaluate": "Measure what a scene lost against another: PSNR, SSIM, fidelity and drop of every view.",
     "score": "Save the importance of every Gaussian, for --method paper: other targets then need no scoring.",
     "study": "Make the experiments of a paper on scenes of your own: tables, charts and one page.",
+    "synth": "Make a big scene from a small one, to test memory and time with.",
     "devices": "List the OpenCL devices, whether they work, and which one is used.",
 }
 """Subcommands and their line in the overview: spelled out here so that `--help` loads none of them."""
