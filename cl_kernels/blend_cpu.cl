@@ -38,7 +38,16 @@ inline int any_alive(FW t) {
 
 #if STATS
 #define SUMS (STATS == 1 ? 1 : STATS == 2 ? 2 : STATS == 3 ? 4 : 6)
-#define ADD_SUM(k, v, scale) add_fixed(sums + (size_t)pair.x * (2 * SUMS) + 2 * (k), tree_sum(v), scale)
+#if defined(cl_khr_int64_base_atomics) && defined(__ENDIAN_LITTLE__)
+#pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
+// The same words in one step: sums below zero take two with 32 bits.
+inline void add_sum(__global uint *words, float value, float scale) {
+  atom_add((volatile __global long *)words, (long)clamp(value * scale, -FIXED_LARGEST, FIXED_LARGEST));
+}
+#else
+#define add_sum add_fixed
+#endif
+#define ADD_SUM(k, v, scale) add_sum(sums + (size_t)pair.x * (2 * SUMS) + 2 * (k), tree_sum(v), scale)
 
 // The fixed pairwise tree over the 16 lanes of a block: l + (l + 8), then + 4, + 2, + 1.
 #if W == 16
