@@ -28,6 +28,7 @@ from flexgs_edge.pipeline.best import grid_search
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.progress import Progress
+from flexgs_edge.render import Renderer
 from flexgs_edge.scene import write_ply
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.ply import PlySource
@@ -160,8 +161,8 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
     searches: list[RateSearch] = []
     steps: list[RateStep] = []
 
-    def recording(options: CompressOptions) -> Any:
-        make = grid_search(options)
+    def recording(options: CompressOptions, renderer: Renderer) -> Any:
+        make = grid_search(options, renderer=renderer)
 
         def recorded(path: Any, measure: Any, report: Any) -> Any:
             search = make(path, measure, lambda step: (steps.append(step), report(step)))  # type: ignore[func-returns-value]
