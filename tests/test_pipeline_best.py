@@ -153,7 +153,7 @@ def test_fidelity_and_modelled_drop_decide_without_photos(project: Path, tmp_pat
 def test_the_refit_pays(project: Path, tmp_path: Path, size: int) -> None:
     """The same size target with and without: the refitted file is closer to the original's renders.
 
-    Not between these sizes: there the loss of so few Gaussians falls by two thirds within 2 kB, and where a search stops says more.
+    Not between these sizes: there the loss of so few Gaussians falls by two thirds within 2 kB, and where a search stops decides.
     """
     words = {**TINY, "images": "none", "max_size": size}
     with_refit = compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
