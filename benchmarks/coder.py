@@ -95,7 +95,7 @@ def base_payload(scene_path: Path, output: Path, steps: Steps, device: str | Non
     try:
         with renderer.load(source) as original:
             judge.prepare(original, progress)
-            targets = TargetViews(renderer, original, cameras, progress=progress)
+            targets = TargetViews.of(renderer, original, cameras, progress=progress)
         planes = source.read(slice(0, source.count), list(FIELD))
         grid, order = to_grid(planes, np.zeros(source.count, np.uint8), steps, source.origin)
         exact = {"sh_rest": np.ascontiguousarray(planes["sh_rest"][:, order])}
@@ -128,7 +128,8 @@ def main() -> None:
     if options.file is not None:
         report(bench, options.file, options.file.name)
         return
-    steps = Steps(*options.steps, chroma=CHROMA)
+    kinds = ("position", "scale", "rotation", "opacity", "dc")
+    steps = Steps(**dict(zip(kinds, options.steps, strict=True)), sh=(), chroma=CHROMA)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "base.fgs"
         quality = base_payload(SCENES[options.scene] / "point_cloud.ply", path, steps, options.device, Progress())

@@ -165,7 +165,11 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
         make = grid_search(options, renderer=renderer)
 
         def recorded(path: Any, measure: Any, report: Any) -> Any:
-            search = make(path, measure, lambda step: (steps.append(step), report(step)))  # type: ignore[func-returns-value]
+            def noted(step: RateStep) -> None:
+                steps.append(step)
+                report(step)
+
+            search = make(path, measure, noted)
             assert isinstance(search, RateSearch)
             searches.append(search)
             return search

@@ -32,7 +32,7 @@ def main() -> None:
     bench = Bench(backend.name, options.repeats)
     path = SCENES[options.scene] / "point_cloud.ply"
     scene, companions = load_scene(path), find_companions(path)
-    views = find_views(resolve_drawing(ViewOptions(), scene, companions), companions)
+    views = find_views(resolve_drawing(ViewOptions(), scene, companions), companions, scene.source)
     assert views is not None
     renderer = Renderer(backend, budget)
     judge = Judge(renderer, scene.source, views, views.held_out, budget)

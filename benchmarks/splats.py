@@ -42,8 +42,8 @@ def random_splats(count: int = COUNT) -> MemorySource:
 def main() -> None:
     options = parse(__doc__, repeats=7)
     backend, budget = backend_of(options)
-    centre = {"cx": (WIDTH - 1) / 2, "cy": (HEIGHT - 1) / 2}
-    camera = Camera("random", WIDTH, HEIGHT, np.eye(3), np.zeros(3), FOCAL, FOCAL, **centre)
+    cx, cy = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
+    camera = Camera("random", WIDTH, HEIGHT, np.eye(3), np.zeros(3), FOCAL, FOCAL, cx, cy)
     renderer = Renderer(backend, budget)
     bench = Bench(backend.name, options.repeats)
     with renderer.load(random_splats()) as scene:
