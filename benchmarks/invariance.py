@@ -9,7 +9,6 @@ python -m benchmarks.invariance [SCENE] [--factor F] [--effort fast|balanced|tho
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ import numpy as np
 from benchmarks.harness import SCENES, Bench, check
 from flexgs_edge.best.search import RateSearch, RateStep
 from flexgs_edge.cameras import Camera, read_cameras
+from flexgs_edge.cameras.inria import inria_json
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.kernels.twins.project import sh_basis
 from flexgs_edge.pipeline.best import grid_search
@@ -128,19 +128,7 @@ def write_project(folder: Path, source: SceneSource, cameras: Sequence[Camera], 
     """A PLY with cameras.json and photos (linked) beside it."""
     folder.mkdir()
     write_ply(folder / "point_cloud.ply", source)
-    entries = [
-        {
-            "img_name": camera.name,
-            "width": camera.width,
-            "height": camera.height,
-            "position": camera.center.tolist(),
-            "rotation": camera.rotation.T.tolist(),
-            "fx": camera.fx,
-            "fy": camera.fy,
-        }
-        for camera in cameras
-    ]
-    (folder / "cameras.json").write_text(json.dumps(entries), encoding="utf-8")
+    (folder / "cameras.json").write_text(inria_json(cameras), encoding="utf-8")
     if images is not None:
         (folder / "images").symlink_to(images.resolve(), target_is_directory=True)
     return folder / "point_cloud.ply"

@@ -157,7 +157,7 @@ __kernel void blend(
   ends += (size_t)(blocks - 1) * get_global_size(0);
   const uint first = tile ? ends[tile - 1] : 0u, last = ends[tile];
   uint live = 0xFFFFu;
-  // Pixels of block columns and rows: worked out anew for each block they took a tenth of the blend.
+  // Pixels of block columns and rows, once a tile instead of once a splat and block.
 #if W == 1
   float x_of[TILE];
   for (int x = 0; x < TILE; ++x) x_of[x] = (float)(tile_px + x);

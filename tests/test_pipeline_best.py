@@ -149,17 +149,19 @@ def test_fidelity_and_modelled_drop_decide_without_photos(project: Path, tmp_pat
     assert trained.decision_views == "training" and trained.quality_views == "held-out"
 
 
-@pytest.mark.parametrize("size", [10_000, 18_000])
-def test_the_refit_pays(project: Path, tmp_path: Path, size: int) -> None:
-    """The same size target with and without: the refitted file is closer to the original's renders.
+def test_the_refit_pays(project: Path, tmp_path: Path) -> None:
+    """With it most files of a size are closer to the original's renders.
 
-    Not between these sizes: there the loss of so few Gaussians falls by two thirds within 2 kB, and where a search stops decides.
+    Not all: where the loss falls by two thirds within 2 kB, where a search stops decides (here at 14 kB).
     """
-    words = {**TINY, "images": "none", "max_size": size}
-    with_refit = compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
-    without = compress(project / "point_cloud.ply", tmp_path / "b.fgs", refit=False, **words)
-    assert with_refit.quality is not None and without.quality is not None
-    assert with_refit.quality.modelled_drop < without.quality.modelled_drop
+    better = []
+    for size in range(10_000, 20_000, 2_000):
+        words = {**TINY, "images": "none", "max_size": size}
+        with_refit = compress(project / "point_cloud.ply", tmp_path / "a.fgs", force=True, **words).quality
+        without = compress(project / "point_cloud.ply", tmp_path / "b.fgs", force=True, refit=False, **words).quality
+        assert with_refit is not None and without is not None
+        better.append(with_refit.modelled_drop < without.modelled_drop)
+    assert sum(better) >= 4
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.invariance import LEAST_SAME, Similarity, compare, turn_of_band
+from benchmarks.invariance import LEAST_SAME, MOST_BYTES, Similarity, compare, turn_of_band
 from flexgs_edge.best.steps import probe_slopes
 from flexgs_edge.cameras import read_cameras
 from flexgs_edge.constants import DEFAULT_NEAR
@@ -72,6 +72,5 @@ def test_moved_scenes_are_compressed_alike(tmp_path: Path) -> None:
     found, note = compare(project, tmp_path, FACTOR, **words)
     assert open_scene(tmp_path / "moved" / "point_cloud.ply").count == open_scene(project / "point_cloud.ply").count
     assert len(read_cameras(tmp_path / "moved" / "cameras.json")) == 9
-    assert found.choice >= LEAST_SAME, note
-    # `fast` ends anywhere within 8 % of the target's loss, and rounding moves the drop of some 300 Gaussians by as much.
-    assert found.same >= 0.95 and abs(found.bytes_ratio - 1) <= 0.06, note
+    # By 0.01, 7.3 and 10, where everything rounds otherwise: one Gaussian too, and 0.6 to 1.2 % of the bytes.
+    assert min(found.same, found.choice) >= LEAST_SAME and abs(found.bytes_ratio - 1) <= MOST_BYTES, note

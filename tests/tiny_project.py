@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from flexgs_edge.budget import MemoryBudget
-from flexgs_edge.cameras import Camera, read_cameras
+from flexgs_edge.cameras import read_cameras
+from flexgs_edge.cameras.inria import inria_json
 from flexgs_edge.kernels import open_backend
 from flexgs_edge.render import Renderer
 from flexgs_edge.scene import open_scene, write_ply
@@ -18,27 +18,13 @@ from synthetic import look_from, make_camera, random_scene
 COUNT, VIEWS, WIDTH, HEIGHT = 400, 9, 40, 30
 
 
-def camera_entry(index: int, camera: Camera) -> dict[str, object]:
-    """A camera as INRIA's cameras.json has it: camera to world."""
-    return {
-        "id": index,
-        "img_name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "position": camera.center.tolist(),
-        "rotation": camera.rotation.T.tolist(),
-        "fx": camera.fx,
-        "fy": camera.fy,
-    }
-
-
 def write_cameras(path: Path, views: int = VIEWS) -> Path:
     """`views` poses around the middle of `random_scene`."""
     cameras = []
     for index in range(views):
         rotation, translation = look_from(index)
         cameras.append(make_camera(WIDTH, HEIGHT, rotation=rotation, translation=translation, name=f"v{index:02}"))
-    path.write_text(json.dumps([camera_entry(index, camera) for index, camera in enumerate(cameras)]))
+    path.write_text(inria_json(cameras))
     return path
 
 

@@ -64,7 +64,7 @@ from flexgs_edge.cli import words
     default="best",
     show_default=True,
     help="best: measured removal costs, colour refit and an entropy coder. paper: FlexGaussian's, bit-packed without entropy "
-    "coding: some five times the bytes at the same drop, in a fraction of the seconds.",
+    "coding: four to six times the bytes at the same drop, in a fraction of the seconds.",
 )
 @words.option(
     "Method",
