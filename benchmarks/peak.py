@@ -40,15 +40,8 @@ __kernel void peak(const uint rounds, __global const float *records, __global fl
     for (int k = 0; k < {BLOCKS}; ++k) {{
       FW dx = xs[k] - mx, dy = y - my;
       FW alpha = splat_alpha(dx, dy, ca, cb, cc, level);
-      FW t = trans[k];
-      FW next = t * ((FW)1.0f - alpha);
-      IW seen = MASK(alpha >= (FW)ALPHA_MIN);
-      IW hit = seen & MASK(next >= (FW)TRANSMITTANCE_MIN);
-      FW weight = pick(hit, alpha * t, (FW)0.0f);
-      red[k] = fma(weight, cr, red[k]);
-      green[k] = fma(weight, cg, green[k]);
-      blue[k] = fma(weight, cbl, blue[k]);
-      trans[k] = pick(hit, next, pick(seen, -fabs(t), t));
+      FW weight;
+      blend_over(alpha, cr, cg, cbl, red + k, green + k, blue + k, trans + k, &weight);
     }}
   }}
   FW all = (FW)0.0f;

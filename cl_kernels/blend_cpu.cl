@@ -209,15 +209,8 @@ __kernel void blend(
         const int k = b * BLOCK_VECTORS + v;
         FW dx = X_OF(b, v) - mx, dy = y_of[(b >> 2) * BLOCK_VECTORS + v] - my;
         FW alpha = splat_alpha(dx, dy, ca, cb, cc, level);
-        FW t = trans[k];
-        FW next = t * ((FW)1.0f - alpha);
-        IW seen = MASK(alpha >= (FW)ALPHA_MIN);
-        IW hit = seen & MASK(next >= (FW)TRANSMITTANCE_MIN);
-        FW weight = pick(hit, alpha * t, (FW)0.0f);
-        red[k] = fma(weight, cr, red[k]);
-        green[k] = fma(weight, cg, green[k]);
-        blue[k] = fma(weight, cbl, blue[k]);
-        trans[k] = pick(hit, next, pick(seen, -fabs(t), t));
+        FW weight;
+        IW hit = blend_over(alpha, cr, cg, cbl, red + k, green + k, blue + k, trans + k, &weight);
 #if STATS
         hit_sum[v] += hit;
 #endif
