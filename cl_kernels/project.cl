@@ -2,7 +2,7 @@
 // Twin: flexgs_edge.kernels.twins.project
 
 // Camera, 32 floats (see sh.clh too): R row-major 0-8, t 9-11, fx fy cx cy 12-15, near 16, Jacobian clamp x lo hi, y lo hi 17-20,
-// position 21-23, width height 24-25.
+// position 21-23, width height 24-25, dilation 26.
 #define CAM(k) ((FW)camera[k])
 
 // One colour channel in direction (x, y, z); sh_rest holds the channel's coefficients above degree 0.
@@ -66,9 +66,9 @@ __kernel void project(
     a = dot3(g00, g01, g02, g00, g01, g02);
     b = dot3(g00, g01, g02, g10, g11, g12);
     c = dot3(g10, g11, g12, g10, g11, g12);
-    det = before + fma(a + c, (FW)DILATION, (FW)(DILATION * DILATION));
-    a += (FW)DILATION;
-    c += (FW)DILATION;
+    det = before + fma(a + c, CAM(26), CAM(26) * CAM(26));
+    a += CAM(26);
+    c += CAM(26);
     FW share = before / det;  // at most 1: the sum above rounds to `before` at the least
     shown &= MASK(share >= (FW)SHARE_MIN);
     level = fma((FW)0.5f, flog2(larger(share, (FW)SHARE_MIN)), level);
@@ -77,12 +77,12 @@ __kernel void project(
     FW v0 = dot3(cxx, cxy, cxz, t00, t01, t02);
     FW v1 = dot3(cxy, cyy, cyz, t00, t01, t02);
     FW v2 = dot3(cxz, cyz, czz, t00, t01, t02);
-    a = dot3(t00, t01, t02, v0, v1, v2) + (FW)DILATION;
+    a = dot3(t00, t01, t02, v0, v1, v2) + CAM(26);
     b = dot3(t10, t11, t12, v0, v1, v2);
     v0 = dot3(cxx, cxy, cxz, t10, t11, t12);
     v1 = dot3(cxy, cyy, cyz, t10, t11, t12);
     v2 = dot3(cxz, cyz, czz, t10, t11, t12);
-    c = dot3(t10, t11, t12, v0, v1, v2) + (FW)DILATION;
+    c = dot3(t10, t11, t12, v0, v1, v2) + CAM(26);
     // ac - b^2 with the rounding error of b^2 added back: plain float32 loses needles here.
     FW bb = b * b;
     det = fma(a, c, -bb) + fma(-b, b, bb);

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from flexgs_edge.errors import BudgetError, FlexGSError, FormatError, InputError
-from flexgs_edge.grid import morton
+from flexgs_edge.grid import near_rows
 from flexgs_edge.quantize import normalize_quats
 from flexgs_edge.scene import (
     FIELD,
@@ -249,11 +249,7 @@ def _check_reach(path: str | os.PathLike[str], source: SceneSource, format: Form
 def near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
     """[N] i64: rows along a Morton curve through the scene's box."""
     means = np.concatenate([source.read(rows, ["means"])["means"] for rows in source.chunks(chunk_rows)], axis=1)
-    # By rank along each axis: a few far rows do not squeeze the rest into one cell.
-    cells = np.empty(means.shape, np.int64)
-    for axis, line in enumerate(means):
-        cells[axis, np.argsort(line, kind="stable")] = np.arange(line.size) * 1024 // line.size
-    return np.argsort(morton(cells), kind="stable")
+    return near_rows(means)
 
 
 @cache

@@ -307,6 +307,15 @@ def morton(cells: np.ndarray) -> np.ndarray:
     return index
 
 
+def near_rows(means: np.ndarray) -> np.ndarray:
+    """[n] i64: rows of `means` ([3, n]) along a Morton curve, so that neighbours on it are near each other."""
+    # By rank along each axis: a few far rows do not squeeze the rest into one cell.
+    cells = np.empty(means.shape, np.int64)
+    for axis, line in enumerate(means):
+        cells[axis, np.argsort(line, kind="stable")] = np.arange(line.size) * 1024 // line.size
+    return np.argsort(morton(cells), kind="stable")
+
+
 def _spread(bits: np.ndarray) -> np.ndarray:
     """Two zero bits before every bit of a number of 21 bits."""
     for shift, mask in (

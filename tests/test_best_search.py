@@ -15,7 +15,7 @@ from flexgs_edge.adapt import MaxDrop, Measurement, MinFidelity, Target
 from flexgs_edge.adapt.targets import MaxSize
 from flexgs_edge.best import search as search_module
 from flexgs_edge.best.choice import BitModel
-from flexgs_edge.best.effort import EFFORTS, Effort
+from flexgs_edge.best.effort import EFFORTS, LARGEST_STEP, PIXELS_A_ROW, Effort, sampled_poses
 from flexgs_edge.best.kept import Mended
 from flexgs_edge.best.path import Snapshot, take_rows
 from flexgs_edge.best.search import EXTRA_STEPS, RateResult, RateSearch, RateStep
@@ -24,7 +24,7 @@ from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.score.removal import RemovalCosts
-from synthetic import random_scene
+from synthetic import make_camera, random_scene
 
 SLOPES = Slopes(dict.fromkeys(GEOMETRY, 100.0))
 UNIT = choose_steps(SLOPES, np.ones(1), np.zeros(1), 0, 1.0).opacity
@@ -76,7 +76,7 @@ class World:
         assert self.multiplier is not None
         return round(self.size(self.multiplier)), self.bits
 
-    def measure(self, planes: dict[str, np.ndarray]) -> Measurement:
+    def measure(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         if self.multiplier is None:  # the walk down, before anything was coded: pruning alone
             costs = self.path.snapshots[-1].costs
             least = costs.removal[costs.weight2 > 0].min(initial=1e9)
@@ -264,3 +264,15 @@ def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> Non
     expected[:, :3, 2:] = 1
     np.testing.assert_array_equal(found["sh_rest"].reshape(3, 8, 4), expected)
     assert not planes["sh_dc"].any() and found["means"] is planes["means"]
+
+
+@pytest.mark.parametrize(("count", "step"), [(10, LARGEST_STEP), (100, 3), (240, 2), (260, 1), (10**6, 1)])
+def test_poses_have_no_more_pixels_than_the_rows_need(count: int, step: int) -> None:
+    cameras = [make_camera(64, 48) for _ in range(8)]
+    sampled = sampled_poses(cameras, count)
+    assert {camera.width for camera in sampled} == {-(-64 // step)} | ({64 // step} if 64 % step else set())
+    if 1 < step < LARGEST_STEP:
+        pixels = sum(camera.width * camera.height for camera in sampled)
+        assert pixels >= PIXELS_A_ROW * count
+    # Not the same lattice in every view.
+    assert len({(camera.cx, camera.cy) for camera in sampled}) == min(step**2, 8)

@@ -91,6 +91,22 @@ def test_splits_that_make_no_sense(holdout: int) -> None:
         split_views(10, holdout)
 
 
+def test_every_pixel_of_a_lattice_is_one_of_the_whole_view() -> None:
+    camera, point = turned(), np.array([0.3, -0.2, 4.0])
+    for step, column, row in ((1, 0, 0), (2, 1, 0), (3, 2, 1)):
+        part = camera.every(step, column, row)
+        np.testing.assert_allclose(project(part, point) * step + (column, row), project(camera, point), rtol=1e-12)
+        assert (part.width, part.height) == (len(range(column, 64, step)), len(range(row, 48, step)))
+        # A quarter of a pixel's area of the lattice is a pixel's of the whole.
+        assert part.dilation * step**2 == pytest.approx(camera.dilation)
+
+
+@pytest.mark.parametrize("place", [(2, 2, 0), (2, 0, -1), (100, 70, 0)])
+def test_lattices_without_pixels_are_refused(place: tuple[int, int, int]) -> None:
+    with pytest.raises(InputError, match=r"no such pixels in 64x48"):
+        turned().every(*place)
+
+
 def test_only_wide_views_are_limited() -> None:
     cameras = [make_camera(1600, 900), make_camera(4946, 3286), make_camera(3, 9)]
     limited, note = limit_width(cameras, 1600)

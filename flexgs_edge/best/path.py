@@ -29,7 +29,7 @@ class Snapshot:
     Attributes
     ----------
     rows : np.ndarray
-        [n] i64, rows of the scene, ascending.
+        [n] i64, rows of the scene, in the order of the path.
     planes : dict
         Stored planes of these rows.
     costs : RemovalCosts
@@ -46,7 +46,7 @@ class Snapshot:
         return len(self.rows)
 
     def cheapest(self, count: int) -> np.ndarray:
-        """[n] bool: all but the `count` cheapest to remove of those that some pose sees (ties by row)."""
+        """[n] bool: all but the `count` cheapest to remove of those that some pose sees (ties by place)."""
         keep = np.ones(self.count, bool)
         seen = np.flatnonzero(self.costs.weight2 > 0)
         keep[seen[np.argsort(self.costs.removal[seen], kind="stable")[:count]]] = False
@@ -62,7 +62,7 @@ class PrunePath:
     planes : dict
         Stored planes of the whole scene ([width, N] f32 by field).
     rows : np.ndarray
-        [n] i64, rows to start from (dead splats left out).
+        [n] i64, rows to start from (dead splats left out), in the order that the path keeps.
     origin : np.ndarray
         [3] f64.
     cameras : sequence of Camera

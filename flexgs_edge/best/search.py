@@ -28,6 +28,8 @@ from flexgs_edge.grid import GridScene, Steps, from_grid, recolour, to_grid
 from flexgs_edge.refit import refit_colours
 from flexgs_edge.score.removal import RemovalCosts
 
+Measure = Callable[..., Measurement]
+"""Quality of planes ([width, n] f32 by field); with `estimate=True` a good guess, in a part of the time."""
 Product = TypeVar("Product")
 """What a step makes: a grid, or a finished file."""
 
@@ -121,7 +123,7 @@ class MultiplierSearch(ABC, Generic[Product]):
     def __init__(
         self,
         path: PrunePath,
-        measure: Callable[[dict[str, np.ndarray]], Measurement],
+        measure: Measure,
         effort: Effort,
         on_step: Callable[[RateStep], None] | None = None,
     ) -> None:
@@ -189,7 +191,7 @@ class MultiplierSearch(ABC, Generic[Product]):
                 if last.count * self.bits.base / 8 <= target.limit_bytes:
                     break
             elif len(self.path.snapshots) > 1:
-                excess = target.excess(0, self.measure(last.planes))
+                excess = target.excess(0, self.measure(last.planes, estimate=True))
                 if excess >= math.log(PRUNED_PART):
                     break
             if last.count < 16:
@@ -241,7 +243,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         self,
         path: PrunePath,
         size_of: Callable[[GridScene], tuple[int, BitModel]],
-        measure: Callable[[dict[str, np.ndarray]], Measurement],
+        measure: Measure,
         effort: Effort,
         refit: bool = True,
         on_step: Callable[[RateStep], None] | None = None,
@@ -265,7 +267,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         grid = self._unmended(multiplier)
         if target.limit_bytes is not None:
             return target.excess(self.size_of(grid)[0], None)
-        return target.excess(0, self.measure(from_grid(grid)))
+        return target.excess(0, self.measure(from_grid(grid), estimate=True))
 
     def _aim(self, multiplier: float, steps: Sequence[RateStep], target: Target) -> float:
         """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""

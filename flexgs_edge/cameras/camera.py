@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexgs_edge.constants import DEFAULT_HOLDOUT
+from flexgs_edge.constants import DEFAULT_HOLDOUT, DILATION
 from flexgs_edge.errors import InputError
 
 
@@ -33,6 +33,8 @@ class Camera:
         Principal point, pixels, integer pixel centres: (W - 1) / 2 is the middle.
     distortion : str, optional
         The lens distortion that was left out: the pose is good for scores, but photos of this camera do not match its renders.
+    dilation : float
+        Added to both diagonal terms of the 2D covariance, px^2.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Camera:
     cx: float
     cy: float
     distortion: str | None = None
+    dilation: float = DILATION
 
     def __post_init__(self) -> None:
         for field, shape in (("rotation", (3, 3)), ("translation", (3,))):
@@ -73,6 +76,27 @@ class Camera:
             fy=self.fy * down,
             cx=(self.cx + 0.5) * across - 0.5,
             cy=(self.cy + 0.5) * down - 0.5,
+        )
+
+    def every(self, step: int, column: int = 0, row: int = 0) -> Camera:
+        """The view at every `step`-th pixel of both directions, from pixel (`column`, `row`) on: the same colours, fewer of them.
+
+        Raises `InputError` where no pixel is left.
+        """
+        width, height = -(-(self.width - column) // step), -(-(self.height - row) // step)
+        if not (0 <= column < step and 0 <= row < step) or width < 1 or height < 1:
+            raise InputError(
+                f"camera {self.name!r}: every {step} pixels from ({column}, {row}): no such pixels in {self.width}x{self.height}"
+            )
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx / step,
+            fy=self.fy / step,
+            cx=(self.cx - column) / step,
+            cy=(self.cy - row) / step,
+            dilation=self.dilation / step**2,
         )
 
     def moved(self, origin: np.ndarray) -> Camera:

@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flexgs_edge.adapt import Measurement, Target
+from flexgs_edge.adapt import Target
 from flexgs_edge.best.choice import BitModel, choose_one_degree
 from flexgs_edge.best.path import PrunePath, take_rows
-from flexgs_edge.best.search import Effort, MultiplierSearch, RateStep
+from flexgs_edge.best.search import Effort, Measure, MultiplierSearch, RateStep
 from flexgs_edge.formats import Format, near_order
 from flexgs_edge.pipeline.foreign import FileMaker, WrittenFile, lower_degree
 from flexgs_edge.refit import refit_colours
@@ -34,7 +34,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         self,
         path: PrunePath,
         files: FileMaker,
-        measure: Callable[[dict[str, np.ndarray]], Measurement],
+        measure: Measure,
         effort: Effort,
         refit: bool = True,
         on_step: Callable[[RateStep], None] | None = None,

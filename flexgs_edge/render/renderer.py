@@ -84,7 +84,7 @@ def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray
     record[12:16] = moved.fx, moved.fy, moved.cx, moved.cy
     record[16:21] = near, x_low, x_high, y_low, y_high
     record[21:24] = moved.center
-    record[24:26] = moved.width, moved.height
+    record[24:27] = moved.width, moved.height, moved.dilation
     return record.astype(np.float32)
 
 

@@ -54,7 +54,7 @@ class OnePassPath(PrunePath):
         """See `PrunePath.descend`."""
         last = self.snapshots[-1]
         snapshot = super().descend(share)
-        kept = np.searchsorted(last.rows, snapshot.rows)
+        kept = np.flatnonzero(np.isin(last.rows, snapshot.rows))
         # Weights and mean colours belong to the colours as they are now.
         snapshot.costs = replace(snapshot.costs, removal=last.costs.removal[kept], sh=last.costs.sh[:, kept])
         return snapshot

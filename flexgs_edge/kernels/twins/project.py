@@ -6,7 +6,6 @@ import numpy as np
 
 from flexgs_edge.constants import (
     CULLED,
-    DILATION,
     EXTENT_SLACK,
     LOG2_255,
     LOG2_E,
@@ -90,19 +89,21 @@ def _bounds(
     return (x1 - x0 + f32(1)) * (y1 - y0 + f32(1)), (x1 >= x0) & (y1 >= y0)
 
 
-def _from_covariance(cov: np.ndarray, t0: Triple, t1: Triple) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _from_covariance(
+    cov: np.ndarray, t0: Triple, t1: Triple, dilation: np.float32
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """a, b, c and the determinant of the dilated 2D covariance."""
     cxx, cxy, cxz, cyy, cyz, czz = cov
     v0 = (dot3(cxx, cxy, cxz, *t0), dot3(cxy, cyy, cyz, *t0), dot3(cxz, cyz, czz, *t0))
-    a, b = dot3(*t0, *v0) + f32(DILATION), dot3(*t1, *v0)
+    a, b = dot3(*t0, *v0) + dilation, dot3(*t1, *v0)
     v1 = (dot3(cxx, cxy, cxz, *t1), dot3(cxy, cyy, cyz, *t1), dot3(cxz, cyz, czz, *t1))
-    c = dot3(*t1, *v1) + f32(DILATION)
+    c = dot3(*t1, *v1) + dilation
     bb = b * b
     return a, b, c, fma(a, c, -bb) + fma(-b, b, bb)
 
 
 def _from_factor(
-    factor: np.ndarray, t0: Triple, t1: Triple
+    factor: np.ndarray, t0: Triple, t1: Triple, dilation: np.float32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The same from the covariance's triangular factor, and the determinant before the dilation as a share of that after it."""
     fxx, fyx, fzx, fyy, fzy, fzz = factor
@@ -110,7 +111,6 @@ def _from_factor(
     cross = tuple(fma(g0[k], g1[m], -(g0[m] * g1[k])) for k, m in ((1, 2), (2, 0), (0, 1)))
     before = dot3(*cross, *cross)
     a, b, c = dot3(*g0, *g0), dot3(*g0, *g1), dot3(*g1, *g1)
-    dilation = f32(DILATION)
     det = before + fma(a + c, dilation, dilation * dilation)
     return a + dilation, b, c + dilation, det, before / det
 
@@ -152,12 +152,12 @@ def project(
     t1 = tuple(fma(j12, cam[6 + k], j11 * cam[3 + k]) for k in range(3))
 
     if antialiased:
-        a, b, c, det, share = _from_factor(cov[:, :count], t0, t1)
+        a, b, c, det, share = _from_factor(cov[:, :count], t0, t1, cam[26])
         shown &= share >= f32(SHARE_MIN)
         level = fma(f32(0.5), flog2(np.where(share > f32(SHARE_MIN), share, f32(SHARE_MIN))), level)
         shown &= level >= -(f32(LOG2_255) + f32(EXTENT_SLACK))
     else:
-        a, b, c, det = _from_covariance(cov[:, :count], t0, t1)
+        a, b, c, det = _from_covariance(cov[:, :count], t0, t1, cam[26])
     t2 = np.fmax((level + (f32(LOG2_255) + f32(EXTENT_SLACK))) * (f32(2) / _LOG2_E), f32(0))
     half = (np.sqrt(t2 * a), np.sqrt(t2 * c))
     reach, radius = half, np.zeros_like(a)
