@@ -24,11 +24,10 @@ from flexgs_edge.cameras import Camera, read_cameras
 from flexgs_edge.cameras.inria import inria_json
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.kernels.twins.project import sh_basis
-from flexgs_edge.pipeline.best import grid_search
+from flexgs_edge.pipeline.best import GridCoder, grid_search
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.progress import Progress
-from flexgs_edge.render import Renderer
 from flexgs_edge.scene import write_ply
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.ply import PlySource
@@ -149,8 +148,8 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
     searches: list[RateSearch] = []
     steps: list[RateStep] = []
 
-    def recording(options: CompressOptions, renderer: Renderer) -> Any:
-        make = grid_search(options, renderer=renderer)
+    def recording(options: CompressOptions, coder: GridCoder) -> Any:
+        make = grid_search(options, coder)
 
         def recorded(path: Any, measure: Any, report: Any) -> Any:
             def noted(step: RateStep) -> None:

@@ -133,6 +133,15 @@ same bits. A pixel's weight is at most 1; errors get finer units since those of 
 FIXED_LARGEST: Final = 2.0**62
 """Values are clamped to this before they become integers."""
 
+# --- similarity of images (Wang et al. 2004) ----------------------------------------------------
+SSIM_SIGMA: Final = 1.5
+"""Standard deviation of the window, pixels."""
+SSIM_WINDOW: Final = 11
+"""Side of the window, and so of the smallest picture that has an SSIM."""
+SSIM_C1: Final = 0.01**2
+SSIM_C2: Final = 0.03**2
+"""What keeps the quotients of means and of variances finite, for a data range of 1."""
+
 # --- container version 2 ----------------------------------------------------------------------
 RANS_PRECISION: Final = 14
 """Probabilities count in 1/2^14."""

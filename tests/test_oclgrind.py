@@ -26,6 +26,7 @@ from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.refit import refit_colours
 from flexgs_edge.render import Renderer, Statistics, device_scene, renderer
+from flexgs_edge.render.similarity import ssims
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.score.removal import measure_costs
 from grid_scenes import STEPS, make_grid
@@ -79,7 +80,9 @@ def results(backend: OpenCLBackend | TwinBackend) -> Iterator[np.ndarray]:
         drawer.release()
     drawer = Renderer(counting, large_budget())
     with drawer.load_quantized(quantize_all(source, groups=3)) as scene:
-        yield drawer.render(scene, camera)
+        image = drawer.render(scene, camera)
+        yield image
+    yield np.array(ssims(counting, [(image, image[::-1])]), np.float64)
     yield from second_passes(drawer, camera)
     drawer.release()
     assert set(counting.launched) == set(KERNELS)

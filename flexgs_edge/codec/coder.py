@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -85,6 +85,8 @@ class Encoded:
     bits: np.ndarray
     device: Device | None = None
     """What writes the streams; None: NumPy."""
+    written: tuple[bytes, ...] | None = None
+    """The streams, if they are there already."""
 
     @property
     def sh_bytes(self) -> float:
@@ -96,12 +98,19 @@ class Encoded:
 
     def streams(self) -> Iterator[bytes]:
         """The bytes of every chunk in order, each made when it is asked for or one before."""
+        if self.written is not None:
+            yield from self.written
+            return
         sizes = [chunk.stop - chunk.start for chunk in self.chunks]
         pairs = list(zip(sizes, self.batches, strict=True))
         if self.device is not None and self.device.threads:
             yield from _streams_on(self.device, self.model, pairs)
             return
         yield from in_order(lambda pair: encode_chunk(self.model, *pair), pairs, thread_count(len(pairs)))
+
+    def finished(self) -> Encoded:
+        """The same with its streams, the bytes of a file, in place of its symbols, which are several times as many."""
+        return replace(self, written=tuple(self.streams()), batches=[])
 
 
 def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS, device: Device | None = None) -> Encoded:

@@ -42,6 +42,7 @@ def write_grid(
     force: bool = False,
     chunk_rows: int = CHUNK_ROWS,
     device: Device | None = None,
+    encoded: Encoded | None = None,
 ) -> int:
     """Encode a grid scene into a file, which appears under its name only when it is complete.
 
@@ -59,13 +60,15 @@ def write_grid(
         Rows of a chunk, at most 65536.
     device : Device, optional
         Counts symbols, with the same result.
+    encoded : Encoded, optional
+        `encode_grid(grid, chunk_rows)`, where it is known already.
 
     Returns
     -------
     int
         Bytes of the file, as `coded_size` predicts.
     """
-    encoded = encode_grid(grid, chunk_rows, device)
+    encoded = encoded or encode_grid(grid, chunk_rows, device)
     model = encoded.model.to_bytes()
     header = _header(grid, encoded, len(model), settings, chunk_rows)
     with atomic_write(path, force) as file:
@@ -87,14 +90,18 @@ def coded_size(
 
 
 def coded_parts(
-    grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS, device: Device | None = None
+    grid: GridScene,
+    settings: Mapping[str, Any],
+    chunk_rows: int = CHUNK_ROWS,
+    device: Device | None = None,
+    encoded: Encoded | None = None,
 ) -> tuple[int, float]:
     """Exact bytes of the file that `write_grid` makes of these arguments, and how many of them the SH take.
 
     The SH take the information in their symbols and in the degrees of the rows, and their groups' part of the model:
     what coding the scene again without them would save, but for the header's and the lanes' bytes.
     """
-    encoded = encode_grid(grid, chunk_rows, device)
+    encoded = encoded or encode_grid(grid, chunk_rows, device)
     model_bytes = len(encoded.model.to_bytes())
     header = _header(grid, encoded, model_bytes, settings, chunk_rows)
     size = header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes

@@ -56,6 +56,8 @@ KERNELS: dict[str, KernelSpec] = {
     "residual": KernelSpec("score.cl", "ubbb", "rows"),
     "sh_costs": KernelSpec("score.cl", "uuuuuubbbbb", "rows"),
     "sh_residual": KernelSpec("score.cl", "uuuuubbbb", "rows"),
+    "ssim_columns": KernelSpec("similarity.cl", "uuubbbb", "rows"),
+    "ssim_rows": KernelSpec("similarity.cl", "uubbb", "rows"),
     "dequantize": KernelSpec("dequantize.cl", "uuuuuuubbbb"),
 }
 """Every kernel by the name that `Backend.launch` and the twins share."""

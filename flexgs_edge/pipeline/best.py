@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,10 +18,10 @@ from flexgs_edge.best.search import Measure, MultiplierSearch, Product, RateResu
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
 from flexgs_edge.cameras.order import farthest_order
-from flexgs_edge.codec.container2 import coded_parts
+from flexgs_edge.codec.coder import Encoded, encode_grid
+from flexgs_edge.codec.container2 import coded_parts, write_grid
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.grid import GridScene, near_rows
-from flexgs_edge.kernels import Backend
 from flexgs_edge.pipeline.foreign import FileMaker, WrittenFile, search_pruned_files
 from flexgs_edge.pipeline.foreign_best import FileSearch
 from flexgs_edge.pipeline.judge import Judge, measurement_of
@@ -54,14 +55,47 @@ Report = Callable[[RateStep], None]
 SearchMaker = Callable[[PrunePath, Measure, Report], MultiplierSearch[Product]]
 
 
+class GridCoder:
+    """Codes the grids of a search. The last one stays coded, so that writing it is copying.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        Its device codes where it can.
+    """
+
+    def __init__(self, renderer: Renderer) -> None:
+        self._renderer = renderer
+        self._last: tuple[GridScene, Encoded] | None = None
+
+    def encoded(self, grid: GridScene) -> Encoded:
+        """The grid as it will lie in a file."""
+        if self._last is None or self._last[0] is not grid:
+            self._last = None
+            device = coding_device(self._renderer.backend, self._renderer.budget, grid)
+            self._last = grid, encode_grid(grid, device=device).finished()
+        return self._last[1]
+
+    def size_and_bits(self, grid: GridScene) -> tuple[int, BitModel]:
+        """See `size_and_bits`."""
+        return size_and_bits(grid, self.encoded(grid))
+
+    def size(self, grid: GridScene, settings: Mapping[str, Any]) -> int:
+        """Bytes of the file that `write` makes."""
+        return coded_parts(grid, settings, encoded=self.encoded(grid))[0]
+
+    def write(self, path: str | os.PathLike[str], grid: GridScene, settings: Mapping[str, Any]) -> int:
+        """See `write_grid`."""
+        return write_grid(path, grid, settings, encoded=self.encoded(grid))
+
+
 def grid_search(
-    options: CompressOptions, search: type[RateSearch] = RateSearch, renderer: Renderer | None = None
+    options: CompressOptions, coder: GridCoder, search: type[RateSearch] = RateSearch
 ) -> SearchMaker[GridScene]:
-    """Searches for the grid of a `.fgs`; the renderer's device codes where it can."""
+    """Searches for the grid of a `.fgs`."""
 
     def size_of(grid: GridScene) -> tuple[int, BitModel]:
-        device = None if renderer is None else coding_device(renderer.backend, renderer.budget, grid)
-        size, bits = size_and_bits(grid, device)
+        size, bits = coder.size_and_bits(grid)
         return (size if options.layers == 1 else round(LAYERS_COST * size)), bits
 
     plan = EFFORTS[options.effort]
@@ -226,7 +260,7 @@ def layered(
     return assign_layers(
         grid,
         options.layers,
-        size_and_bits(grid, coding_device(renderer.backend, renderer.budget, grid))[1],
+        GridCoder(renderer).size_and_bits(grid)[1],
         renderer,
         poses,
         progress,
@@ -250,12 +284,12 @@ def alive(logits: np.ndarray) -> np.ndarray:
     return logits >= np.float32(-np.log(1 / ALPHA_MIN - 1) - 1e-3)
 
 
-def size_and_bits(grid: GridScene, device: Backend | None = None) -> tuple[int, BitModel]:
+def size_and_bits(grid: GridScene, encoded: Encoded | None = None) -> tuple[int, BitModel]:
     """Exact bytes of a grid's file, and what its Gaussians cost.
 
     The bytes of the SH are shared among their coefficients; the rest among the rows.
     """
-    size, sh = coded_parts(grid, {}, device=device)
+    size, sh = coded_parts(grid, {}, encoded=encoded)
     size += SETTINGS_MOST
     base = size - sh
     rows = [int(np.count_nonzero(grid.sh_degrees >= level)) for level in range(1, grid.sh_degree + 1)]

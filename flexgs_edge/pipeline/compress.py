@@ -14,12 +14,12 @@ import numpy as np
 from flexgs_edge.adapt import SearchResult, Step, Target, adapt, measure_fixed
 from flexgs_edge.bitspec import PAPER, BitSpec
 from flexgs_edge.budget import MemoryBudget, format_size
-from flexgs_edge.codec import FgsSource, coded_size, open_fgs, write_grid
+from flexgs_edge.codec import FgsSource, open_fgs
 from flexgs_edge.codec.container import write_container
 from flexgs_edge.errors import TargetError
 from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, from_grid
-from flexgs_edge.pipeline.best import grid_search, layered, search_best, search_files
+from flexgs_edge.pipeline.best import GridCoder, grid_search, layered, search_best, search_files
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
@@ -30,7 +30,7 @@ from flexgs_edge.pipeline.outputs import check_outputs, temporary_name
 from flexgs_edge.pipeline.plan import Plan, make_settings
 from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.pipeline.report import Reporter
-from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, coding_device, run_info
+from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, run_info
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice, nonzero_sh, order_from_scores
 from flexgs_edge.quantize import QuantizedScene
@@ -193,8 +193,9 @@ class _Job:
         if self.format is not None:
             return self._run_files(self.format, output, None, decide, report)
         LOG.info("searching for %s", plan.target.describe())
+        coder = GridCoder(renderer)
         grid, search = search_best(
-            grid_search(options, renderer=renderer),
+            grid_search(options, coder),
             renderer,
             self.source,
             self.views.of(self.views.train),
@@ -212,18 +213,17 @@ class _Job:
             with self.clock.stage("layers"):
                 grid = layered(grid, renderer, self.views.of(self.views.train), options, self.progress)
         settings = make_settings(options, plan, self.scene, self.views, search, None)
-        device = coding_device(self.workspace.backend, self.budget, grid)
         if output is None:
             if self.reporter is not None:
-                self.reporter.read_contents_of(lambda place: write_grid(place, grid, settings, device=device))
+                self.reporter.read_contents_of(lambda place: coder.write(place, grid, settings))
             size, quality = (
-                coded_size(grid, settings, device=device),
+                coder.size(grid, settings),
                 self._measure_source(MemorySource(from_grid(grid), origin=grid.origin), report),
             )
         else:
             with temporary_name(output, options.force) as place:
                 with self.clock.stage("write"):
-                    size = write_grid(place, grid, settings, device=device)
+                    size = coder.write(place, grid, settings)
                 if search.reached and plan.target.limit_bytes is not None and size > plan.target.limit_bytes:
                     raise TargetError(
                         f"{plan.target.describe()}: {options.layers} layers make the file {size} bytes; ask for fewer layers"

@@ -13,14 +13,15 @@ from flexgs_edge.pipeline.inputs import Views
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import DeviceScene, Renderer
 from flexgs_edge.render.quality import Distance, Quality, ViewQuality, compare_view, mse
+from flexgs_edge.render.similarity import ssim_bytes, ssims
 from flexgs_edge.scene import SceneSource
 
 SHARE = 4
 """Reference images may take this part of the free budget (one in four): the rest is for the scene and its views."""
-LIBRARY_BYTES = 48 * 2**20
-"""What Pillow, scikit-image and SciPy take when they are loaded (measured: 45 MiB)."""
+LIBRARY_BYTES = 12 * 2**20
+"""What Pillow takes when it is loaded and decodes (measured: 8 MiB)."""
 WORK_BYTES = 100
-"""Bytes a pixel that decoding a photo, or SSIM, holds for a moment (measured: 72 for SSIM)."""
+"""Bytes a pixel that decoding a photo, or SSIM, holds for a moment (32 of SSIM's are the backend's)."""
 ESTIMATE_STEP = 2
 """Pixels from one to the next, in both directions, that an estimate looks at."""
 
@@ -116,13 +117,14 @@ class Judge:
         progress: Progress = SILENT,
         lpips: Distance | None = None,
     ) -> Quality:
-        """Quality of `scene` over the views (about 0.3 s a megapixel and pair more with SSIM, 3 s with LPIPS)."""
+        """Quality of `scene` over the views (LPIPS takes about 3 s a megapixel and pair)."""
         found: list[ViewQuality] = []
         for i, camera in enumerate(progress.track(self.cameras, "comparing views", len(self.cameras))):
             image = self.renderer.render(scene, camera)
             error = self._original_error[i] if self.photos is not None else None
             references = self.original(i), self._photo(i)
-            found.append(compare_view(camera.name, image, *references, error, with_ssim, lpips))
+            ssims = self._ssims if with_ssim else None
+            found.append(compare_view(camera.name, image, *references, error, ssims, lpips))
         return Quality(tuple(found), self.base_psnr)
 
     def estimate(self, scene: DeviceScene) -> Quality:
@@ -136,6 +138,15 @@ class Judge:
                 compare_view(camera.name, image, self.original(i)[every], None if photo is None else photo[every])
             )
         return Quality(tuple(found), self.base_psnr)
+
+    def _ssims(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
+        height, width = pairs[0][0].shape[:2]
+        room = min(ssim_bytes(width, height), self._work)
+        self._budget.give(room)  # taken again by the arrays themselves
+        try:
+            return ssims(self.renderer.backend, pairs)
+        finally:
+            self._budget.take("comparing views", room)
 
     def images(self, scene: DeviceScene, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Render of `scene`, render of the original and photo of the view `indices[i]`: [H, W, 3] f32 in [0, 1]."""

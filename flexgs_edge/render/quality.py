@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +17,10 @@ from flexgs_edge.errors import InputError
 
 ROWS = 128
 """Image rows per step of the squared error: bounds the float64 copies to a few MB whatever the picture's height."""
-SSIM_WINDOW = 11
-"""Side of scikit-image's Gaussian window at sigma 1.5, and so the smallest picture that has an SSIM."""
-SSIM_THREADS = 2
-"""Channels compared at once: each holds about 24 bytes a pixel."""
 Distance = Callable[[np.ndarray, np.ndarray], float | None]
 """A distance of two [H, W, 3] images; `None` where there is none."""
+Similarities = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | None]]
+"""Similarities of several pairs of [H, W, 3] images of one size."""
 MSE_FLOOR = 1e-12
 """Errors below this (120 dB, beyond float32 renders) count as this much where two PSNRs are subtracted."""
 
@@ -65,28 +62,6 @@ def mean_psnr(values: Sequence[float | None]) -> float | None:
     """
     known = [value for value in values if value is not None]
     return math.fsum(known) / len(known) if known else None
-
-
-def ssim(image: np.ndarray, reference: np.ndarray) -> float | None:
-    """SSIM of two [H, W, 3] images: Gaussian window, sigma 1.5, data range 1. `None` below 11 pixels a side."""
-    return ssims([(image, reference)])[0]
-
-
-def ssims(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
-    """`ssim` of several pairs of images of one size, two channels at a time: most of it is SciPy, which lets threads run."""
-    if not pairs or min(pairs[0][0].shape[:2]) < SSIM_WINDOW:
-        return [None] * len(pairs)
-    from skimage.metrics import structural_similarity  # 0.4 s of import that a search does not need
-
-    def of_channel(place: int) -> float:
-        images = (np.clip(image[..., place % 3], 0.0, 1.0) for image in pairs[place // 3])
-        return structural_similarity(
-            *images, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0
-        )
-
-    with ThreadPoolExecutor(SSIM_THREADS) as pool:
-        channels = list(pool.map(of_channel, range(3 * len(pairs))))
-    return [float(np.mean(channels[at : at + 3])) for at in range(0, len(channels), 3)]
 
 
 def drop(original_error: float, error: float) -> float:
@@ -283,7 +258,7 @@ def compare_view(
     original: np.ndarray,
     photo: np.ndarray | None = None,
     original_error: float | None = None,
-    with_ssim: bool = False,
+    ssims: Similarities | None = None,
     lpips: Distance | None = None,
 ) -> ViewQuality:
     """Figures of one render.
@@ -298,15 +273,15 @@ def compare_view(
         The photo, [H, W, 3] f32 in [0, 1].
     original_error : float, optional
         Mean squared error of `original` against `photo`, if it is known already.
-    with_ssim : bool
-        Also measure SSIM (about 0.3 s a megapixel).
+    ssims : callable, optional
+        Also measure this similarity of all pairs of images.
     lpips : callable, optional
         Also measure this distance of two images (about 3 s a megapixel for LPIPS).
     """
     if photo is not None and original_error is None:
         original_error = mse(original, photo)
     similar: list[float | None] = [None] * 3
-    if with_ssim:
+    if ssims:
         pairs = [(image, original), *([(image, photo), (original, photo)] if photo is not None else ())]
         similar[: len(pairs)] = ssims(pairs)
     return ViewQuality(

@@ -11,11 +11,10 @@ from pathlib import Path
 
 from flexgs_edge.adapt import MaxSize, min_ratio
 from flexgs_edge.budget import format_size
-from flexgs_edge.codec import coded_size
 from flexgs_edge.errors import InputError
 from flexgs_edge.formats import FORMATS, Format, check_converter, near_order
 from flexgs_edge.grid import GridScene, from_grid
-from flexgs_edge.pipeline.best import grid_search, open_path, search_path
+from flexgs_edge.pipeline.best import GridCoder, grid_search, open_path, search_path
 from flexgs_edge.pipeline.foreign import open_files
 from flexgs_edge.pipeline.judge import measurement_of
 from flexgs_edge.pipeline.plan import EVERYTHING, make_settings
@@ -168,15 +167,16 @@ def best_points(
     with open_path(
         workspace.renderer, source, cameras, options, workspace.budget, workspace.clock, bench.progress, variant.path
     ) as path:
+        coder = GridCoder(workspace.renderer)
         for ratio in sorted(ratios):
             target = _target(bench, ratio)
-            make = grid_search(options, variant.search, workspace.renderer)
+            make = grid_search(options, coder, variant.search)
             with workspace.clock.stage("search"):
                 grid, search = search_path(make, path, workspace.renderer, source, bench.judge, target, options)
             seconds = time.perf_counter() - started
             if search.reached:
                 plan = replace(bench.plan, target=target)
-                size = coded_size(grid, make_settings(options, plan, bench.scene, bench.views, search, None))
+                size = coder.size(grid, make_settings(options, plan, bench.scene, bench.views, search, None))
                 quality = _judged_source(bench, grid)
                 point = RatePoint("best", variant.name, effort, ratio, size, grid.count, quality, seconds)
                 found += Found((_said(point),))

@@ -12,6 +12,7 @@ from flexgs_edge.kernels.twins.blend import blend, blend_both, blend_removal, bl
 from flexgs_edge.kernels.twins.dequantize import dequantize
 from flexgs_edge.kernels.twins.project import project
 from flexgs_edge.kernels.twins.score import residual, sh_costs, sh_residual
+from flexgs_edge.kernels.twins.similarity import ssim_columns, ssim_rows
 from flexgs_edge.kernels.twins.sort import (
     exclusive_scan,
     sort_count,
@@ -38,6 +39,8 @@ TWINS: dict[str, Callable[..., None]] = {
     "blend_residual": blend_residual,
     "blend_both": blend_both,
     "residual": residual,
+    "ssim_columns": ssim_columns,
+    "ssim_rows": ssim_rows,
     "sh_costs": sh_costs,
     "sh_residual": sh_residual,
     "dequantize": dequantize,
