@@ -7,11 +7,15 @@
    (log-linear in p and s, fitted to the points measured so far) expects to hold. A point that fails rules out all points
    with both rates as high. The answer is always a point that was itself measured to hold.
 
+Both look at estimates, from a part of the pixels, whose distance from a full measurement is taken at the first point. The
+answer is then measured in full; if it does not hold, the next one by what that showed is.
+
 Steps are counted, never timed, and the model uses plain Python floats in a fixed order: same command, same bytes.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +26,7 @@ from flexgs_edge.adapt.targets import Measurement, Target
 from flexgs_edge.errors import TargetError
 from flexgs_edge.prune import Choice
 
-Phase = Literal["list", "refine", "fixed", "line", "multiplier"]
+Phase = Literal["list", "refine", "confirm", "fixed", "line", "multiplier"]
 
 CANDIDATES: tuple[tuple[int, int], ...] = (
     (2, 3), (1, 5), (2, 4), (3, 3), (1, 6), (2, 5), (3, 4), (4, 3), (2, 6), (3, 5),
@@ -49,6 +53,9 @@ class Evaluator(Protocol):
     def measure(self, choice: Choice) -> Measurement:
         """Prune, quantize, dequantize, render and compare: the costly question."""
 
+    def estimate(self, choice: Choice) -> Measurement:
+        """The same from a part of the pixels, in less time."""
+
 
 @dataclass(frozen=True)
 class Step:
@@ -64,10 +71,12 @@ class Step:
         Quality; `None` where size alone decided.
     excess : float
         By how much the target was missed; zero or less holds.
-    phase : {"list", "refine", "fixed", "line", "multiplier"}
+    phase : {"list", "refine", "confirm", "fixed", "line", "multiplier"}
         Part of the search that asked.
     seconds : float
         Wall time of the step.
+    estimated : bool
+        `measurement` is an estimate from a part of the pixels, and `excess` what a full one is expected to show.
     """
 
     choice: Choice
@@ -76,6 +85,7 @@ class Step:
     excess: float
     phase: Phase
     seconds: float
+    estimated: bool = False
 
     @property
     def holds(self) -> bool:
@@ -114,7 +124,7 @@ def adapt(
     Parameters
     ----------
     evaluator : Evaluator
-        Answers for sizes and measurements; no point is measured twice.
+        Answers for sizes, estimates and measurements; no point is asked for either twice.
     target : Target
         What must hold.
     effort : {"fast", "balanced", "thorough"}
@@ -135,6 +145,7 @@ def adapt(
         chosen = _search_quality(search, refine_steps)
     else:
         chosen = _search_size(search, target.limit_bytes, refine_steps)
+    chosen = _confirmed(search, chosen)
     if not chosen.holds and not best_effort:
         raise out_of_reach(target, chosen)
     return SearchResult(chosen, chosen.holds, tuple(search.steps))
@@ -167,7 +178,9 @@ class _Search:
         self.on_step = on_step
         self.steps: list[Step] = []
         self._known: dict[Choice, Step] = {}
+        self._confirmed: dict[Choice, Step] = {}
         self._sizes: dict[Choice, int] = {}
+        self._off = 0.0
 
     def size(self, choice: Choice) -> int:
         if choice not in self._sizes:
@@ -177,21 +190,69 @@ class _Search:
     def known(self, choice: Choice) -> bool:
         return choice in self._known
 
-    def measure(self, choice: Choice, phase: Phase) -> Step:
+    def estimate(self, choice: Choice, phase: Phase) -> Step:
+        """The step of a choice; the first one is measured in full as well, to tell how far estimates are off."""
         if choice not in self._known:
+            first = not self._known
+            started = time.perf_counter()
+            measurement = self.evaluator.estimate(choice)
+            excess = self.target.excess(self.size(choice), measurement)
+            if first and self.target.limit_bytes is None:
+                off = self.confirm(choice).excess - excess
+                self._off = off if math.isfinite(off) else 0.0  # identical renders have no finite distance
+            seconds = time.perf_counter() - started
+            step = Step(choice, self.size(choice), measurement, excess + self._off, phase, seconds, estimated=True)
+            self._known[choice] = step
+            self._tell(step)
+        return self._known[choice]
+
+    def confirm(self, choice: Choice) -> Step:
+        """The step of a choice measured in full."""
+        if choice not in self._confirmed:
             started = time.perf_counter()
             measurement = self.evaluator.measure(choice)
             excess = self.target.excess(self.size(choice), measurement)
-            step = Step(choice, self.size(choice), measurement, excess, phase, time.perf_counter() - started)
-            self._known[choice] = step
-            self.steps.append(step)
-            if self.on_step:
-                self.on_step(step)
-        return self._known[choice]
+            step = Step(choice, self.size(choice), measurement, excess, "confirm", time.perf_counter() - started)
+            self._confirmed[choice] = step
+            self._tell(step)
+        return self._confirmed[choice]
+
+    def _tell(self, step: Step) -> None:
+        self.steps.append(step)
+        if self.on_step:
+            self.on_step(step)
+
+    @property
+    def estimates(self) -> list[Step]:
+        """The estimated steps, in order."""
+        return list(self._known.values())
+
+    def unconfirmed(self) -> list[Step]:
+        """Steps that were only estimated, the one that holds with the fewest bytes first, then those that miss by least."""
+        steps = [step for choice, step in self._known.items() if choice not in self._confirmed]
+        return sorted(steps, key=lambda step: (max(step.excess, 0.0), step.size))
+
+    def closest(self) -> Step:
+        """Of the steps measured in full, the one that misses by least."""
+        return min(self._confirmed.values(), key=lambda step: (step.excess, step.size))
 
     def by_size(self, choices: list[Choice]) -> list[Choice]:
         """Choices from most to fewest bytes; ties by rates, so that the order is one."""
         return sorted(choices, key=lambda choice: (-self.size(choice), choice.prune, choice.sh))
+
+
+def _confirmed(search: _Search, chosen: Step) -> Step:
+    """`chosen` measured in full; while that does not hold, the next of the steps that should by what it showed."""
+    full = search.confirm(chosen.choice)
+    while not full.holds:
+        off = max(full.excess - chosen.excess, 0.0)
+        # Where the estimate already said that nothing holds, the rest is farther away.
+        rest = [step for step in search.unconfirmed() if step.excess + off <= 0.0]
+        if not rest:
+            return search.closest()
+        chosen = rest[0]
+        full = search.confirm(chosen.choice)
+    return full
 
 
 def _candidates(search: _Search) -> list[Choice]:
@@ -201,33 +262,33 @@ def _candidates(search: _Search) -> list[Choice]:
 def _search_quality(search: _Search, refine_steps: int) -> Step:
     candidates = _candidates(search)
     at = candidates.index(Choice(100 * START[0], 100 * START[1]))
-    best = search.measure(candidates[at], "list")
+    best = search.estimate(candidates[at], "list")
     if best.holds:
         for choice in candidates[at + 1 :]:
-            step = search.measure(choice, "list")
+            step = search.estimate(choice, "list")
             if not step.holds:
                 break
             best = step
     else:
         for choice in reversed(candidates[:at]):
-            best = search.measure(choice, "list")
+            best = search.estimate(choice, "list")
             if best.holds:
                 break
     gentlest = best.choice == candidates[0]
     box = _box(best.choice, to_zero=gentlest)
     if not best.holds:
         # The whole list fails: only the gentlest point can still hold, and it is the closest if it does not.
-        best = search.measure(Choice(0, 0), "refine")
+        best = search.estimate(Choice(0, 0), "refine")
         refine_steps -= 1
         if not best.holds:
-            return min(search.steps, key=lambda step: (step.excess, step.size))
+            return min(search.estimates, key=lambda step: (step.excess, step.size))
     return _refine(search, best, box, refine_steps)
 
 
 def _refine(search: _Search, best: Step, box: list[Choice], steps: int) -> Step:
     """Walk from `best` towards fewer bytes inside `box`, measuring at most `steps` new points."""
     for _ in range(steps):
-        failed = [step.choice for step in search.steps if not step.holds]
+        failed = [step.choice for step in search.estimates if not step.holds]
         open_points = [
             choice
             for choice in box
@@ -235,13 +296,13 @@ def _refine(search: _Search, best: Step, box: list[Choice], steps: int) -> Step:
         ]
         if not open_points:
             break
-        model = LossModel.fit([(step.choice, step.excess) for step in search.steps])
+        model = LossModel.fit([(step.choice, step.excess) for step in search.estimates])
         expected = [choice for choice in open_points if model.predict(choice) <= 0.0]
         if expected:
             probe = search.by_size(expected)[-1]
         else:  # none is expected to hold: the likeliest one, in case the model is wrong
             probe = min(open_points, key=lambda choice: (model.predict(choice), search.size(choice), choice.prune))
-        step = search.measure(probe, "refine")
+        step = search.estimate(probe, "refine")
         if step.holds and step.size < best.size:
             best = step
     return best
@@ -250,17 +311,17 @@ def _refine(search: _Search, best: Step, box: list[Choice], steps: int) -> Step:
 def _search_size(search: _Search, limit: int, refine_steps: int) -> Step:
     """The least compression that fits: sizes are free, so measuring only compares points on the edge of the limit."""
     if search.size(Choice(0, 0)) <= limit:
-        return search.measure(Choice(0, 0), "list")
+        return search.estimate(Choice(0, 0), "list")
     candidates = _candidates(search)
     fitting = [choice for choice in candidates if search.size(choice) <= limit]
     answer = fitting[0] if fitting else candidates[-1]
     box = _box(answer, to_zero=answer == candidates[0])
     edge = _edge(search, [choice for choice in box if search.size(choice) <= limit])
     if fitting:
-        search.measure(answer, "list")
+        search.estimate(answer, "list")
     if not edge:
         smallest = search.by_size(box)[-1]
-        return search.measure(smallest, "refine")
+        return search.estimate(smallest, "refine")
     judge = search.target.judge
 
     def loss(step: Step) -> tuple[float, int]:
@@ -269,17 +330,17 @@ def _search_size(search: _Search, limit: int, refine_steps: int) -> Step:
 
     # One hill climb along the edge (one point for each p), from the p of the list's answer outwards.
     at = min(range(len(edge)), key=lambda i: (abs(edge[i].prune - answer.prune), i))
-    best = search.measure(edge[at], "refine")
+    best = search.estimate(edge[at], "refine")
     left = refine_steps - 1
     for direction in (-1, 1):
         i = at + direction
         while 0 <= i < len(edge) and left > 0:
-            step = search.measure(edge[i], "refine")
+            step = search.estimate(edge[i], "refine")
             left -= 1
             if loss(step) >= loss(best):
                 break
             best, i = step, i + direction
-    return min((step for step in search.steps if step.holds), key=loss)
+    return min((step for step in search.estimates if step.holds), key=loss)
 
 
 def _edge(search: _Search, fitting: list[Choice]) -> list[Choice]:

@@ -164,4 +164,4 @@ def _hidden(planes: dict[str, np.ndarray], weight2: np.ndarray, share: float) ->
 
 def take_rows(planes: dict[str, np.ndarray], rows: np.ndarray) -> dict[str, np.ndarray]:
     """The planes' columns `rows`, C-contiguous."""
-    return {name: np.ascontiguousarray(values[:, rows]) for name, values in planes.items()}
+    return {name: np.take(values, rows, axis=1) for name, values in planes.items()}

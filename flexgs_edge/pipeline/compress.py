@@ -399,4 +399,5 @@ class _Job:
 
 def _step_words(step: Step, target: Target | None) -> str:
     figure = target.report(step.size, step.measurement) if target else ""
+    figure += " (estimated)" if step.estimated else ""
     return f"{step.phase}: prune {step.choice.prune / 1000:g}, SH {step.choice.sh / 1000:g}: {figure}, {step.seconds:.1f} s"

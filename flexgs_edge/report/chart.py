@@ -111,6 +111,7 @@ def _step_words(step: Step) -> str:
     if found is not None and found.drop is not None:
         figures = f", drop {found.drop:.3f} dB"
     rates = f"prune {step.choice.prune / 1000:g}, SH {step.choice.sh / 1000:g}"
+    figures += " (estimated)" if step.estimated else ""
     return text(f"{step.phase}: {rates}: {format_size(step.size)}{figures}")
 
 

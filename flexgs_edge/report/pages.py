@@ -199,7 +199,8 @@ def _search_section(result: CompressResult, material: Material) -> list[str]:
         if found is not None:
             figures = [_decibel(found.drop, missing=True), _decibel(found.modelled_drop), _decibel(found.fidelity)]
         rates = [f"{step.choice.prune / 1000:g}", f"{step.choice.sh / 1000:g}"]
-        rows.append([f"{number} {step.phase}", format_size(step.size), *figures, mark, *rates, f"{step.seconds:.1f} s"])
+        name = f"{number} {step.phase}{', estimated' if step.estimated else ''}"
+        rows.append([name, format_size(step.size), *figures, mark, *rates, f"{step.seconds:.1f} s"])
     heads = ["step", "size", "drop", "modelled", "fidelity", "target", "prune rate", "SH rate", "time"]
     state = " open" if len(rows) <= FEW_ROWS else ""
     return [

@@ -348,6 +348,7 @@ def step_json(step: Step) -> dict[str, Any]:
         "fidelity": _rounded(found.fidelity if found else None),
         "modelled_drop": _rounded(found.modelled_drop if found else None),
         "holds": step.holds,
+        "estimated": step.estimated,
         "seconds": round(step.seconds, 3),
     }
 

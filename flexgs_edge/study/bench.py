@@ -197,6 +197,9 @@ class _Remembering:
     def measure(self, choice: Choice) -> Measurement:
         return self.bench.point(Setting(choice)).measurement
 
+    def estimate(self, choice: Choice) -> Measurement:
+        return self.bench.evaluator(Setting()).estimate(choice)
+
 
 @contextmanager
 def open_bench(

@@ -130,7 +130,8 @@ def plane(bench: Bench) -> Experiment:
     ]
     for number, step in enumerate(search.steps, 1):
         assert step.measurement is not None
-        kind = "answer" if step.choice == search.chosen.choice else step.phase
+        # Steps of the list and of the refinement are what the search saw: estimates.
+        kind = "answer" if step is search.chosen else step.phase
         rows.append(
             {
                 "kind": kind,
