@@ -87,6 +87,12 @@ from flexgs_edge.cli import words
     help="Up to 4 layers that each double the bytes (best only): `trim` then cuts the file to a size without the original.",
 )
 @words.option(
+    "Run",
+    "--scratch",
+    metavar="DIR",
+    help="Folder for scratch files, used when a scene does not fit into the memory limit (best only). Default: beside OUT.",
+)
+@words.option(
     "Method",
     "--score",
     metavar="gs|meson|FILE",

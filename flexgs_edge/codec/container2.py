@@ -28,6 +28,7 @@ from flexgs_edge.codec.walk import ChunkCodes
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.grid import GridScene
 from flexgs_edge.scene.atomic import atomic_write
+from flexgs_edge.scratch import MEMORY, Room
 
 VERSION = 2
 
@@ -42,6 +43,7 @@ def write_grid(
     force: bool = False,
     chunk_rows: int = CHUNK_ROWS,
     device: Device | None = None,
+    room: Room = MEMORY,
 ) -> int:
     """Encode a grid scene into a file, which appears under its name only when it is complete.
 
@@ -59,13 +61,15 @@ def write_grid(
         Rows of a chunk, at most 65536.
     device : Device, optional
         Counts symbols, with the same result.
+    room : Room, optional
+        Where symbols lie until they are written.
 
     Returns
     -------
     int
         Bytes of the file, as `coded_size` predicts.
     """
-    encoded = encode_grid(grid, chunk_rows, device)
+    encoded = encode_grid(grid, chunk_rows, device, room)
     model = encoded.model.to_bytes()
     header = _header(grid, encoded, len(model), settings, chunk_rows)
     with atomic_write(path, force) as file:
@@ -80,21 +84,29 @@ def write_grid(
 
 
 def coded_size(
-    grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS, device: Device | None = None
+    grid: GridScene,
+    settings: Mapping[str, Any],
+    chunk_rows: int = CHUNK_ROWS,
+    device: Device | None = None,
+    room: Room = MEMORY,
 ) -> int:
     """Exact bytes of the file that `write_grid` makes of these arguments."""
-    return coded_parts(grid, settings, chunk_rows, device)[0]
+    return coded_parts(grid, settings, chunk_rows, device, room)[0]
 
 
 def coded_parts(
-    grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS, device: Device | None = None
+    grid: GridScene,
+    settings: Mapping[str, Any],
+    chunk_rows: int = CHUNK_ROWS,
+    device: Device | None = None,
+    room: Room = MEMORY,
 ) -> tuple[int, float]:
     """Exact bytes of the file that `write_grid` makes of these arguments, and how many of them the SH take.
 
     The SH take the information in their symbols and in the degrees of the rows, and their groups' part of the model:
     what coding the scene again without them would save, but for the header's and the lanes' bytes.
     """
-    encoded = encode_grid(grid, chunk_rows, device)
+    encoded = encode_grid(grid, chunk_rows, device, room)
     model_bytes = len(encoded.model.to_bytes())
     header = _header(grid, encoded, model_bytes, settings, chunk_rows)
     size = header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes

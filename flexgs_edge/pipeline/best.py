@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.layers import assign_layers
 from flexgs_edge.best.path import PARTS, PrunePath, sums_room
 from flexgs_edge.best.search import MultiplierSearch, Product, RateResult, RateSearch, RateStep
-from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.budget import MemoryBudget, format_size
 from flexgs_edge.cameras import Camera
 from flexgs_edge.cameras.order import farthest_order
 from flexgs_edge.codec.container2 import coded_parts
@@ -28,10 +30,15 @@ from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.workspace import Stopwatch, coding_device
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice
-from flexgs_edge.render import Renderer
+from flexgs_edge.render import Renderer, sum_bytes
+from flexgs_edge.render.device_scene import COMPACT_ROWS, MOST_SUMS
+from flexgs_edge.render.renderer import FIRST_SHARE
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
+from flexgs_edge.scratch import MEMORY, Room, Scratch
+
+LOG = logging.getLogger("flexgs_edge")
 
 COST_BYTES = 16
 """Costs of a row and snapshot beside those of its SH: removal and weight, in double precision."""
@@ -50,6 +57,12 @@ SETTINGS_MOST = 1536
 """Bytes that the settings in the header take at most: the search counts them before they are known."""
 
 
+SPILLED_ROW_BYTES = 24
+"""Bytes that each row of a scene in scratch files takes of memory for a moment: choosing the cheapest rows, and lists of rows."""
+SPOOL_ROW_BYTES = 52
+"""Bytes that each row that a view shows takes of the scratch file for its sums (`ViewSums`)."""
+
+
 Measure = Callable[[dict[str, np.ndarray]], Measurement]
 Report = Callable[[RateStep], None]
 SearchMaker = Callable[[PrunePath, Measure, Report], MultiplierSearch[Product]]
@@ -62,7 +75,7 @@ def grid_search(
 
     def size_of(grid: GridScene) -> tuple[int, BitModel]:
         device = None if renderer is None else coding_device(renderer.backend, renderer.budget, grid)
-        size, bits = size_and_bits(grid, device)
+        size, bits = size_and_bits(grid, device, MEMORY if renderer is None else renderer.room)
         return (size if options.layers == 1 else round(LAYERS_COST * size)), bits
 
     plan = EFFORTS[options.effort]
@@ -104,7 +117,7 @@ def search_best(
     make : callable
         `grid_search` or `file_search`.
     source : SceneSource
-        A checked scene; held in memory as a whole.
+        A checked scene; held in `renderer.room` as a whole.
     cameras : list of Camera
         Training poses; at most as many as the effort scores are used, farthest first.
     judge : Judge
@@ -139,16 +152,19 @@ def open_path(
     make : callable, optional
         Builds the path from the arguments of `PrunePath`.
     """
-    scored = scored_poses(cameras, options)
-    size = source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep)
-    largest = max(scored, key=lambda camera: camera.width * camera.height)
-    budget.require(
-        "a search by measured costs", size + renderer.least_bytes(source, largest, sums_room(source.sh_degree))
-    )
+    scored, room = scored_poses(cameras, options), renderer.room
+    largest = largest_of(scored)
+    if room.spills:
+        size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest)
+    else:
+        size = source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep)
+        least = renderer.least_bytes(source, largest, sums_room(source.sh_degree))
+    budget.require("a search by measured costs", size + least)
     budget.take("the scene and its path", size)
     try:
-        planes = source.read(slice(0, source.count), list(FIELD))
-        with TargetViews() as targets:
+        planes = {name: room.empty((source.width(name), source.count), np.float32) for name in FIELD}
+        source.read(slice(0, source.count), list(FIELD), planes)
+        with TargetViews(room.folder) as targets:
             with clock.stage("search"):
                 rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
                 path = make(
@@ -225,11 +241,64 @@ def layered(
     return assign_layers(
         grid,
         options.layers,
-        size_and_bits(grid, coding_device(renderer.backend, renderer.budget, grid))[1],
+        size_and_bits(grid, coding_device(renderer.backend, renderer.budget, grid), renderer.room)[1],
         renderer,
         poses,
         progress,
     )
+
+
+def choose_room(
+    renderer: Renderer,
+    source: SceneSource,
+    cameras: Sequence[Camera],
+    options: CompressOptions,
+    budget: MemoryBudget,
+    folder: Path,
+) -> Room:
+    """Memory, where the scene and the path of its search fit, else scratch files; says which, and how much they may take.
+
+    Parameters
+    ----------
+    folder : path
+        For scratch files.
+
+    Raises
+    ------
+    BudgetError
+        When not even the views fit, or the disk is too small.
+    """
+    scored = scored_poses(cameras, options)
+    largest = largest_of(scored)
+    rows, keep = source.count, EFFORTS[options.effort].keep
+    whole = rows * row_bytes(source.sh_degree, keep)
+    if whole + renderer.least_bytes(source, largest, sums_room(source.sh_degree)) <= budget.free:
+        return MEMORY
+    budget.require(
+        "a search by measured costs with all else in scratch files",
+        SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest),
+    )
+    room = Scratch(folder)
+    renderer.largest = largest
+    spooled = SPOOL_ROW_BYTES * rows * len(scored)
+    LOG.info(
+        "%d Gaussians and the path of their search need %s in memory, %s are free: they go to scratch files in %s "
+        "(at most about %s; --scratch names another folder), %d rows at a time; %d bytes of each Gaussian and views of the "
+        "Gaussians that they show stay in memory; %d passes over %d poses",
+        rows, format_size(whole), format_size(budget.free), room.folder, format_size(whole + spooled), COMPACT_ROWS,
+        SPILLED_ROW_BYTES, 2 + EFFORTS[options.effort].refit_rounds, len(scored),
+    )  # fmt: skip
+    return room
+
+
+def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:
+    """Bytes that the first view of a search in scratch files needs; one that shows more than `FIRST_SHARE` says needs more."""
+    return renderer.compact_bytes(source, largest, -(-source.count // FIRST_SHARE), sum_bytes(MOST_SUMS))
+
+
+def largest_of(cameras: Sequence[Camera]) -> Camera:
+    """The camera with most pixels."""
+    return max(cameras, key=lambda camera: camera.width * camera.height)
 
 
 def row_bytes(sh_degree: int, keep: float) -> int:
@@ -249,12 +318,12 @@ def alive(logits: np.ndarray) -> np.ndarray:
     return logits >= np.float32(-np.log(1 / ALPHA_MIN - 1) - 1e-3)
 
 
-def size_and_bits(grid: GridScene, device: Backend | None = None) -> tuple[int, BitModel]:
+def size_and_bits(grid: GridScene, device: Backend | None = None, room: Room = MEMORY) -> tuple[int, BitModel]:
     """Exact bytes of a grid's file, and what its Gaussians cost.
 
     The bytes of the SH are shared among their coefficients; the rest among the rows.
     """
-    size, sh = coded_parts(grid, {}, device=device)
+    size, sh = coded_parts(grid, {}, device=device, room=room)
     size += SETTINGS_MOST
     base = size - sh
     rows = [int(np.count_nonzero(grid.sh_degrees >= level)) for level in range(1, grid.sh_degree + 1)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import tempfile
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,8 +19,8 @@ from flexgs_edge.codec import FgsSource, coded_size, open_fgs, write_grid
 from flexgs_edge.codec.container import write_container
 from flexgs_edge.errors import TargetError
 from flexgs_edge.formats import Format, read_foreign
-from flexgs_edge.grid import GridScene, from_grid
-from flexgs_edge.pipeline.best import grid_search, layered, search_best, search_files
+from flexgs_edge.grid import GridScene, values_of
+from flexgs_edge.pipeline.best import choose_room, grid_search, layered, search_best, search_files
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
@@ -192,12 +193,15 @@ class _Job:
         self._look_at_original(decide, report, None)
         if self.format is not None:
             return self._run_files(self.format, output, None, decide, report)
+        train = self.views.of(self.views.train)
+        folder = options.scratch or (tempfile.gettempdir() if output is None else output.parent)
+        renderer.room = room = choose_room(renderer, self.source, train, options, self.budget, Path(folder))
         LOG.info("searching for %s", plan.target.describe())
         grid, search = search_best(
             grid_search(options, renderer=renderer),
             renderer,
             self.source,
-            self.views.of(self.views.train),
+            train,
             decide,
             plan.target,
             options,
@@ -210,20 +214,22 @@ class _Job:
             decide.close()
         if options.layers > 1:
             with self.clock.stage("layers"):
-                grid = layered(grid, renderer, self.views.of(self.views.train), options, self.progress)
+                grid = layered(grid, renderer, train, options, self.progress)
         settings = make_settings(options, plan, self.scene, self.views, search, None)
         device = coding_device(self.workspace.backend, self.budget, grid)
         if output is None:
             if self.reporter is not None:
-                self.reporter.read_contents_of(lambda place: write_grid(place, grid, settings, device=device))
+                self.reporter.read_contents_of(
+                    lambda place: write_grid(place, grid, settings, device=device, room=room)
+                )
             size, quality = (
-                coded_size(grid, settings, device=device),
-                self._measure_source(MemorySource(from_grid(grid), origin=grid.origin), report),
+                coded_size(grid, settings, device=device, room=room),
+                self._measure_source(MemorySource(values_of(grid, room), origin=grid.origin), report),
             )
         else:
             with temporary_name(output, options.force) as place:
                 with self.clock.stage("write"):
-                    size = write_grid(place, grid, settings, device=device)
+                    size = write_grid(place, grid, settings, device=device, room=room)
                 if search.reached and plan.target.limit_bytes is not None and size > plan.target.limit_bytes:
                     raise TargetError(
                         f"{plan.target.describe()}: {options.layers} layers make the file {size} bytes; ask for fewer layers"
