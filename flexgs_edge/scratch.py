@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from flexgs_edge.budget import format_size
+from flexgs_edge.budget import AnonymousPeak, format_size
 from flexgs_edge.errors import BudgetError, InputError
 
 BLOCK_ROWS = 1 << 14
@@ -32,7 +32,15 @@ class Room:
     room for."""
     folder: Path | None = None
     peak = 0
-    """Most bytes that lay in files at a time."""
+    """Most bytes that lay in mapped files at a time."""
+
+    @property
+    def peak_anonymous(self) -> int | None:
+        """Peak of the memory that has no file behind it, since there were such files."""
+        return None
+
+    def close(self) -> None:
+        """Stop counting; arrays stay as long as they are used."""
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         """An array, not initialised; its room is given back with it."""
@@ -101,6 +109,7 @@ class Scratch(Room):
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder: Path = Path(os.path.realpath(folder))
         self.used = self.peak = 0
+        self._watch: AnonymousPeak | None = None
         kind = file_system_of(self.folder)
         if kind in _IN_MEMORY:
             raise InputError(
@@ -114,6 +123,17 @@ class Scratch(Room):
             raise InputError(
                 f"--scratch {folder}: no scratch file can be made there ({error.strerror}); name a folder on a disk with room"
             ) from error
+        self._watch = AnonymousPeak()
+
+    @property
+    def peak_anonymous(self) -> int | None:
+        """See `Room.peak_anonymous`."""
+        return None if self._watch is None else self._watch.peak
+
+    def close(self) -> None:
+        """See `Room.close`."""
+        if self._watch is not None:
+            self._watch.close()
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         """See `Room.empty`; raises `BudgetError` when the disk is full."""

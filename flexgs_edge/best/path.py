@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flexgs_edge.best.checkpoint import Checkpoint
 from flexgs_edge.best.effort import LEAST_VIEWS
 from flexgs_edge.cameras import Camera
 from flexgs_edge.progress import SILENT, Progress
@@ -14,6 +15,7 @@ from flexgs_edge.refit import normal_bytes, normal_sums, step_colours
 from flexgs_edge.render import DeviceScene, Renderer, sum_bytes
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.render.view_sums import ViewSums
+from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.score.removal import CostParts, RemovalCosts, cost_parts, cost_sums, moment_bytes, put_costs
 from flexgs_edge.scratch import MEMORY, Room
@@ -22,6 +24,9 @@ PARTS = 2
 """Interleaved parts of the poses; each round measures one, and keeps the sums of the others for the rows that stay. Bytes at 1 dB
 on fox (balanced, refits alike) by processor seconds: one part, .8 kept a round 585 kB / 141 s; two parts, .8 571 / 110, .88 558 /
 134; four parts, .88 581 / 122."""
+
+
+PART_NAMES = ("removal", "weight2", "moments")
 
 
 @dataclass
@@ -85,6 +90,8 @@ class PrunePath:
         Mend colours on the way.
     unseen : float
         Share of the Gaussians that no pose sees that stays, the most visible ones from elsewhere first.
+    checkpoint : Checkpoint, optional
+        Keeps every round; rounds that are there are taken from it.
     """
 
     def __init__(
@@ -98,15 +105,25 @@ class PrunePath:
         refit: bool = True,
         unseen: float = 1.0,
         progress: Progress = SILENT,
+        checkpoint: Checkpoint | None = None,
     ) -> None:
+        self.checkpoint = checkpoint
         self.renderer, self.origin, self.refit = renderer, origin, refit
         self.cameras, self.targets, self.progress = cameras, targets, progress
-        self.room = room = renderer.room
-        start = planes if len(rows) == planes["means"].shape[1] else take_rows(planes, rows, room)
-        source = MemorySource(start, origin=origin)
+        self.room = renderer.room
         count = max(min(PARTS, len(cameras) // LEAST_VIEWS), 1)
         self._views = [range(first, len(cameras), count) for first in range(count)]
-        with renderer.load(source, sum_bytes(2) + moment_bytes(source.sh_degree)) as scene:
+        self._parts: list[CostParts] = []
+        self.snapshots: list[Snapshot] = []
+        if not self._resumed():
+            self._begin(planes, rows, unseen)
+
+    def _begin(self, planes: dict[str, np.ndarray], rows: np.ndarray, unseen: float) -> None:
+        """Measure costs on the whole scene."""
+        room = self.room
+        start = planes if len(rows) == planes["means"].shape[1] else take_rows(planes, rows, room)
+        source = MemorySource(start, origin=self.origin)
+        with self.renderer.load(source, sum_bytes(2) + moment_bytes(source.sh_degree)) as scene:
             self._parts = [self._measure(scene, some, keep=True) for some in self._views]
         costs = RemovalCosts.of(self._parts, room)
         keep = np.flatnonzero(~_hidden(start, costs.weight2, unseen))
@@ -114,7 +131,7 @@ class PrunePath:
             rows, start = room.take(rows, keep), take_rows(start, keep, room)
             self._parts = [part.take(keep, room) for part in self._parts]
             costs = RemovalCosts.of(self._parts, room)
-        self.snapshots = [Snapshot(rows, start, costs)]
+        self._add(Snapshot(rows, start, costs), keep_views=True)
 
     def descend(self, share: float) -> Snapshot:
         """Keep `share` of the last snapshot, measure costs again in the next part of the poses, and mend colours by one step.
@@ -122,6 +139,8 @@ class PrunePath:
         One pass gives both, so the costs are those before the step: it moves colours by little, the rest of the change is in the
         rows that went.
         """
+        if self._resumed():
+            return self.snapshots[-1]
         last = self.snapshots[-1]
         keep = np.flatnonzero(last.cheapest(last.count - round(last.count * share)))
         planes = take_rows(last.planes, keep, self.room)
@@ -134,8 +153,35 @@ class PrunePath:
             measured if part == turn else sums.take(keep, self.room) for part, sums in enumerate(self._parts)
         ]
         costs = RemovalCosts.of(self._parts, self.room)
-        self.snapshots.append(Snapshot(self.room.take(last.rows, keep), planes, costs))
-        return self.snapshots[-1]
+        return self._add(Snapshot(self.room.take(last.rows, keep), planes, costs))
+
+    def _add(self, snapshot: Snapshot, keep_views: bool = False) -> Snapshot:
+        """Append a snapshot, and keep it for a later run where that is asked for."""
+        self.snapshots.append(snapshot)
+        if self.checkpoint is not None:
+            arrays = [("rows", snapshot.rows), *((f"plane-{name}", values) for name, values in snapshot.planes.items())]
+            for number, part in enumerate(self._parts):
+                arrays += [(f"part-{number}-{name}", getattr(part, name)) for name in PART_NAMES]
+            if keep_views and self.refit:
+                arrays += [(f"view-{view}", self.targets[view]) for view in range(len(self.cameras))]
+            self.checkpoint.save(len(self.snapshots) - 1, arrays)
+        return snapshot
+
+    def _resumed(self) -> bool:
+        """Take the next snapshot from where an earlier run kept it; False where it did not."""
+        number = len(self.snapshots)
+        if self.checkpoint is None or not self.checkpoint.has(number):
+            return False
+        arrays = self.checkpoint.load(number, self.room)
+        planes = {name: arrays[f"plane-{name}"] for name in FIELD}
+        self._parts = [
+            CostParts(*(arrays[f"part-{part}-{name}"] for name in PART_NAMES)) for part in range(len(self._views))
+        ]
+        self.snapshots.append(Snapshot(arrays["rows"], planes, RemovalCosts.of(self._parts, self.room)))
+        if number == 0 and self.refit:
+            for view in range(len(self.cameras)):
+                self.targets.add(view, arrays[f"view-{view}"])
+        return True
 
     def _measure(self, scene: DeviceScene, views: Sequence[int], keep: bool = False) -> CostParts:
         costs = ViewSums(self.renderer, scene, [cost_sums(self.renderer, scene.sh_degree)])

@@ -93,6 +93,13 @@ from flexgs_edge.cli import words
     help="Folder for scratch files, used when a scene does not fit into the memory limit (best only). Default: beside OUT.",
 )
 @words.option(
+    "Run",
+    "--resume",
+    is_flag=True,
+    help="Keep every round of the search in the scratch folder until the run is done, and go on from those of a run of the same "
+    "scene, poses and options that was cut short (best only): the bytes are those of one run.",
+)
+@words.option(
     "Method",
     "--score",
     metavar="gs|meson|FILE",

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from flexgs_edge.adapt import Measurement, SearchResult, Step, Target
+from flexgs_edge.best.checkpoint import Checkpoint
 from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.layers import assign_layers
@@ -36,6 +37,7 @@ from flexgs_edge.render.renderer import FIRST_SHARE
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
+from flexgs_edge.score.cache import fingerprint
 from flexgs_edge.scratch import MEMORY, Room, Scratch
 
 LOG = logging.getLogger("flexgs_edge")
@@ -109,6 +111,7 @@ def search_best(
     clock: Stopwatch,
     on_step: Callable[[Step], None] | None = None,
     progress: Progress = SILENT,
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[Product, SearchResult]:
     """What to write, and the steps that led to it.
 
@@ -130,7 +133,8 @@ def search_best(
     BudgetError
         When the scene does not fit.
     """
-    with open_path(renderer, source, cameras, options, budget, clock, progress) as path, clock.stage("search"):
+    path_of = open_path(renderer, source, cameras, options, budget, clock, progress, checkpoint=checkpoint)
+    with path_of as path, clock.stage("search"):
         return search_path(make, path, renderer, source, judge, target, options, on_step)
 
 
@@ -144,6 +148,7 @@ def open_path(
     clock: Stopwatch,
     progress: Progress = SILENT,
     make: Callable[..., PrunePath] = PrunePath,
+    checkpoint: Checkpoint | None = None,
 ) -> Iterator[PrunePath]:
     """The path that searches walk, at its start; several targets may share it, the weakest compression first.
 
@@ -151,6 +156,8 @@ def open_path(
     ----------
     make : callable, optional
         Builds the path from the arguments of `PrunePath`.
+    checkpoint : Checkpoint, optional
+        Where the path keeps its rounds.
     """
     scored, room = scored_poses(cameras, options), renderer.room
     largest = largest_of(scored)
@@ -177,6 +184,7 @@ def open_path(
                     refit=options.refit,
                     unseen=options.unseen_share,
                     progress=progress,
+                    **({} if checkpoint is None else {"checkpoint": checkpoint}),
                 )
             del planes  # the path has its own
             yield path
@@ -289,6 +297,24 @@ def choose_room(
         SPILLED_ROW_BYTES, 2 + EFFORTS[options.effort].refit_rounds, len(scored),
     )  # fmt: skip
     return room
+
+
+def open_checkpoint(
+    renderer: Renderer, source: SceneSource, cameras: Sequence[Camera], options: CompressOptions, folder: Path
+) -> Checkpoint:
+    """Where the path of a search keeps its rounds: a folder named by all that they depend on."""
+    words = f"path {EFFORTS[options.effort].keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r}"
+    assert options.near is not None and options.extent is not None
+    scored = scored_poses(cameras, options)
+    key = fingerprint(source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
+    checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")
+    if checkpoint.rounds:
+        LOG.info(
+            "%s: an earlier run was cut short after %d rounds: going on from there",
+            checkpoint.folder,
+            checkpoint.rounds,
+        )
+    return checkpoint
 
 
 def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:

@@ -17,10 +17,10 @@ from flexgs_edge.bitspec import PAPER, BitSpec
 from flexgs_edge.budget import MemoryBudget, format_size
 from flexgs_edge.codec import FgsSource, coded_size, open_fgs, write_grid
 from flexgs_edge.codec.container import write_container
-from flexgs_edge.errors import TargetError
+from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, values_of
-from flexgs_edge.pipeline.best import choose_room, grid_search, layered, search_best, search_files
+from flexgs_edge.pipeline.best import choose_room, grid_search, layered, open_checkpoint, search_best, search_files
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
@@ -40,6 +40,7 @@ from flexgs_edge.render.quality import Quality
 from flexgs_edge.report.result import CompressResult
 from flexgs_edge.scene import MemorySource, SceneSource
 from flexgs_edge.score import ScoreCache, fingerprint, load_scores, save_scores, score_scene
+from flexgs_edge.scratch import MEMORY, Room
 from flexgs_edge.sensitivity import Sensitivity
 
 LOG = logging.getLogger("flexgs_edge")
@@ -131,6 +132,7 @@ class _Job:
         self.groups = options.bit_spec()[1]
         self.sensitivity: list[Sensitivity] = []
         self.scores_reused = False
+        self.room: Room = MEMORY
 
     def run(self, output: Path | None, scores: np.ndarray | None) -> CompressResult:
         """The whole job; `scores` come from a file, or are computed."""
@@ -192,10 +194,17 @@ class _Job:
         renderer = self.workspace.renderer
         self._look_at_original(decide, report, None)
         if self.format is not None:
+            if options.resume or options.scratch is not None:
+                raise InputError(
+                    f"--{'resume' if options.resume else 'scratch'} works on .fgs files alone: the search for a "
+                    f"{self.format.suffix} is in memory and in one go; leave it out"
+                )
             return self._run_files(self.format, output, None, decide, report)
         train = self.views.of(self.views.train)
-        folder = options.scratch or (tempfile.gettempdir() if output is None else output.parent)
-        renderer.room = room = choose_room(renderer, self.source, train, options, self.budget, Path(folder))
+        folder = Path(options.scratch or (tempfile.gettempdir() if output is None else output.parent))
+        self.room = renderer.room = room = choose_room(renderer, self.source, train, options, self.budget, folder)
+        with self.clock.stage("fingerprint"):
+            kept = open_checkpoint(renderer, self.source, train, options, folder) if options.resume else None
         LOG.info("searching for %s", plan.target.describe())
         grid, search = search_best(
             grid_search(options, renderer=renderer),
@@ -209,6 +218,7 @@ class _Job:
             self.clock,
             on_step=lambda step: LOG.info("%s", _step_words(step, plan.target)),
             progress=self.progress,
+            checkpoint=kept,
         )
         if decide is not report:
             decide.close()
@@ -236,6 +246,9 @@ class _Job:
                     )
                 quality = self._measure_source(open_fgs(place), report)
             LOG.info("wrote %s, %s", output, format_size(size))
+        if kept is not None:
+            kept.remove()
+        room.close()
         return self._result(output, size, search.chosen.choice, grid, search, quality)
 
     def _run_files(
@@ -397,7 +410,7 @@ class _Job:
             scores_saved=options.save_scores,
             score_cache=options.score_cache if plan.computes_scores else None,
             scores_reused=self.scores_reused,
-            run=run_info(self.budget, self.clock, self.workspace.backend if self.workspace else None),
+            run=run_info(self.budget, self.clock, self.workspace.backend if self.workspace else None, self.room),
             format=self.format.suffix[1:] if self.format else "fgs",
             file_sh_degree=scene.sh_degree,
         )
