@@ -203,8 +203,10 @@ class _Job:
         train = self.views.of(self.views.train)
         folder = Path(options.scratch or (tempfile.gettempdir() if output is None else output.parent))
         self.room = renderer.room = room = choose_room(renderer, self.source, train, options, self.budget, folder)
-        with self.clock.stage("fingerprint"):
-            kept = open_checkpoint(renderer, self.source, train, options, folder) if options.resume else None
+        kept = None
+        if options.resume:
+            with self.clock.stage("fingerprint"):
+                kept = open_checkpoint(renderer, self.source, train, options, folder)
         LOG.info("searching for %s", plan.target.describe())
         grid, search = search_best(
             grid_search(options, renderer=renderer),
