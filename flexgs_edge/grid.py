@@ -207,14 +207,14 @@ def to_grid(
     position, order = _along_curve(planes["means"], steps.position, layer, room)
     scale, rotation, dc = (room.empty((3, count), np.int32) for _ in range(3))
     opacity = room.empty((count,), np.int32)
+    ordered = _Ordered(planes, order, room)
     for part in blocks(count):
         rows = order[part]
-        quats, log_scales = canonical_axes(planes["quats"][:, rows], planes["log_scales"][:, rows])
+        quats, log_scales = canonical_axes(ordered.of("quats", part), ordered.of("log_scales", part))
         scale[:, part] = _codes("log_scales", log_scales, steps.scale, rows)
         rotation[:, part] = _codes("quats", quats[1:], steps.rotation, rows)
-        logits = planes["opacity_logits"].reshape(1, count)[:, rows]
-        opacity[part] = _codes("opacity_logits", logits, steps.opacity, rows)[0]
-        dc[:, part] = _colour_codes("sh_dc", planes["sh_dc"][:, None, rows], steps.colour(steps.dc), rows)[:, 0]
+        opacity[part] = _codes("opacity_logits", ordered.of("opacity_logits", part), steps.opacity, rows)[0]
+        dc[:, part] = _colour_codes("sh_dc", ordered.of("sh_dc", part)[:, None], steps.colour(steps.dc), rows)[:, 0]
     degrees = degrees[order]
     grid = GridScene(
         count,
@@ -228,7 +228,7 @@ def to_grid(
         dc,
         degrees,
         tuple(
-            _band_codes(planes["sh_rest"], degree, order[degrees >= degree], steps, room)
+            _band_codes(ordered, degree, np.flatnonzero(degrees >= degree), steps, room, order)
             for degree in range(1, top + 1)
         ),
         np.zeros(count, np.uint8) if layer is None else _bytes("layer", layer, count, 255)[order],
@@ -340,7 +340,8 @@ def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray, room: Room
         rows = np.arange(part.start, part.stop)
         dc[:, part] = _colour_codes("sh_dc", sh_dc[:, None, part], grid.steps.colour(grid.steps.dc), rows)[:, 0]
     degrees = range(1, grid.sh_degree + 1)
-    bands = tuple(_band_codes(sh_rest, d, np.flatnonzero(grid.sh_degrees >= d), grid.steps, room) for d in degrees)
+    colours = _Ordered({"sh_rest": sh_rest}, None, room)
+    bands = tuple(_band_codes(colours, d, np.flatnonzero(grid.sh_degrees >= d), grid.steps, room) for d in degrees)
     return replace(grid, dc=dc, sh=bands)
 
 
@@ -400,14 +401,42 @@ def _colour_codes(name: str, rgb: np.ndarray, steps: np.ndarray, order: np.ndarr
     return _codes(name, colour, steps[:, None, None].astype(np.float64), order)
 
 
-def _band_codes(sh_rest: np.ndarray, degree: int, rows: np.ndarray, steps: Steps, room: Room) -> np.ndarray:
-    """[3 * (2l + 1), n] codes of the coefficients of one SH degree."""
-    band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
-    rgb = sh_rest.reshape(3, len(sh_rest) // 3, sh_rest.shape[1])[:, band]
+class _Ordered:
+    """Columns of planes in another order (None: their own), read in parts.
+
+    From memory they are looked up as they are asked for. In files all are put in order first, plane by plane: otherwise places
+    all over every plane would be read for each part.
+    """
+
+    def __init__(self, planes: Planes, order: np.ndarray | None, room: Room) -> None:
+        self._planes, self._order = dict(planes), order
+        if order is not None and room.spills:
+            self._planes = {name: room.take(values, order) for name, values in planes.items() if name != "means"}
+            self._order = None
+
+    def of(self, field: str, rows: slice) -> np.ndarray:
+        """[width, m] of some rows."""
+        values = self._planes[field]
+        return values.reshape(-1, values.shape[-1])[:, rows if self._order is None else self._order[rows]]
+
+    def band(self, degree: int, rows: np.ndarray) -> np.ndarray:
+        """[3, 2l + 1, m] coefficients of one SH degree of some rows."""
+        values = self._planes["sh_rest"]
+        band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
+        rgb = values.reshape(3, len(values) // 3, values.shape[1])[:, band]
+        return rgb[:, :, rows if self._order is None else self._order[rows]]
+
+
+def _band_codes(
+    planes: _Ordered, degree: int, rows: np.ndarray, steps: Steps, room: Room, order: np.ndarray | None = None
+) -> np.ndarray:
+    """[3 * (2l + 1), n] codes of the coefficients of one SH degree; `order` gives input rows for the message."""
     codes = room.empty((3, 2 * degree + 1, len(rows)), np.int32)
     for part in blocks(len(rows)):
         chosen = rows[part]
-        codes[:, :, part] = _colour_codes("sh_rest", rgb[:, :, chosen], steps.colour(steps.sh[degree - 1]), chosen)
+        named = chosen if order is None else order[chosen]
+        rgb = planes.band(degree, chosen)
+        codes[:, :, part] = _colour_codes("sh_rest", rgb, steps.colour(steps.sh[degree - 1]), named)
     return codes.reshape(6 * degree + 3, len(rows))
 
 

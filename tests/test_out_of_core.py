@@ -213,7 +213,7 @@ def run(folder: Path, *words: str, seconds: float | None = None) -> subprocess.C
 
 
 def test_kills_lose_no_bytes(tmp_path: Path) -> None:
-    """Under a limit that sends the scene to scratch files, killed twice at any moment, and resumed."""
+    """Killed twice at any moment, and resumed (what lies in scratch files alone is gone with the process: test_scratch.py)."""
     write_ply(tmp_path / "point_cloud.ply", random_scene(6000, 8, 3, size=-4.0))
     write_cameras(tmp_path / "cameras.json")
     started = time.perf_counter()
