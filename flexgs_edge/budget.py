@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import resource
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -27,6 +28,10 @@ _UNITS = {
     "MIB": 2**20,
     "GIB": 2**30,
 }
+
+
+SAMPLE_SECONDS = 0.05
+"""Seconds between looks at the memory: peaks that are shorter may be missed. A look takes 30 microseconds."""
 
 
 def parse_size(text: str) -> int:
@@ -78,6 +83,37 @@ def current_rss() -> int:
             return int(statm.read().split()[1]) * resource.getpagesize()
     except OSError:
         return peak_rss()
+
+
+def anonymous_rss() -> int | None:
+    """Resident memory of this process without a file behind it, in bytes; None where the system does not tell."""
+    try:
+        with open("/proc/self/status", "rb") as status:
+            return next(int(line.split()[1]) for line in status if line.startswith(b"RssAnon:")) * 1024
+    except (OSError, StopIteration):
+        return None
+
+
+class AnonymousPeak:
+    """Watches the memory that no file stands behind, from now on: the kernel keeps no peak of it.
+
+    Pages of mapped scratch files are resident as long as nobody needs the room, so they tell nothing of what a run needs.
+    """
+
+    def __init__(self) -> None:
+        self.peak = anonymous_rss()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="memory", daemon=True)
+        self._thread.start()
+
+    def _watch(self) -> None:
+        while not self._stop.wait(SAMPLE_SECONDS):
+            self.peak = max(self.peak or 0, anonymous_rss() or 0) or None
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._stop.set()
+        self._thread.join()
 
 
 def available_memory(proc: str | Path = "/proc", groups: str | Path = "/sys/fs/cgroup") -> int:

@@ -7,7 +7,7 @@ machine gets the same bits.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -17,10 +17,10 @@ from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.rotations import canonical_axes
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
+from flexgs_edge.scratch import MEMORY, Room, blocks, stable_order
 
 POSITION_BITS = 21
 """Cells along an axis of a scene as a power of two: three of them fill a 63-bit curve index."""
-_BLOCK_ROWS = 16384
 
 Planes = Mapping[str, np.ndarray]
 
@@ -132,22 +132,22 @@ class GridScene:
         """Rows with SH above degree 0."""
         return int(np.count_nonzero(self.sh_degrees))
 
-    def take(self, rows: np.ndarray) -> GridScene:
+    def take(self, rows: np.ndarray, room: Room = MEMORY) -> GridScene:
         """The rows `rows` in their order, with the SH degree that is left."""
         rows = np.arange(self.count)[rows]
         degrees = self.sh_degrees[rows]
         top = int(degrees.max(initial=0))
-        bands = tuple(self.sh[degree][:, _places(self.sh_degrees, rows, degree + 1)] for degree in range(top))
+        bands = tuple(room.take(self.sh[d], _places(self.sh_degrees, rows, d + 1)) for d in range(top))
         return GridScene(
             len(rows),
             top,
             self.origin,
             replace(self.steps, sh=self.steps.sh[:top]),
-            self.position[:, rows],
-            self.scale[:, rows],
-            self.rotation[:, rows],
-            self.opacity[rows],
-            self.dc[:, rows],
+            room.take(self.position, rows),
+            room.take(self.scale, rows),
+            room.take(self.rotation, rows),
+            room.take(self.opacity, rows),
+            room.take(self.dc, rows),
             degrees,
             bands,
             self.layer[rows],
@@ -167,6 +167,7 @@ def to_grid(
     steps: Steps,
     origin: np.ndarray | Sequence[float],
     layer: np.ndarray | None = None,
+    room: Room = MEMORY,
 ) -> tuple[GridScene, np.ndarray]:
     """Put a scene on its grid.
 
@@ -185,6 +186,8 @@ def to_grid(
         [3] f64.
     layer : np.ndarray, optional
         [n], 0 to 255.
+    room : Room, optional
+        Where the grid goes.
 
     Returns
     -------
@@ -201,41 +204,77 @@ def to_grid(
     top = int(degrees.max(initial=0))
     if len(steps.sh) < top or planes["sh_rest"].shape[0] < 3 * sh_rest_count(top):
         raise InputError(f"SH degree {top} asked for: expected a step and coefficients for each degree up to it")
-    position = _codes("means", planes["means"], steps.position)
-    cells = position - position.min(axis=1, keepdims=True, initial=CODE_LIMIT) if count else position
-    if cells.max(initial=0) >= 1 << POSITION_BITS:
-        raise InputError(
-            f"means: the scene is {int(cells.max())} position steps of {steps.position:g} wide, expected less than "
-            f"2^{POSITION_BITS}: take a larger step or remove far outliers"
-        )
-    layers = np.zeros(count, np.uint8) if layer is None else _bytes("layer", layer, count, 255)
-    order = np.lexsort((morton(cells), layers)).astype(np.int64)
-    scale, rotation, dc = (np.empty((3, count), np.int32) for _ in range(3))
-    opacity = np.empty(count, np.int32)
-    for part in _blocks(count):
+    position, order = _along_curve(planes["means"], steps.position, layer, room)
+    scale, rotation, dc = (room.empty((3, count), np.int32) for _ in range(3))
+    opacity = room.empty((count,), np.int32)
+    ordered = _Ordered(planes, order, room)
+    for part in blocks(count):
         rows = order[part]
-        quats, log_scales = canonical_axes(planes["quats"][:, rows], planes["log_scales"][:, rows])
+        quats, log_scales = canonical_axes(ordered.of("quats", part), ordered.of("log_scales", part))
         scale[:, part] = _codes("log_scales", log_scales, steps.scale, rows)
         rotation[:, part] = _codes("quats", quats[1:], steps.rotation, rows)
-        logits = planes["opacity_logits"].reshape(1, count)[:, rows]
-        opacity[part] = _codes("opacity_logits", logits, steps.opacity, rows)[0]
-        dc[:, part] = _colour_codes("sh_dc", planes["sh_dc"][:, None, rows], steps.colour(steps.dc), rows)[:, 0]
+        opacity[part] = _codes("opacity_logits", ordered.of("opacity_logits", part), steps.opacity, rows)[0]
+        dc[:, part] = _colour_codes("sh_dc", ordered.of("sh_dc", part)[:, None], steps.colour(steps.dc), rows)[:, 0]
     degrees = degrees[order]
     grid = GridScene(
         count,
         top,
         np.array(origin, np.float64).reshape(3),
         replace(steps, sh=steps.sh[:top]),
-        position[:, order],
+        position,
         scale,
         rotation,
         opacity,
         dc,
         degrees,
-        tuple(_band_codes(planes["sh_rest"], degree, order[degrees >= degree], steps) for degree in range(1, top + 1)),
-        layers[order],
+        tuple(
+            _band_codes(ordered, degree, np.flatnonzero(degrees >= degree), steps, room, order)
+            for degree in range(1, top + 1)
+        ),
+        np.zeros(count, np.uint8) if layer is None else _bytes("layer", layer, count, 255)[order],
     )
     return grid, order
+
+
+def _along_curve(means: np.ndarray, step: float, layer: np.ndarray | None, room: Room) -> tuple[np.ndarray, np.ndarray]:
+    """Position codes [3, n] i32 in their order, and that order ([n] i64): by layer, then along the Morton curve."""
+    count = means.shape[1]
+    codes = room.empty((3, count), np.int32)
+    low, high = np.full((3, 1), CODE_LIMIT), np.full((3, 1), -CODE_LIMIT)
+    for part in blocks(count):
+        codes[:, part] = some = _codes("means", means[:, part], step, np.arange(part.start, part.stop))
+        low, high = (
+            np.minimum(low, some.min(axis=1, keepdims=True)),
+            np.maximum(high, some.max(axis=1, keepdims=True)),
+        )
+    if count and (high - low).max() >= 1 << POSITION_BITS:
+        raise InputError(
+            f"means: the scene is {int((high - low).max())} position steps of {step:g} wide, expected less than "
+            f"2^{POSITION_BITS}: take a larger step or remove far outliers"
+        )
+    keys = room.empty((count,), np.uint64)
+    for part in blocks(count):
+        keys[part] = morton(codes[:, part] - low)
+    layers = None if layer is None else _bytes("layer", layer, count, 255)
+    order = stable_order(keys, room) if layers is None else np.lexsort((keys, layers)).astype(np.int64)
+    return room.take(codes, order), order
+
+
+def values_of(grid: GridScene, room: Room = MEMORY) -> dict[str, np.ndarray]:
+    """`from_grid` of all rows and fields, in arrays of `room`."""
+    planes = {name: room.empty((field.width(grid.sh_degree), grid.count), np.float32) for name, field in FIELD.items()}
+    names = [name for name in FIELD if name != "sh_rest"]
+    first = np.zeros(grid.sh_degree, np.int64)
+    for part in blocks(grid.count):
+        for name, values in from_grid(grid, part, names).items():
+            planes[name][:, part] = values
+        # As `from_grid` finds them, but counted once.
+        degrees = grid.sh_degrees[part]
+        last = first + np.array([np.count_nonzero(degrees > level) for level in range(grid.sh_degree)], np.int64)
+        bands = [band[:, a:b] for band, a, b in zip(grid.sh, first.tolist(), last.tolist(), strict=True)]
+        planes["sh_rest"][:, part] = _spread_bands(grid, degrees, bands)
+        first = last
+    return planes
 
 
 def from_grid(
@@ -270,14 +309,21 @@ def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:
         start, stop, step = rows.indices(grid.count)
         rows = rows if step == 1 else np.arange(start, stop, step)
     degrees = grid.sh_degrees[rows]
-    planes = np.zeros((3, sh_rest_count(grid.sh_degree), len(degrees)), np.float32)
+    bands = []
     for degree in range(1, grid.sh_degree + 1):
-        has = np.flatnonzero(degrees >= degree)
         if isinstance(rows, slice):
             first = int(np.count_nonzero(grid.sh_degrees[:start] >= degree))
-            chosen = grid.sh[degree - 1][:, first : first + len(has)]
+            bands.append(grid.sh[degree - 1][:, first : first + int(np.count_nonzero(degrees >= degree))])
         else:
-            chosen = grid.sh[degree - 1][:, _places(grid.sh_degrees, np.arange(grid.count)[rows], degree)]
+            bands.append(grid.sh[degree - 1][:, _places(grid.sh_degrees, np.arange(grid.count)[rows], degree)])
+    return _spread_bands(grid, degrees, bands)
+
+
+def _spread_bands(grid: GridScene, degrees: np.ndarray, bands: Sequence[np.ndarray]) -> np.ndarray:
+    """[3 * K, n] f32 of rows with these degrees ([n]) and these codes of each degree."""
+    planes = np.zeros((3, sh_rest_count(grid.sh_degree), len(degrees)), np.float32)
+    for degree, chosen in enumerate(bands, start=1):
+        has = np.flatnonzero(degrees >= degree)
         values = _rgb(chosen.reshape(3, 2 * degree + 1, len(has)), grid.steps.colour(grid.steps.sh[degree - 1]))
         band = planes[:, degree * degree - 1 : (degree + 1) ** 2 - 1]
         for colour, coefficients in zip(band, values, strict=True):
@@ -287,12 +333,15 @@ def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:
     return planes.reshape(planes.shape[0] * planes.shape[1], len(degrees))
 
 
-def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray) -> GridScene:
+def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray, room: Room = MEMORY) -> GridScene:
     """The same rows with other colours ([3, n] and [3 * K, n] f32, in the grid's row order) put on the same steps."""
-    rows = np.arange(grid.count)
-    dc = _colour_codes("sh_dc", sh_dc[:, None], grid.steps.colour(grid.steps.dc), rows)[:, 0]
+    dc = room.empty((3, grid.count), np.int32)
+    for part in blocks(grid.count):
+        rows = np.arange(part.start, part.stop)
+        dc[:, part] = _colour_codes("sh_dc", sh_dc[:, None, part], grid.steps.colour(grid.steps.dc), rows)[:, 0]
     degrees = range(1, grid.sh_degree + 1)
-    bands = tuple(_band_codes(sh_rest, d, rows[grid.sh_degrees >= d], grid.steps) for d in degrees)
+    colours = _Ordered({"sh_rest": sh_rest}, None, room)
+    bands = tuple(_band_codes(colours, d, np.flatnonzero(grid.sh_degrees >= d), grid.steps, room) for d in degrees)
     return replace(grid, dc=dc, sh=bands)
 
 
@@ -307,13 +356,18 @@ def morton(cells: np.ndarray) -> np.ndarray:
     return index
 
 
-def near_rows(means: np.ndarray) -> np.ndarray:
+def near_rows(means: np.ndarray, room: Room = MEMORY) -> np.ndarray:
     """[n] i64: rows of `means` ([3, n]) along a Morton curve, so that neighbours on it are near each other."""
     # By rank along each axis: a few far rows do not squeeze the rest into one cell.
-    cells = np.empty(means.shape, np.int64)
-    for axis, line in enumerate(means):
-        cells[axis, np.argsort(line, kind="stable")] = np.arange(line.size) * 1024 // line.size
-    return np.argsort(morton(cells), kind="stable")
+    count = means.shape[1]
+    cells, index = room.empty(means.shape, np.int16), room.empty((count,), np.uint64)
+    for line, ranks in zip(means, cells, strict=True):
+        order = stable_order(line, room)
+        for part in blocks(count):
+            ranks[order[part]] = np.arange(part.start, part.stop) * 1024 // count
+    for part in blocks(count):
+        index[part] = morton(cells[:, part])
+    return stable_order(index, room)
 
 
 def _spread(bits: np.ndarray) -> np.ndarray:
@@ -361,21 +415,43 @@ def _colour_codes(name: str, rgb: np.ndarray, steps: np.ndarray, order: np.ndarr
     return _codes(name, colour, steps[:, None, None].astype(np.float64), order)
 
 
-def _band_codes(sh_rest: np.ndarray, degree: int, rows: np.ndarray, steps: Steps) -> np.ndarray:
-    """[3 * (2l + 1), n] codes of the coefficients of one SH degree."""
-    band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
-    rgb = sh_rest.reshape(3, len(sh_rest) // 3, sh_rest.shape[1])[:, band]
-    codes = np.empty((3, 2 * degree + 1, len(rows)), np.int32)
-    for part in _blocks(len(rows)):
+class _Ordered:
+    """Columns of planes in another order (None: their own), read in parts.
+
+    From memory they are looked up as they are asked for. In files all are put in order first, plane by plane: otherwise places
+    all over every plane would be read for each part.
+    """
+
+    def __init__(self, planes: Planes, order: np.ndarray | None, room: Room) -> None:
+        self._planes, self._order = dict(planes), order
+        if order is not None and room.spills:
+            self._planes = {name: room.take(values, order) for name, values in planes.items() if name != "means"}
+            self._order = None
+
+    def of(self, field: str, rows: slice) -> np.ndarray:
+        """[width, m] of some rows."""
+        values = self._planes[field]
+        return values.reshape(-1, values.shape[-1])[:, rows if self._order is None else self._order[rows]]
+
+    def band(self, degree: int, rows: np.ndarray) -> np.ndarray:
+        """[3, 2l + 1, m] coefficients of one SH degree of some rows."""
+        values = self._planes["sh_rest"]
+        band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
+        rgb = values.reshape(3, len(values) // 3, values.shape[1])[:, band]
+        return rgb[:, :, rows if self._order is None else self._order[rows]]
+
+
+def _band_codes(
+    planes: _Ordered, degree: int, rows: np.ndarray, steps: Steps, room: Room, order: np.ndarray | None = None
+) -> np.ndarray:
+    """[3 * (2l + 1), n] codes of the coefficients of one SH degree; `order` gives input rows for the message."""
+    codes = room.empty((3, 2 * degree + 1, len(rows)), np.int32)
+    for part in blocks(len(rows)):
         chosen = rows[part]
-        codes[:, :, part] = _colour_codes("sh_rest", rgb[:, :, chosen], steps.colour(steps.sh[degree - 1]), chosen)
+        named = chosen if order is None else order[chosen]
+        rgb = planes.band(degree, chosen)
+        codes[:, :, part] = _colour_codes("sh_rest", rgb, steps.colour(steps.sh[degree - 1]), named)
     return codes.reshape(6 * degree + 3, len(rows))
-
-
-def _blocks(count: int) -> Iterator[slice]:
-    """Parts of rows: their numbers in float64, several copies of them, are held for a part at a time."""
-    for start in range(0, count, _BLOCK_ROWS):
-        yield slice(start, min(start + _BLOCK_ROWS, count))
 
 
 def _values(codes: np.ndarray, step: float) -> np.ndarray:

@@ -24,6 +24,7 @@ from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.score.removal import RemovalCosts
+from flexgs_edge.scratch import MEMORY
 from synthetic import make_camera, random_scene
 
 SLOPES = Slopes(dict.fromkeys(GEOMETRY, 100.0))
@@ -38,6 +39,7 @@ class FakePath:
     """A path whose costs are known: descending removes the cheapest and changes no cost."""
 
     renderer = origin = cameras = targets = None
+    room = MEMORY
 
     def __init__(self, count: int = 600, degree: int = 1, unseen: int = 0, scale: float = 1.0) -> None:
         rng = np.random.default_rng(81)
@@ -92,9 +94,9 @@ def powers(loss: float = 0.6, size: float = -0.45) -> World:
 
 @pytest.fixture(autouse=True)
 def _known_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
-    def to_grid(planes: Any, degrees: Any, steps: Steps, origin: Any) -> Any:
+    def to_grid(planes: Any, degrees: Any, steps: Steps, origin: Any, **words: Any) -> Any:
         World.multiplier = (steps.opacity / UNIT) ** 2
-        return grid.to_grid(planes, degrees, steps, origin)
+        return grid.to_grid(planes, degrees, steps, origin, **words)
 
     monkeypatch.setattr(World, "multiplier", None)
     monkeypatch.setattr(search_module, "to_grid", to_grid)
@@ -253,7 +255,7 @@ def test_efforts_grow() -> None:
 def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> None:
     rng = np.random.default_rng(5)
     mended = {"sh_dc": rng.normal(size=(3, 3)).astype(np.float32), "sh_rest": np.ones((9, 3), np.float32)}
-    last = Mended.of(np.array([7, 2, 5]), np.array([1, 0, 1]), mended)
+    last = Mended.of(np.array([2, 5, 7]), np.array([0, 1, 1]), np.array([2, 0, 1]), mended)
     planes = {"sh_dc": np.zeros((3, 4), np.float32), "sh_rest": np.zeros((24, 4), np.float32), "means": np.ones((3, 4))}
     found = last.apply(np.array([1, 2, 5, 7]), np.array([1, 1, 1, 1]), planes)
     np.testing.assert_array_equal(

@@ -97,7 +97,7 @@ def test_json_has_every_documented_key_and_no_infinity(done: tuple[Path, Compres
         "identical_views", "worst", "views",
     }  # fmt: skip
     assert set(record["run"]) == {
-        "seconds", "stages", "startup_ms", "compile_ms", "memory_limit", "peak_memory", "device",
+        "seconds", "stages", "startup_ms", "compile_ms", "memory_limit", "peak_memory", "peak_anonymous", "scratch", "device",
     }  # fmt: skip
     assert record["search"] and all(step["seconds"] >= 0 for step in record["search"])
     assert list(record["run"]["stages"]) == [

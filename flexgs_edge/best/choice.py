@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.score.removal import RemovalCosts
+from flexgs_edge.scratch import MEMORY, Room, blocks
 
 SH_FACTOR = 2.0
 """Costs of dropped SH count this much. They are measured one Gaussian at a time, but neighbours on a surface lose the same
@@ -54,14 +55,15 @@ def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.n
     tuple of np.ndarray
         [n] bool kept, [n] u8 SH degree kept.
     """
-    top = len(costs.sh)
-    lagrangian = [SH_FACTOR * costs.sh[level] + multiplier * bits.of_degree(level) for level in range(top)]
-    lagrangian.append(np.full(len(costs.removal), multiplier * bits.of_degree(top)))
-    degrees = np.argmin(lagrangian, axis=0).astype(np.uint8)
-    keep = REMOVAL_FACTOR * costs.removal >= np.min(lagrangian, axis=0)
-    unseen = costs.weight2 <= 0
-    keep[unseen] = True
-    degrees[unseen] = 0
+    top, count = len(costs.sh), len(costs.removal)
+    keep, degrees = np.empty(count, bool), np.empty(count, np.uint8)
+    for rows in blocks(count):
+        removal, sh = costs.removal[rows], costs.sh[:, rows]
+        lagrangian = [SH_FACTOR * sh[level] + multiplier * bits.of_degree(level) for level in range(top)]
+        lagrangian.append(np.full(len(removal), multiplier * bits.of_degree(top)))
+        unseen = costs.weight2[rows] <= 0
+        degrees[rows] = np.where(unseen, 0, np.argmin(lagrangian, axis=0))
+        keep[rows] = unseen | (REMOVAL_FACTOR * removal >= np.min(lagrangian, axis=0))
     return keep, degrees
 
 
@@ -81,16 +83,20 @@ def choose_one_degree(costs: RemovalCosts, bits: BitModel, multiplier: float) ->
 
 
 def drop_bands(
-    planes: dict[str, np.ndarray], degrees: np.ndarray, sh_mean: np.ndarray, y0: float
+    planes: dict[str, np.ndarray], degrees: np.ndarray, sh_mean: np.ndarray, y0: float, room: Room = MEMORY
 ) -> dict[str, np.ndarray]:
     """Clear SH above `degrees` ([n]) and add the cleared bands' mean colour (`sh_mean`, [D, 3, n]) to the constant."""
     top = len(sh_mean)
     if top == 0:
         return planes
-    lower = np.minimum(degrees, top - 1).astype(np.int64)
-    mean = np.take_along_axis(sh_mean, lower[None, None], axis=0)[0]
-    dc = planes["sh_dc"] + np.where(degrees < top, mean, np.float32(0)) / np.float32(y0)
-    rest = planes["sh_rest"].reshape(3, (top + 1) ** 2 - 1, -1).copy()
-    for level in range(1, top + 1):
-        rest[:, level * level - 1 : (level + 1) ** 2 - 1] *= degrees >= level
-    return {**planes, "sh_dc": dc.astype(np.float32), "sh_rest": rest.reshape(planes["sh_rest"].shape)}
+    dc, rest = (room.empty(planes[name].shape, np.float32) for name in ("sh_dc", "sh_rest"))
+    for rows in blocks(len(degrees)):
+        some = degrees[rows]
+        lower = np.minimum(some, top - 1).astype(np.int64)
+        mean = np.take_along_axis(sh_mean[:, :, rows], lower[None, None], axis=0)[0]
+        dc[:, rows] = planes["sh_dc"][:, rows] + np.where(some < top, mean, np.float32(0)) / np.float32(y0)
+        kept = planes["sh_rest"][:, rows].copy().reshape(3, (top + 1) ** 2 - 1, -1)
+        for level in range(1, top + 1):
+            kept[:, level * level - 1 : (level + 1) ** 2 - 1] *= some >= level
+        rest[:, rows] = kept.reshape(-1, len(some))
+    return {**planes, "sh_dc": dc, "sh_rest": rest}

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flexgs_edge.scratch import MEMORY, Room, blocks
+
 
 @dataclass
 class Mended:
@@ -16,22 +18,34 @@ class Mended:
     planes: dict[str, np.ndarray]
 
     @classmethod
-    def of(cls, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> Mended:
-        """Of refitted `planes`, whose columns belong to `rows` in any order."""
-        order = np.argsort(rows)
-        return cls(rows[order], degrees[order], {name: planes[name][:, order] for name in ("sh_dc", "sh_rest")})
+    def of(
+        cls,
+        rows: np.ndarray,
+        degrees: np.ndarray,
+        order: np.ndarray,
+        planes: dict[str, np.ndarray],
+        room: Room = MEMORY,
+    ) -> Mended:
+        """Of refitted `planes`, whose columns belong to `rows[order]`; rows ascending."""
+        back = room.empty((len(order),), np.int64)
+        back[order] = np.arange(len(order))
+        return cls(rows, degrees, {name: room.take(planes[name], back) for name in ("sh_dc", "sh_rest")})
 
-    def apply(self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def apply(
+        self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray], room: Room = MEMORY
+    ) -> dict[str, np.ndarray]:
         """`planes` with these colours where a row was kept with the same SH degree."""
         if not len(self.rows) or not len(rows):
             return planes
-        at = np.minimum(np.searchsorted(self.rows, rows), len(self.rows) - 1)
-        same = np.flatnonzero((self.rows[at] == rows) & (self.degrees[at] == degrees))
-        changed = {name: planes[name].copy() for name in self.planes}
-        for name, values in changed.items():
-            # A grid may have lost its highest degrees: coefficients are channel by channel.
-            mended = self.planes[name].reshape(3, -1, len(self.rows))
-            values.reshape(3, -1, len(rows))[:, : mended.shape[1], same] = mended[:, :, at[same]]
+        changed = {name: room.copy(planes[name]) for name in self.planes}
+        for part in blocks(len(rows)):
+            some = rows[part]
+            at = np.minimum(np.searchsorted(self.rows, some), len(self.rows) - 1)
+            same = np.flatnonzero((self.rows[at] == some) & (self.degrees[at] == degrees[part]))
+            for name, values in changed.items():
+                # A grid may have lost its highest degrees: coefficients are channel by channel.
+                mended = self.planes[name].reshape(3, -1, len(self.rows))
+                values.reshape(3, -1, len(rows))[:, : mended.shape[1], part.start + same] = mended[:, :, at[same]]
         return {**planes, **changed}
 
 

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.best.choice import BitModel
+from flexgs_edge.best.path import take_rows
 from flexgs_edge.cameras import Camera
-from flexgs_edge.grid import GridScene, from_grid
+from flexgs_edge.grid import GridScene, values_of
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import Renderer, sum_bytes
 from flexgs_edge.scene.source import MemorySource
@@ -46,11 +47,11 @@ def assign_layers(
     spent = np.array([bits.of_degree(degree) for degree in range(grid.sh_degree + 1)])[grid.sh_degrees]
     layer = np.zeros(grid.count, np.uint8)
     left = np.arange(grid.count)
-    planes = from_grid(grid)
+    planes, room = values_of(grid, renderer.room), renderer.room
     for level in range(layers - 1, 0, -1):
         end = HALF * spent[left].sum()
         while len(left) and spent[left].sum() > end:
-            kept = {name: np.ascontiguousarray(values[:, left]) for name, values in planes.items()}
+            kept = take_rows(planes, left, room)
             with renderer.load(MemorySource(kept, origin=grid.origin), sum_bytes(2)) as scene:
                 costs = measure_costs(renderer, scene, cameras, sh_costs=False, progress=progress)
             worth = np.where(costs.weight2 > 0, costs.removal / spent[left], -1.0)
@@ -61,4 +62,4 @@ def assign_layers(
             layer[left[cut]] = level
             left = np.delete(left, cut)
     order = np.argsort(layer, kind="stable")
-    return replace(grid.take(order), layer=layer[order])
+    return replace(grid.take(order, room), layer=layer[order])

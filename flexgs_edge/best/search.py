@@ -24,7 +24,7 @@ from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
 from flexgs_edge.best.steps import Slopes, choose_steps, holdable, probe_slopes
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
-from flexgs_edge.grid import GridScene, Steps, from_grid, recolour, to_grid
+from flexgs_edge.grid import GridScene, Steps, recolour, to_grid, values_of
 from flexgs_edge.refit import refit_colours
 from flexgs_edge.score.removal import RemovalCosts
 
@@ -222,9 +222,11 @@ class MultiplierSearch(ABC, Generic[Product]):
         """What a multiplier keeps."""
         index, keep, degrees = self._snapshot(multiplier)
         snapshot = self.path.snapshots[index]
-        rows = np.flatnonzero(keep)
-        planes = drop_bands(take_rows(snapshot.planes, rows), degrees[rows], snapshot.costs.sh_mean[:, :, rows], SH_C0)
-        return Kept(index, snapshot.rows[rows], planes, degrees[rows], snapshot.costs.weight2[rows])
+        rows, room = np.flatnonzero(keep), self.path.room
+        means = room.take(snapshot.costs.sh_mean, rows)
+        planes = drop_bands(take_rows(snapshot.planes, rows, room), degrees[rows], means, SH_C0, room)
+        weight2 = room.take(snapshot.costs.weight2, rows)
+        return Kept(index, room.take(snapshot.rows, rows), planes, degrees[rows], weight2)
 
 
 class RateSearch(MultiplierSearch[GridScene]):
@@ -260,14 +262,14 @@ class RateSearch(MultiplierSearch[GridScene]):
 
     def _unmended(self, multiplier: float) -> GridScene:
         kept, steps = self._choice(multiplier)
-        return to_grid(kept.planes, kept.degrees, steps, self.path.origin)[0]
+        return to_grid(kept.planes, kept.degrees, steps, self.path.origin, room=self.path.room)[0]
 
     def _probe(self, multiplier: float, target: Target) -> float:
         """The excess of a multiplier's result without a refit of its own."""
         grid = self._unmended(multiplier)
         if target.limit_bytes is not None:
             return target.excess(self.size_of(grid)[0], None)
-        return target.excess(0, self.measure(from_grid(grid), estimate=True))
+        return target.excess(0, self.measure(values_of(grid, self.path.room), estimate=True))
 
     def _aim(self, multiplier: float, steps: Sequence[RateStep], target: Target) -> float:
         """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""
@@ -304,7 +306,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         """What a multiplier keeps, with the colours of the last refit, and the grid steps."""
         kept = self.kept(multiplier)
         if self._mended is not None:
-            kept.planes = self._mended.apply(kept.rows, kept.degrees, kept.planes)
+            kept.planes = self._mended.apply(kept.rows, kept.degrees, kept.planes, self.path.room)
         snapshot = self.path.snapshots[kept.snapshot]
         if self._slopes is None:
             # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
@@ -317,7 +319,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         kept, steps = self._choice(multiplier)
         grid = self._finish(kept, steps)
         size, _ = self.size_of(grid)
-        measurement = self.measure(from_grid(grid))
+        measurement = self.measure(values_of(grid, self.path.room))
         excess = target.excess(size, measurement)
         sh_count = int((kept.degrees > 0).sum())
         seconds = time.perf_counter() - started
@@ -325,12 +327,12 @@ class RateSearch(MultiplierSearch[GridScene]):
 
     def _finish(self, kept: Kept, steps: Steps) -> GridScene:
         """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
-        path, planes = self.path, kept.planes
+        path, room, planes = self.path, self.path.room, kept.planes
         fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
         fine = holdable(fine, planes)
-        grid, order = to_grid(planes, kept.degrees, fine, path.origin)
+        grid, order = to_grid(planes, kept.degrees, fine, path.origin, room=room)
         degrees = kept.degrees[order]
-        moved = from_grid(grid)
+        moved = values_of(grid, room)
         if self.refit:
             shared = (path.origin, path.cameras, path.targets)
             moved = refit_colours(
@@ -342,14 +344,9 @@ class RateSearch(MultiplierSearch[GridScene]):
                 subsets=self.effort.subsets_of(len(path.cameras)),
                 progress=path.progress,
             )
-            self._mended = Mended.of(kept.rows[order], degrees, moved)
-            coarse = from_grid(
-                recolour(
-                    replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree])),
-                    moved["sh_dc"],
-                    moved["sh_rest"],
-                )
-            )
+            self._mended = Mended.of(kept.rows, kept.degrees, order, moved, room)
+            grid = replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree]))
+            coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], room), room)
             moved = refit_colours(
                 path.renderer,
                 coarse,
@@ -361,7 +358,7 @@ class RateSearch(MultiplierSearch[GridScene]):
                 progress=path.progress,
             )
         final = replace(grid.steps, dc=steps.dc, sh=steps.sh[: grid.sh_degree])
-        return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"])
+        return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"], room)
 
 
 def _better(step: RateStep, other: RateStep, target: Target) -> bool:

@@ -19,9 +19,11 @@ from flexgs_edge.grid import CODE_LIMIT, POSITION_BITS, Steps
 from flexgs_edge.render import Renderer
 from flexgs_edge.rotations import tilted, turned
 from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.scratch import blocks
 
 GEOMETRY = ("position", "scale", "rotation", "opacity")
 VALUES = {"position": 3, "scale": 3, "rotation": 3, "opacity": 1}
+CHANGES = {"position": "means", "scale": "log_scales", "rotation": "quats", "opacity": "opacity_logits"}
 PROBE_VIEWS = 8
 """Poses that the trial grids are judged on, evenly spread."""
 SMALLEST_THREE = 1.051
@@ -55,20 +57,25 @@ def probe_slopes(
     views = [cameras[i * len(cameras) // min(PROBE_VIEWS, len(cameras))] for i in range(min(PROBE_VIEWS, len(cameras)))]
     with renderer.load(MemorySource(planes, origin=origin)) as scene:
         reference = [renderer.render(scene, camera).astype(np.float16) for camera in views]
-    size = float(np.exp(np.median(planes["log_scales"].min(axis=0).astype(np.float64))))
+    smallest = np.concatenate([planes["log_scales"][:, rows].min(axis=0) for rows in blocks(count)])
+    size = float(np.exp(np.median(smallest.astype(np.float64))))
     # Small enough that squared errors grow with squared steps, large enough to stand clear of half precision references.
     trial = {"position": size / 4, "scale": 0.1, "rotation": 0.03, "opacity": 0.2}
     per_row = {}
     for kind in GEOMETRY:
-        moved = {**planes, **_on_trial_grid(planes, kind, np.float32(trial[kind]))}
+        field = CHANGES[kind]
+        moved = {**planes, field: renderer.room.empty(planes[field].shape, np.float32)}
+        for rows in blocks(count):
+            some = {name: values[:, rows] for name, values in planes.items()}
+            moved[field][:, rows] = _on_trial_grid(some, kind, np.float32(trial[kind]))
         with renderer.load(MemorySource(moved, origin=origin)) as scene:
             error = sum(_squared_error(renderer.render(scene, c), r) for c, r in zip(views, reference, strict=True))
         per_row[kind] = error * len(cameras) / len(views) / (count * trial[kind] ** 2)
     return Slopes(per_row)
 
 
-def _on_trial_grid(planes: dict[str, np.ndarray], kind: str, step: np.float32) -> dict[str, np.ndarray]:
-    """The planes that change when values of one kind are rounded to multiples of `step`.
+def _on_trial_grid(planes: dict[str, np.ndarray], kind: str, step: np.float32) -> np.ndarray:
+    """The field that changes when values of one kind are rounded to multiples of `step`.
 
     All but opacities get errors of the same mean square instead, along and about each Gaussian's own axes, with signs from the
     digits of its opacity: where a grid begins depends on the scene's unit and axes, and with it a few large Gaussians' errors,
@@ -80,11 +87,11 @@ def _on_trial_grid(planes: dict[str, np.ndarray], kind: str, step: np.float32) -
         places = np.arange(first, first + 3, dtype=np.uint64)[:, None]
         errors = np.where(digits >> places & np.uint64(1), -1.0, 1.0) * float(step) / math.sqrt(12)
         if kind == "scale":
-            return {"log_scales": (planes["log_scales"] + errors).astype(np.float32)}
+            return (planes["log_scales"] + errors).astype(np.float32)
         if kind == "rotation":
-            return {"quats": tilted(planes["quats"], errors * math.sqrt(SMALLEST_THREE)).astype(np.float32)}
-        return {"means": (planes["means"] + turned(planes["quats"], errors)).astype(np.float32)}
-    return {"opacity_logits": (np.rint(planes["opacity_logits"] / step) * step).astype(np.float32)}
+            return tilted(planes["quats"], errors * math.sqrt(SMALLEST_THREE)).astype(np.float32)
+        return (planes["means"] + turned(planes["quats"], errors)).astype(np.float32)
+    return (np.rint(planes["opacity_logits"] / step) * step).astype(np.float32)
 
 
 def _squared_error(image: np.ndarray, reference: np.ndarray) -> float:
@@ -117,7 +124,7 @@ def holdable(steps: Steps, planes: dict[str, np.ndarray]) -> Steps:
     """`steps`, made coarser where the grid could not hold the planes' values: far outliers, or a multiplier near zero."""
 
     def finest(name: str, codes: int = CODE_LIMIT - 2) -> float:
-        return float(np.abs(planes[name]).max(initial=0.0)) / codes
+        return max((float(np.abs(row).max(initial=0.0)) for row in planes[name]), default=0.0) / codes
 
     width = float(np.ptp(planes["means"], axis=1).max(initial=0.0)) if planes["means"].size else 0.0
     least = 2.0**-70

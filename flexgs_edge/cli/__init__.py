@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import logging
+import signal
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, NoReturn
 
 import click
@@ -62,6 +64,8 @@ def command() -> None:
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code; the only place where errors become messages."""
     state = State()
+    with suppress(ValueError):  # not the main thread: whoever runs us there has signals in hand
+        signal.signal(signal.SIGTERM, _on_terminate)
     try:
         code = command.main(
             args=None if argv is None else list(argv), prog_name="flexgs-edge", standalone_mode=False, obj=state
@@ -71,6 +75,11 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
             traceback.print_exc()
         code = _exit_code(error)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _on_terminate(number: int, frame: object) -> NoReturn:
+    """End as Ctrl-C does, so that nothing half-written is left behind."""
+    raise SystemExit(128 + number)
 
 
 def _exit_code(error: BaseException) -> int:

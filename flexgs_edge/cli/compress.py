@@ -87,6 +87,19 @@ from flexgs_edge.cli import words
     help="Up to 4 layers that each double the bytes (best only): `trim` then cuts the file to a size without the original.",
 )
 @words.option(
+    "Run",
+    "--scratch",
+    metavar="DIR",
+    help="Folder for scratch files, used when a scene does not fit into the memory limit (best only). Default: beside OUT.",
+)
+@words.option(
+    "Run",
+    "--resume",
+    is_flag=True,
+    help="Keep every round of the search in the scratch folder until the run is done, and go on from those of a run of the same "
+    "scene, poses and options that was cut short (best only): the bytes are those of one run.",
+)
+@words.option(
     "Method",
     "--score",
     metavar="gs|meson|FILE",

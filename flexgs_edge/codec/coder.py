@@ -18,6 +18,7 @@ from flexgs_edge.codec.threads import in_order, thread_count
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds, walk_chunk, walk_positions
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import POSITION_BITS, GridScene, morton
+from flexgs_edge.scratch import MEMORY, Room, blocks
 
 CHUNK_ROWS = 65536
 SAMPLE_CHUNKS = 2
@@ -45,18 +46,23 @@ def plan_chunks(layers: list[int], chunk_rows: int = CHUNK_ROWS) -> list[Chunk]:
     return chunks
 
 
-def cells_of(grid: GridScene) -> tuple[np.ndarray, np.ndarray, int]:
+def cells_of(grid: GridScene, room: Room = MEMORY) -> tuple[np.ndarray, np.ndarray, int]:
     """[n] u64 Morton indices, the lowest cell [3] i64, and the depth of the cube that holds the scene."""
     if grid.count == 0:
         return np.zeros(0, np.uint64), np.zeros(3, np.int64), 0
     low = grid.position.min(axis=1).astype(np.int64)
-    cells = grid.position - low[:, None]
-    depth = int(cells.max()).bit_length()
+    depth = int((grid.position.max(axis=1) - low).max()).bit_length()
     if depth > POSITION_BITS:
         raise InputError(f"position: the scene is 2^{depth} cells wide, expected at most 2^{POSITION_BITS}")
-    index = morton(cells)
-    steps = np.diff(grid.layer.astype(np.int16))
-    if (steps < 0).any() or (index[1:] < index[:-1])[steps == 0].any():
+    index = room.empty((grid.count,), np.uint64)
+    for rows in blocks(grid.count):
+        index[rows] = morton(grid.position[:, rows] - low[:, None])
+    sorted_ = True
+    for rows in blocks(grid.count):
+        both = slice(max(rows.start - 1, 0), rows.stop)
+        steps = np.diff(grid.layer[both].astype(np.int16))
+        sorted_ &= not ((steps < 0).any() or (index[both][1:] < index[both][:-1])[steps == 0].any())
+    if not sorted_:
         raise InputError("grid: expected rows sorted by layer, then by the Morton index of their cell: use to_grid")
     return index, low, depth
 
@@ -113,13 +119,15 @@ class Encoded:
         return replace(self, written=tuple(self.streams()), batches=[])
 
 
-def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS, device: Device | None = None) -> Encoded:
+def encode_grid(
+    grid: GridScene, chunk_rows: int = CHUNK_ROWS, device: Device | None = None, room: Room = MEMORY
+) -> Encoded:
     """Fit a model to a scene and count its symbols; `Encoded.streams` gives the chunks.
 
     Holds two or three bytes a coded number beside the grid itself; with a device, which gives the same result, a kilobyte
-    a row of as many chunks as it works on at once.
+    a row of as many chunks as it works on at once. The bytes for each number lie in `room`.
     """
-    cells, low, depth = cells_of(grid)
+    cells, low, depth = cells_of(grid, room)
     layers = np.bincount(grid.layer, minlength=1).tolist()
     chunks = plan_chunks(layers, chunk_rows)
     kinds = group_kinds(grid.sh_degree)
@@ -142,7 +150,7 @@ def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS, device: Device | 
         else in_order(counted, chunks, thread_count(len(chunks)))
     )
     for port in ports:
-        batches.append(port.batches)
+        batches.append(_put_away(port.batches, room))
         count.add(port)
     merged = [merge_contexts(counts) for counts in count.counts]
     levels = [
@@ -157,6 +165,25 @@ def encode_grid(grid: GridScene, chunk_rows: int = CHUNK_ROWS, device: Device | 
         float((n * (PRECISION - np.log2(np.maximum(t.freqs, 1)))).sum()) for (_, n), t in zip(merged, model.tables)
     )
     return Encoded(model, low, layers, chunks, batches, count.raw + np.array(list(costs)), device)
+
+
+def _put_away(batches: list[Batch], room: Room) -> list[Batch]:
+    """The batches of a chunk in one array of `room`."""
+    if not room.spills:
+        return batches
+    size = sum(len(c) + len(s) + sum(len(values) for _, values in raw) for _, c, s, raw in batches)
+    held, at = room.empty((size,), np.uint8), 0
+
+    def put(values: np.ndarray) -> np.ndarray:
+        nonlocal at
+        place = held[at : at + len(values)]
+        place[...] = values
+        at += len(values)
+        return place
+
+    return [
+        (alphabet, put(c), put(s), [(bits, put(values)) for bits, values in raw]) for alphabet, c, s, raw in batches
+    ]
 
 
 def _counted_on(

@@ -28,6 +28,7 @@ from flexgs_edge.codec.walk import ChunkCodes
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.grid import GridScene
 from flexgs_edge.scene.atomic import atomic_write
+from flexgs_edge.scratch import MEMORY, Room
 
 VERSION = 2
 
@@ -43,6 +44,7 @@ def write_grid(
     chunk_rows: int = CHUNK_ROWS,
     device: Device | None = None,
     encoded: Encoded | None = None,
+    room: Room = MEMORY,
 ) -> int:
     """Encode a grid scene into a file, which appears under its name only when it is complete.
 
@@ -62,13 +64,15 @@ def write_grid(
         Counts symbols, with the same result.
     encoded : Encoded, optional
         `encode_grid(grid, chunk_rows)`, where it is known already.
+    room : Room, optional
+        Where symbols lie until they are written.
 
     Returns
     -------
     int
         Bytes of the file, as `coded_size` predicts.
     """
-    encoded = encoded or encode_grid(grid, chunk_rows, device)
+    encoded = encoded or encode_grid(grid, chunk_rows, device, room)
     model = encoded.model.to_bytes()
     header = _header(grid, encoded, len(model), settings, chunk_rows)
     with atomic_write(path, force) as file:
@@ -83,10 +87,14 @@ def write_grid(
 
 
 def coded_size(
-    grid: GridScene, settings: Mapping[str, Any], chunk_rows: int = CHUNK_ROWS, device: Device | None = None
+    grid: GridScene,
+    settings: Mapping[str, Any],
+    chunk_rows: int = CHUNK_ROWS,
+    device: Device | None = None,
+    room: Room = MEMORY,
 ) -> int:
     """Exact bytes of the file that `write_grid` makes of these arguments."""
-    return coded_parts(grid, settings, chunk_rows, device)[0]
+    return coded_parts(grid, settings, chunk_rows, device, room=room)[0]
 
 
 def coded_parts(
@@ -95,13 +103,14 @@ def coded_parts(
     chunk_rows: int = CHUNK_ROWS,
     device: Device | None = None,
     encoded: Encoded | None = None,
+    room: Room = MEMORY,
 ) -> tuple[int, float]:
     """Exact bytes of the file that `write_grid` makes of these arguments, and how many of them the SH take.
 
     The SH take the information in their symbols and in the degrees of the rows, and their groups' part of the model:
     what coding the scene again without them would save, but for the header's and the lanes' bytes.
     """
-    encoded = encoded or encode_grid(grid, chunk_rows, device)
+    encoded = encoded or encode_grid(grid, chunk_rows, device, room)
     model_bytes = len(encoded.model.to_bytes())
     header = _header(grid, encoded, model_bytes, settings, chunk_rows)
     size = header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes

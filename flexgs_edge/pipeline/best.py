@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flexgs_edge.adapt import Measurement, SearchResult, Step, Target
+from flexgs_edge.best.checkpoint import Checkpoint
 from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.effort import EFFORTS, sampled_poses
 from flexgs_edge.best.layers import assign_layers
 from flexgs_edge.best.path import PARTS, PrunePath, sums_room
 from flexgs_edge.best.search import Measure, MultiplierSearch, Product, RateResult, RateSearch, RateStep
-from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.budget import MemoryBudget, format_size
 from flexgs_edge.cameras import Camera
 from flexgs_edge.cameras.order import farthest_order
 from flexgs_edge.codec.coder import Encoded, encode_grid
@@ -29,10 +32,16 @@ from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.workspace import Stopwatch, coding_device
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice
-from flexgs_edge.render import Renderer
+from flexgs_edge.render import Renderer, sum_bytes
+from flexgs_edge.render.device_scene import COMPACT_ROWS, MOST_SUMS
+from flexgs_edge.render.renderer import FIRST_SHARE
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
+from flexgs_edge.score.cache import fingerprint
+from flexgs_edge.scratch import MEMORY, Room, Scratch
+
+LOG = logging.getLogger("flexgs_edge")
 
 COST_BYTES = 16
 """Costs of a row and snapshot beside those of its SH: removal and weight, in double precision."""
@@ -49,6 +58,12 @@ LAYERS_COST = 1.06
 layers)."""
 SETTINGS_MOST = 1536
 """Bytes that the settings in the header take at most: the search counts them before they are known."""
+
+
+SPILLED_ROW_BYTES = 24
+"""Bytes that each row of a scene in scratch files takes of memory for a moment: choosing the cheapest rows, and lists of rows."""
+SPOOL_ROW_BYTES = 52
+"""Bytes that each row that a view shows takes of the scratch file for its sums (`ViewSums`)."""
 
 
 Report = Callable[[RateStep], None]
@@ -73,7 +88,9 @@ class GridCoder:
         if self._last is None or self._last[0] is not grid:
             self._last = None
             device = coding_device(self._renderer.backend, self._renderer.budget, grid)
-            self._last = grid, encode_grid(grid, device=device).finished()
+            encoded = encode_grid(grid, device=device, room=self._renderer.room)
+            # Of a scene in scratch files even the bytes of the file may be too many.
+            self._last = grid, encoded if self._renderer.room.spills else encoded.finished()
         return self._last[1]
 
     def size_and_bits(self, grid: GridScene) -> tuple[int, BitModel]:
@@ -129,6 +146,7 @@ def search_best(
     clock: Stopwatch,
     on_step: Callable[[Step], None] | None = None,
     progress: Progress = SILENT,
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[Product, SearchResult]:
     """What to write, and the steps that led to it.
 
@@ -137,7 +155,7 @@ def search_best(
     make : callable
         `grid_search` or `file_search`.
     source : SceneSource
-        A checked scene; held in memory as a whole.
+        A checked scene; held in `renderer.room` as a whole.
     cameras : list of Camera
         Training poses; at most as many as the effort scores are used, farthest first.
     judge : Judge
@@ -150,7 +168,8 @@ def search_best(
     BudgetError
         When the scene does not fit.
     """
-    with open_path(renderer, source, cameras, options, budget, clock, progress) as path, clock.stage("search"):
+    path_of = open_path(renderer, source, cameras, options, budget, clock, progress, checkpoint=checkpoint)
+    with path_of as path, clock.stage("search"):
         return search_path(make, path, renderer, source, judge, target, options, on_step)
 
 
@@ -164,6 +183,7 @@ def open_path(
     clock: Stopwatch,
     progress: Progress = SILENT,
     make: Callable[..., PrunePath] = PrunePath,
+    checkpoint: Checkpoint | None = None,
 ) -> Iterator[PrunePath]:
     """The path that searches walk, at its start; several targets may share it, the weakest compression first.
 
@@ -171,21 +191,26 @@ def open_path(
     ----------
     make : callable, optional
         Builds the path from the arguments of `PrunePath`.
+    checkpoint : Checkpoint, optional
+        Where the path keeps its rounds.
     """
-    scored = scored_poses(cameras, source.count, options)
-    size = source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep)
-    largest = max(scored, key=lambda camera: camera.width * camera.height)
-    budget.require(
-        "a search by measured costs", size + renderer.least_bytes(source, largest, sums_room(source.sh_degree))
-    )
+    scored, room = scored_poses(cameras, source.count, options), renderer.room
+    largest = largest_of(scored)
+    if room.spills:
+        size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest)
+    else:
+        size = source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep)
+        least = renderer.least_bytes(source, largest, sums_room(source.sh_degree))
+    budget.require("a search by measured costs", size + least)
     budget.take("the scene and its path", size)
     try:
-        planes = source.read(slice(0, source.count), list(FIELD))
-        with TargetViews() as targets:
+        planes = {name: room.empty((source.width(name), source.count), np.float32) for name in FIELD}
+        source.read(slice(0, source.count), list(FIELD), planes)
+        with TargetViews(room.folder) as targets:
             with clock.stage("search"):
                 rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
                 # Neighbours in space become neighbours in memory: a view of fox takes a seventh less.
-                rows = rows[near_rows(planes["means"][:, rows])]
+                rows = room.take(rows, near_rows(room.take(planes["means"], rows), room))
                 path = make(
                     renderer,
                     planes,
@@ -196,6 +221,7 @@ def open_path(
                     refit=options.refit,
                     unseen=options.unseen_share,
                     progress=progress,
+                    **({} if checkpoint is None else {"checkpoint": checkpoint}),
                 )
             del planes  # the path has its own
             yield path
@@ -265,6 +291,77 @@ def layered(
         poses,
         progress,
     )
+
+
+def choose_room(
+    renderer: Renderer,
+    source: SceneSource,
+    cameras: Sequence[Camera],
+    options: CompressOptions,
+    budget: MemoryBudget,
+    folder: Path,
+) -> Room:
+    """Memory, where the scene and the path of its search fit, else scratch files; says which, and how much they may take.
+
+    Parameters
+    ----------
+    folder : path
+        For scratch files.
+
+    Raises
+    ------
+    BudgetError
+        When not even the views fit, or the disk is too small.
+    """
+    scored = scored_poses(cameras, source.count, options)
+    largest = largest_of(scored)
+    rows, keep = source.count, EFFORTS[options.effort].keep
+    whole = rows * row_bytes(source.sh_degree, keep)
+    if whole + renderer.least_bytes(source, largest, sums_room(source.sh_degree)) <= budget.free:
+        return MEMORY
+    budget.require(
+        "a search by measured costs with all else in scratch files",
+        SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest),
+    )
+    room = Scratch(folder)
+    renderer.largest = largest
+    spooled = SPOOL_ROW_BYTES * rows * len(scored)
+    LOG.info(
+        "%d Gaussians and the path of their search need %s in memory, %s are free: they go to scratch files in %s "
+        "(at most about %s; --scratch names another folder), %d rows at a time; %d bytes of each Gaussian and views of the "
+        "Gaussians that they show stay in memory; %d passes over %d poses",
+        rows, format_size(whole), format_size(budget.free), room.folder, format_size(whole + spooled), COMPACT_ROWS,
+        SPILLED_ROW_BYTES, 2 + EFFORTS[options.effort].refit_rounds, len(scored),
+    )  # fmt: skip
+    return room
+
+
+def open_checkpoint(
+    renderer: Renderer, source: SceneSource, cameras: Sequence[Camera], options: CompressOptions, folder: Path
+) -> Checkpoint:
+    """Where the path of a search keeps its rounds: a folder named by all that they depend on."""
+    words = f"path {EFFORTS[options.effort].keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r}"
+    assert options.near is not None and options.extent is not None
+    scored = scored_poses(cameras, source.count, options)
+    key = fingerprint(source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
+    checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")
+    if checkpoint.rounds:
+        LOG.info(
+            "%s: an earlier run was cut short after %d rounds: going on from there",
+            checkpoint.folder,
+            checkpoint.rounds,
+        )
+    return checkpoint
+
+
+def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:
+    """Bytes that the first view of a search in scratch files needs; one that shows more than `FIRST_SHARE` says needs more."""
+    return renderer.compact_bytes(source, largest, -(-source.count // FIRST_SHARE), sum_bytes(MOST_SUMS))
+
+
+def largest_of(cameras: Sequence[Camera]) -> Camera:
+    """The camera with most pixels."""
+    return max(cameras, key=lambda camera: camera.width * camera.height)
 
 
 def row_bytes(sh_degree: int, keep: float) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import tempfile
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,10 +17,18 @@ from flexgs_edge.bitspec import PAPER, BitSpec
 from flexgs_edge.budget import MemoryBudget, format_size
 from flexgs_edge.codec import FgsSource, open_fgs
 from flexgs_edge.codec.container import write_container
-from flexgs_edge.errors import TargetError
+from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.formats import Format, read_foreign
-from flexgs_edge.grid import GridScene, from_grid
-from flexgs_edge.pipeline.best import GridCoder, grid_search, layered, search_best, search_files
+from flexgs_edge.grid import GridScene, values_of
+from flexgs_edge.pipeline.best import (
+    GridCoder,
+    choose_room,
+    grid_search,
+    layered,
+    open_checkpoint,
+    search_best,
+    search_files,
+)
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
@@ -39,6 +48,7 @@ from flexgs_edge.render.quality import Quality
 from flexgs_edge.report.result import CompressResult
 from flexgs_edge.scene import MemorySource, SceneSource
 from flexgs_edge.score import ScoreCache, fingerprint, load_scores, save_scores, score_scene
+from flexgs_edge.scratch import MEMORY, Room
 from flexgs_edge.sensitivity import Sensitivity
 
 LOG = logging.getLogger("flexgs_edge")
@@ -130,6 +140,7 @@ class _Job:
         self.groups = options.bit_spec()[1]
         self.sensitivity: list[Sensitivity] = []
         self.scores_reused = False
+        self.room: Room = MEMORY
 
     def run(self, output: Path | None, scores: np.ndarray | None) -> CompressResult:
         """The whole job; `scores` come from a file, or are computed."""
@@ -191,14 +202,26 @@ class _Job:
         renderer = self.workspace.renderer
         self._look_at_original(decide, report, None)
         if self.format is not None:
+            if options.resume or options.scratch is not None:
+                raise InputError(
+                    f"--{'resume' if options.resume else 'scratch'} works on .fgs files alone: the search for a "
+                    f"{self.format.suffix} is in memory and in one go; leave it out"
+                )
             return self._run_files(self.format, output, None, decide, report)
+        train = self.views.of(self.views.train)
+        folder = Path(options.scratch or (tempfile.gettempdir() if output is None else output.parent))
+        self.room = renderer.room = room = choose_room(renderer, self.source, train, options, self.budget, folder)
+        kept = None
+        if options.resume:
+            with self.clock.stage("fingerprint"):
+                kept = open_checkpoint(renderer, self.source, train, options, folder)
         LOG.info("searching for %s", plan.target.describe())
         coder = GridCoder(renderer)
         grid, search = search_best(
             grid_search(options, coder),
             renderer,
             self.source,
-            self.views.of(self.views.train),
+            train,
             decide,
             plan.target,
             options,
@@ -206,19 +229,20 @@ class _Job:
             self.clock,
             on_step=lambda step: LOG.info("%s", _step_words(step, plan.target)),
             progress=self.progress,
+            checkpoint=kept,
         )
         if decide is not report:
             decide.close()
         if options.layers > 1:
             with self.clock.stage("layers"):
-                grid = layered(grid, renderer, self.views.of(self.views.train), options, self.progress)
+                grid = layered(grid, renderer, train, options, self.progress)
         settings = make_settings(options, plan, self.scene, self.views, search, None)
         if output is None:
             if self.reporter is not None:
                 self.reporter.read_contents_of(lambda place: coder.write(place, grid, settings))
             size, quality = (
                 coder.size(grid, settings),
-                self._measure_source(MemorySource(from_grid(grid), origin=grid.origin), report),
+                self._measure_source(MemorySource(values_of(grid, room), origin=grid.origin), report),
             )
         else:
             with temporary_name(output, options.force) as place:
@@ -230,6 +254,9 @@ class _Job:
                     )
                 quality = self._measure_source(open_fgs(place), report)
             LOG.info("wrote %s, %s", output, format_size(size))
+        if kept is not None:
+            kept.remove()
+        room.close()
         return self._result(output, size, search.chosen.choice, grid, search, quality)
 
     def _run_files(
@@ -391,7 +418,7 @@ class _Job:
             scores_saved=options.save_scores,
             score_cache=options.score_cache if plan.computes_scores else None,
             scores_reused=self.scores_reused,
-            run=run_info(self.budget, self.clock, self.workspace.backend if self.workspace else None),
+            run=run_info(self.budget, self.clock, self.workspace.backend if self.workspace else None, self.room),
             format=self.format.suffix[1:] if self.format else "fgs",
             file_sh_degree=scene.sh_degree,
         )

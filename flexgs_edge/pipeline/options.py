@@ -35,6 +35,8 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "unseen": ("best", "keep"),
     "refit": ("best", True),
     "layers": ("best", 1),
+    "scratch": ("best", None),
+    "resume": ("best", False),
 }
 """Options that only one `--method` knows, with their defaults."""
 
@@ -146,6 +148,11 @@ class CompressOptions(ViewOptions):
         Refit colours after pruning and quantizing (`best`).
     layers : int
         Layers that `trim` can cut the file at, 1 to 4 (`best`).
+    scratch : str, optional
+        Folder for scratch files of scenes that do not fit into memory (`best`). Default: the output's.
+    resume : bool
+        Keep every round of the search in the scratch folder until the run is done, and go on from the rounds of a run that was
+        cut short (`best`).
     report : str, optional
         Folder for a page about the run (index.html) and its record (result.json).
     dry_run : bool
@@ -173,6 +180,8 @@ class CompressOptions(ViewOptions):
     unseen: str = "keep"
     refit: bool = True
     layers: int = 1
+    scratch: str | None = None
+    resume: bool = False
     report: str | None = None
     dry_run: bool = False
     force: bool = False

@@ -15,6 +15,7 @@ from flexgs_edge.kernels import Backend, open_backend
 from flexgs_edge.pipeline.options import ViewOptions
 from flexgs_edge.render import Renderer
 from flexgs_edge.report.result import RunInfo
+from flexgs_edge.scratch import MEMORY, Room
 
 DEVICE_ROWS = 200_000
 """Scenes of fewer Gaussians are coded and decoded before the kernels for it are built."""
@@ -103,7 +104,7 @@ def coding_device(backend: Backend | None, budget: MemoryBudget, grid: GridScene
     return backend if backend.threads * device_bytes(CHUNK_ROWS, grid.sh_degree) <= budget.free else None
 
 
-def run_info(budget: MemoryBudget, clock: Stopwatch, backend: Backend | None = None) -> RunInfo:
+def run_info(budget: MemoryBudget, clock: Stopwatch, backend: Backend | None = None, room: Room = MEMORY) -> RunInfo:
     """Seconds, memory and device of a run."""
     return RunInfo(
         seconds=clock.total,
@@ -113,4 +114,6 @@ def run_info(budget: MemoryBudget, clock: Stopwatch, backend: Backend | None = N
         memory_limit=budget.limit,
         peak_memory=peak_rss(),
         device=backend.describe() if backend else None,
+        peak_anonymous=room.peak_anonymous,
+        scratch=room.peak if room.spills else None,
     )

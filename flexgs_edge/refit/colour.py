@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,10 @@ import numpy as np
 from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.render import DeviceScene, Renderer, sum_bytes
+from flexgs_edge.render import Renderer, sum_bytes
+from flexgs_edge.render.device_scene import Chunk
 from flexgs_edge.render.targets import TargetViews
+from flexgs_edge.render.view_sums import Maker, ViewSums
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
 
@@ -62,18 +65,19 @@ def refit_colours(
     dict
         The planes, with new `sh_dc` and `sh_rest`.
     """
-    planes = {**planes, "sh_dc": planes["sh_dc"].copy(), "sh_rest": planes["sh_rest"].copy()}
+    room = renderer.room
+    planes = {**planes, "sh_dc": room.copy(planes["sh_dc"]), "sh_rest": room.copy(planes["sh_rest"])}
     subsets = max(min(subsets, len(cameras)), 1)
     parts = [range(first, len(cameras), subsets) for _ in range(rounds) for first in range(subsets)]
     source = MemorySource(planes, origin=origin)
-    room = sum_bytes(4) + normal_bytes(source.sh_degree)
-    with renderer.load(source, room, targets=True) as scene:
+    with renderer.load(source, sum_bytes(4) + normal_bytes(source.sh_degree), targets=True) as scene:
         for part in progress.track(parts, "refitting colours", len(parts)):
-            normal = NormalSums(renderer, scene)
+            normal = ViewSums(renderer, scene, [normal_sums(renderer)])
             try:
                 for view in part:
-                    normal.add_view(renderer.residual_sums(scene, cameras[view], targets[view]))
-                step_colours(planes, degrees, normal.finish(), bands)
+                    normal.add_view(renderer.residual_sums(scene, cameras[view], targets[view]), cameras[view])
+                for rows, (sums,) in normal.parts():
+                    step_colours(planes, degrees, rows, sums.values(), bands)
             finally:
                 normal.release()
             scene.refresh("sh_dc", "sh_rest")
@@ -81,55 +85,56 @@ def refit_colours(
 
 
 def normal_bytes(sh_degree: int) -> int:
-    """Bytes a row that `NormalSums` takes on the backend."""
+    """Bytes a row that `normal_sums` take on the backend."""
     return 16 * (sh_degree + 1) ** 2
 
 
-class NormalSums:
-    """Sums over views that a step of the refit is made of: back-projected residuals and weights, for every basis function."""
+def normal_sums(renderer: Renderer) -> Maker:
+    """Sums over views that a step of the refit is made of: back-projected residuals and weights, for every basis function.
 
-    def __init__(self, renderer: Renderer, scene: DeviceScene) -> None:
-        self._renderer, self._scene = renderer, scene
-        self._arrays: dict[int, tuple[int, Any]] = {}
+    Residual sums come first among a view's.
+    """
+    return partial(_ChunkNormal, renderer)
 
-    def add_view(self, sums: Any) -> None:
-        """Add the view drawn last; its residual sums come first in `sums`. The order of views is part of the result."""
-        backend = self._renderer.backend
-        for chunk in self._scene.chunks():
-            if chunk.base not in self._arrays:
-                array = backend.array(((chunk.degree + 1) ** 2, 4, chunk.stride), np.float32)
-                backend.fill(array, 0)
-                self._arrays[chunk.base] = (chunk.count, array)
-            backend.launch(
-                "sh_residual", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, sums.shape[1],
-                self._renderer.camera_array, chunk.means, sums, self._arrays[chunk.base][1],
-            )  # fmt: skip
 
-    def finish(self) -> np.ndarray:
+class _ChunkNormal:
+    """These sums of one chunk."""
+
+    def __init__(self, renderer: Renderer, chunk: Chunk) -> None:
+        self._renderer, self._count = renderer, chunk.count
+        self._array = renderer.backend.array(((chunk.degree + 1) ** 2, 4, chunk.stride), np.float32)
+        renderer.backend.fill(self._array, 0)
+
+    def add(self, chunk: Chunk, sums: Any, base: int) -> None:
+        renderer = self._renderer
+        renderer.backend.launch(
+            "sh_residual", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, sums.shape[1],
+            renderer.camera_array, chunk.means, sums, self._array,
+        )  # fmt: skip
+
+    def values(self) -> np.ndarray:
         """[K + 1, 4, n] f32: residual of three channels and weight."""
-        normal = np.zeros(((self._scene.sh_degree + 1) ** 2, 4, self._scene.count), np.float32)
-        for base, (count, array) in self._arrays.items():
-            sums_of_chunk = self._renderer.backend.read(array)[:, :, :count]
-            normal[: len(sums_of_chunk), :, base : base + count] = sums_of_chunk
-        return normal
+        values: np.ndarray = self._renderer.backend.read(self._array)[:, :, : self._count]
+        return values
 
     def release(self) -> None:
-        """Free what is held on the backend."""
-        for _, array in self._arrays.values():
-            array.release()
-        self._arrays = {}
+        if self._array is not None:
+            self._array.release()
+            self._array = None
 
 
-def step_colours(planes: dict[str, np.ndarray], degrees: np.ndarray, normal: np.ndarray, bands: bool = True) -> None:
-    """One step, in place: `normal` from `NormalSums.finish`, the rest as for `refit_colours`."""
+def step_colours(
+    planes: dict[str, np.ndarray], degrees: np.ndarray, rows: slice, normal: np.ndarray, bands: bool = True
+) -> None:
+    """One step of some rows, in place: `normal` is their part of `normal_sums`, the rest as for `refit_colours`."""
     weight = np.where(normal[:, 3] > 0, normal[:, 3], np.float32(np.inf))
     # The constant's basis is Y_0 everywhere: its step in coefficients is 1 / Y_0 of the mean residual.
-    planes["sh_dc"] += np.float32(RELAX_DC / SH_C0) * normal[0, :3] / weight[0]
+    planes["sh_dc"][:, rows] += np.float32(RELAX_DC / SH_C0) * normal[0, :3] / weight[0]
     if not bands or len(normal) == 1:
         return
-    count = len(normal) - 1
-    degree_of = np.repeat(np.arange(1, 5), [sh_rest_count(d) - sh_rest_count(d - 1) for d in range(1, 5)])[:count]
-    rest = planes["sh_rest"].reshape(3, count, -1)
-    for k in range(count):
-        moved = np.where(degrees >= degree_of[k], np.float32(RELAX_SH) / weight[k + 1], np.float32(0))
+    count = len(planes["sh_rest"]) // 3
+    degree_of = np.repeat(np.arange(1, 5), [sh_rest_count(d) - sh_rest_count(d - 1) for d in range(1, 5)])
+    rest = planes["sh_rest"].reshape(3, count, -1)[:, :, rows]
+    for k in range(len(normal) - 1):
+        moved = np.where(degrees[rows] >= degree_of[k], np.float32(RELAX_SH) / weight[k + 1], np.float32(0))
         rest[:, k] += normal[k + 1, :3] * moved

@@ -18,6 +18,8 @@ from flexgs_edge.scene.source import SceneSource
 CHUNK_ROWS = 1 << 18
 """Most rows of a chunk: 60 MB of planes at SH degree 3, large enough that launches cost nothing."""
 MIN_CHUNK_ROWS = 1 << 10
+COMPACT_ROWS = 1 << 15
+"""Rows of a chunk of a scene whose views are compact: 16 MB with all that projecting it takes."""
 
 
 def sum_bytes(planes: int) -> int:
@@ -26,6 +28,8 @@ def sum_bytes(planes: int) -> int:
 
 
 SUM_BYTES = sum_bytes(1)
+MOST_SUMS = 6
+"""Planes of sums that a view has at most (`Renderer.residual_and_removal_sums`)."""
 
 
 def plane_bytes(sh_degree: int) -> int:
@@ -52,9 +56,14 @@ class Chunk:
     sh_dc: Any
     sh_rest: Any
 
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """All planes."""
+        return self.means, self.cov, self.log2_opacity, self.sh_dc, self.sh_rest
+
     def release(self) -> None:
         """Free the planes."""
-        for array in (self.means, self.cov, self.log2_opacity, self.sh_dc, self.sh_rest):
+        for array in self.arrays:
             array.release()
 
 
@@ -193,7 +202,9 @@ class DeviceScene:
         self.statistics: list[Any] = []
         self.resident, self._streamed = False, False
         self.targets = targets
-        self._sum_bytes = sum_bytes
+        self.sum_bytes = sum_bytes
+        self.shown: int | None = None
+        """Rows that a compact view has room for; None while views have room for all."""
         self._planes = planes
         self._budget = budget
         self._resident: list[Chunk] = []
@@ -204,16 +215,46 @@ class DeviceScene:
     @property
     def least_bytes(self) -> int:
         """Bytes that drawing must leave to the scene: none once it is loaded, else its smallest chunk."""
-        return 0 if self._resident else padded(self._least_rows) * self._chunk_row_bytes
+        return 0 if self._resident else self.least_chunk_bytes
+
+    @property
+    def least_chunk_bytes(self) -> int:
+        """Bytes of the smallest chunk."""
+        return padded(self._least_rows) * self._chunk_row_bytes
 
     @property
     def later_bytes(self) -> int:
         """Bytes that sums over views will take: none once the first view made them."""
-        return 0 if self.statistics else self._sum_bytes * self.count
+        return 0 if self.statistics else self.sum_bytes * self.count
+
+    @property
+    def shown_bytes(self) -> int:
+        """Bytes that each row which a compact view shows takes of the sums of one view: all but what is added up over views."""
+        return 0 if self.statistics else min(self.sum_bytes, sum_bytes(MOST_SUMS))
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes that the loaded scene takes."""
+        return sum(array.nbytes for chunk in self._resident for array in chunk.arrays)
+
+    def be_compact(self, shown: int) -> None:
+        """From now on views have room for the rows that they show alone, for so many at first; the scene is streamed."""
+        self.evict()
+        self.shown = shown
+
+    def drop_statistics(self) -> None:
+        """Free the sums of a view."""
+        for array in self.statistics:
+            array.release()
+        self.statistics = []
 
     def _decide(self) -> None:
         """Load the scene if it fits, else find the rows of a streamed chunk (fixed from then on)."""
         planes, budget, later = self._planes, self._budget, self.later_bytes
+        if self.shown is not None:
+            self._rows = min(COMPACT_ROWS, max(self.count, 1))
+            self._streamed = True
+            return
         whole = planes.sh_count * plane_bytes(planes.sh_degree) + (self.count - planes.sh_count) * plane_bytes(0)
         most = min(CHUNK_ROWS, max(self.count, 1))
         # Two chunks may be padded at most: the last with SH and the last without.
@@ -241,6 +282,11 @@ class DeviceScene:
         for first, last, degree in parts:
             for start in range(first, last, self._rows):
                 yield start, min(start + self._rows, last), degree
+
+    @property
+    def starts(self) -> np.ndarray:
+        """[chunks + 1] i64: first row of every chunk, and the number of rows."""
+        return np.array([*(start for start, _, _ in self._spans()), self.count], np.int64)
 
     def _load(self, start: int, stop: int, degree: int) -> Chunk:
         planes = self._planes.load(start, stop, degree)
@@ -274,9 +320,7 @@ class DeviceScene:
     def close(self) -> None:
         """Free everything."""
         self.evict()
-        for array in self.statistics:
-            array.release()
-        self.statistics = []
+        self.drop_statistics()
         self._planes.close()
 
     def __enter__(self) -> DeviceScene:

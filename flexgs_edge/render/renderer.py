@@ -10,13 +10,15 @@ import numpy as np
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
-from flexgs_edge.constants import DEFAULT_NEAR, FIXED_WEIGHT, JACOBIAN_MARGIN, TILE
+from flexgs_edge.constants import CULLED, DEFAULT_NEAR, FIXED_WEIGHT, JACOBIAN_MARGIN, TILE
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels import Backend
 from flexgs_edge.quantize import QuantizedScene
 from flexgs_edge.render.device_scene import (
+    COMPACT_ROWS,
     MIN_CHUNK_ROWS,
     SUM_BYTES,
+    Chunk,
     DeviceScene,
     QuantizedPlanes,
     SourcePlanes,
@@ -25,6 +27,7 @@ from flexgs_edge.render.device_scene import (
     upload_bytes,
 )
 from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.scratch import MEMORY, Room
 
 SORT_DIGIT_BITS = 11
 SORT_DIGITS = 1 << SORT_DIGIT_BITS
@@ -39,6 +42,12 @@ PAIR_SHARE = 8
 SUM_ROWS = 1 << 18
 """Rows of sums that are on the host at a time."""
 EXTENTS = ("exact", "inria")
+CAPACITY_STEP = 1 << 16
+"""Compact views make room for multiples of so many rows: views of about one size then share their buffers."""
+FIRST_SHARE = 4
+"""Part of a scene's rows (one in four) that a compact view has room for until one shows more."""
+GROWTH = 1.1
+"""Room beyond what the part of a view that was seen lets expect."""
 
 
 @dataclass
@@ -114,16 +123,45 @@ def view_shapes(backend: Backend, count: int, width: int, height: int) -> dict[s
     }
 
 
+def chunk_shapes(rows: int) -> dict[str, tuple[tuple[int, ...], Any]]:
+    """The same of what one chunk of a compact view is projected to."""
+    return {
+        "chunk_records": ((rows, 16), np.float32),
+        "chunk_keys": ((rows,), np.uint32),
+        "chunk_bounds": ((rows,), np.uint32),
+    }
+
+
 def shapes_bytes(shapes: dict[str, tuple[tuple[int, ...], Any]]) -> int:
     """Bytes of all of `view_shapes`."""
     return sum(int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
 
 
-class _ViewBuffers:
-    """Buffers that live as long as the views have one size and one number of rows."""
+def view_bytes(backend: Backend, count: int, camera: Camera) -> int:
+    """Bytes of the buffers of a view of so many rows, with the shortest lists of pairs."""
+    tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
+    return shapes_bytes(view_shapes(backend, count, camera.width, camera.height)) + PAIR_BYTES * tiles
 
-    def __init__(self, backend: Backend, scene: DeviceScene, camera: Camera, budget: MemoryBudget) -> None:
-        count, width, height = self.key = view_key(scene, camera)
+
+def target_bytes(camera: Camera) -> int:
+    """Bytes of a target of a view, and of the residual against it."""
+    return TARGET_BYTES * 3 * TILE * TILE * -(-camera.width // TILE) * -(-camera.height // TILE)
+
+
+class _ViewBuffers:
+    """Buffers that live as long as the views have one size and one number of rows.
+
+    With `rows`, there is room for as many splats only, those that a view shows: the buffers of a compact view, and one chunk's
+    for what `project` writes.
+    """
+
+    def __init__(
+        self, backend: Backend, scene: DeviceScene, camera: Camera, budget: MemoryBudget, rows: int | None = None
+    ) -> None:
+        self.key = view_key(scene, camera)
+        _, width, height = self.key
+        self.rows = rows
+        count = scene.count if rows is None else rows
         self.tiles_x, self.tiles_y = -(-width // TILE), -(-height // TILE)
         self.tiles = self.tiles_x * self.tiles_y
         self.padded_height, self.padded_width = self.tiles_y * TILE, self.tiles_x * TILE
@@ -135,7 +173,14 @@ class _ViewBuffers:
         # One splat may touch every tile, so no batch can be smaller than that. What the scene and the sums of a scoring pass
         # need at the least is checked with the view, so that one message names a limit that does.
         later = PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + scene.targets * self._target_bytes
-        budget.require(f"a view of {count} Gaussians at {width}x{height}", size + later)
+        what = (
+            f"a view of {count} Gaussians" if rows is None else f"a view that shows {count} of {scene.count} Gaussians"
+        )
+        if rows is not None:
+            shapes |= chunk_shapes(padded(min(COMPACT_ROWS, scene.count)))
+            later += scene.shown_bytes * rows - scene.later_bytes
+            size = shapes_bytes(shapes)
+        budget.require(f"{what} at {width}x{height}", size + later)
         try:
             made = {name: self._array(shape, dtype) for name, (shape, dtype) in shapes.items()}
             if scene.targets:
@@ -153,6 +198,7 @@ class _ViewBuffers:
         self.digits, self.block_pairs = made["digits"], made["block_pairs"]
         self.room, self.ends = made["room"], made["ends"]
         self.state, self.image = made["state"], made["image"]
+        self.chunk = tuple(made[name] for name in chunk_shapes(0)) if rows is not None else ()
 
     @property
     def _target_bytes(self) -> int:
@@ -184,6 +230,8 @@ class _View:
     buffers: _ViewBuffers
     camera: Camera
     batches: list[tuple[int, int]]
+    count: int
+    """Rows of its sums."""
 
 
 class Renderer:
@@ -202,6 +250,13 @@ class Renderer:
         Pixels that a splat may reach: the ellipse of alpha >= 1/255, or the reference rasteriser's tiles of ceil(3 sigma).
     antialiased : bool
         Multiply opacities by sqrt(det before / det after) the dilation of the 2D covariance, as the model was trained.
+
+    Attributes
+    ----------
+    room : Room
+        Where sums over views go when memory cannot hold them beside a view.
+    largest : Camera or None
+        The largest view that is to come, where that is known: whether views have room for all rows is decided for it.
     """
 
     def __init__(
@@ -221,8 +276,17 @@ class Renderer:
         self.background = tuple(float(np.float32(c)) for c in background)
         self.inria_extent = int(extent == "inria")
         self.antialiased = antialiased
+        self.room: Room = MEMORY
+        self.largest: Camera | None = None
         self.splats_shown = 0
+        self.view_rows: np.ndarray | None = None
+        """[m] u32, rows of the scene that the sums of the view drawn last belong to; None: all of them."""
         self._buffers: _ViewBuffers | None = None
+
+    def aim(self, camera: Camera, origin: np.ndarray) -> None:
+        """Put the record of a view into `camera_array`."""
+        assert self._buffers is not None
+        self.backend.write(self._buffers.camera, camera_record(camera, origin, self.near))
 
     @property
     def camera_array(self) -> Any:
@@ -241,13 +305,19 @@ class Renderer:
 
     def least_bytes(self, source: SceneSource, camera: Camera, sum_bytes: int) -> int:
         """Bytes that a view of `source` with targets and sums of `sum_bytes` a row needs at the least, nothing being loaded."""
-        tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
-        view = shapes_bytes(view_shapes(self.backend, source.count, camera.width, camera.height))
         chunk = padded(min(MIN_CHUNK_ROWS, source.count)) * (
             plane_bytes(source.sh_degree) + upload_bytes(source.sh_degree)
         )
-        pixels = (PAIR_BYTES + TARGET_BYTES * 3 * TILE * TILE) * tiles
-        return view + pixels + sum_bytes * source.count + chunk
+        view = view_bytes(self.backend, source.count, camera) + target_bytes(camera)
+        return view + sum_bytes * source.count + chunk
+
+    def compact_bytes(self, source: SceneSource, camera: Camera, shown: int, sum_bytes: int) -> int:
+        """The same of a view that shows `shown` rows at the most, with sums of `sum_bytes` for each of them."""
+        rows = padded(min(COMPACT_ROWS, source.count))
+        chunk = rows * (plane_bytes(source.sh_degree) + upload_bytes(source.sh_degree)) + shapes_bytes(
+            chunk_shapes(rows)
+        )
+        return view_bytes(self.backend, shown, camera) + target_bytes(camera) + sum_bytes * shown + chunk
 
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
         """Bring a quantized scene to the backend, dequantized there."""
@@ -278,10 +348,11 @@ class Renderer:
     def add_statistics(self, scene: DeviceScene, camera: Camera, statistics: Statistics) -> None:
         """Add one view to `statistics` (hits and weights of every row)."""
         view = self._prepare(scene, camera)
-        hits, sums = self._sum_arrays(scene, 1)
+        hits, sums = self._sum_arrays(scene, view, 1)
         self._blend(view, "blend_stats", (hits, sums, view.buffers.image))
-        statistics.hits += self.backend.read(hits)
-        statistics.weights += self.read_sums(sums, 1, scene.count)[0].view(np.uint64)
+        rows = slice(None) if self.view_rows is None else self.view_rows
+        statistics.hits[rows] += self.backend.read(hits)[: view.count]
+        statistics.weights[rows] += self.read_sums(sums, 1, view.count)[0].view(np.uint64)
 
     def removal_sums(self, scene: DeviceScene, camera: Camera) -> Any:
         """Squared error of removing each row alone, and the sum of its squared weights, in one view.
@@ -293,7 +364,7 @@ class Renderer:
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
-        hits, sums = self._sum_arrays(scene, 2)
+        hits, sums = self._sum_arrays(scene, view, 2)
         self._blend(view, "blend_removal", (hits, sums, view.buffers.image), again=True)
         return sums
 
@@ -313,7 +384,7 @@ class Renderer:
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
-        hits, sums = self._sum_arrays(scene, 4)
+        hits, sums = self._sum_arrays(scene, view, 4)
         self._blend(view, "blend_residual", (hits, sums, self._residual(view, target)), again=True)
         return sums
 
@@ -327,7 +398,7 @@ class Renderer:
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
-        hits, sums = self._sum_arrays(scene, 6)
+        hits, sums = self._sum_arrays(scene, view, 6)
         residual = self._residual(view, target)
         self._blend(view, "blend_both", (hits, sums, view.buffers.image, residual), again=True)
         return sums
@@ -338,24 +409,23 @@ class Renderer:
         self.backend.launch("residual", (residual.shape[0],), residual.shape[0], half, view.buffers.image, residual)
         return residual
 
-    def read_sums(self, sums: Any, channels: int, count: int, first: int = 0) -> np.ndarray:
-        """[channels, N] i64 from the words of sums, from plane `first` on."""
+    def read_sums(self, sums: Any, channels: int, count: int, first: int = 0, start: int = 0) -> np.ndarray:
+        """[channels, N] i64 from the words of sums, from plane `first` and row `start` on."""
         values = np.empty((channels, count), np.int64)
         planes = sums.shape[1]
         for base in range(0, count, SUM_ROWS):
             rows = min(SUM_ROWS, count - base)
-            words = self.backend.read(sums, np.empty((rows, planes, 2), np.uint32), 2 * planes * base)
+            words = self.backend.read(sums, np.empty((rows, planes, 2), np.uint32), 2 * planes * (start + base))
             values[:, base : base + rows] = words.view(np.int64)[:, first : first + channels, 0].T
         return values
 
-    def _sum_arrays(self, scene: DeviceScene, channels: int) -> tuple[Any, Any]:
-        held = scene.statistics
-        if held and held[1].shape[1] != channels:
-            for array in held:
-                array.release()
-            held = scene.statistics = []
+    def _sum_arrays(self, scene: DeviceScene, view: _View, channels: int) -> tuple[Any, Any]:
+        held, count = scene.statistics, view.buffers.rows or scene.count
+        if held and held[1].shape[:2] != (count, channels):
+            scene.drop_statistics()
+            held = []
         if not held:
-            shapes = (((scene.count,), np.uint32), ((scene.count, channels, 2), np.uint32))
+            shapes = (((count,), np.uint32), ((count, channels, 2), np.uint32))
             held = scene.statistics = [self.backend.array(shape, dtype) for shape, dtype in shapes]
         for array in held:
             self.backend.fill(array, 0)
@@ -363,19 +433,71 @@ class Renderer:
 
     def _prepare(self, scene: DeviceScene, camera: Camera) -> _View:
         """Project and order the splats of a view, and split them into batches whose pairs fit."""
-        backend = self.backend
         buffers = self._view_buffers(scene, camera)
-        backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
-        for chunk in scene.chunks():
-            backend.launch(
-                "project", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, self.inria_extent,
-                int(scene.antialiased), buffers.camera, chunk.means, chunk.cov, chunk.log2_opacity, chunk.sh_dc, chunk.sh_rest,
-                buffers.records, buffers.keys, buffers.bounds,
-            )  # fmt: skip
-        shown, pairs = self._sort(scene.count, buffers)
+        self.view_rows = None
+        if buffers.rows is not None:
+            buffers, self.view_rows = self._project_compact(scene, camera, buffers)
+        else:
+            self._project(scene, camera, buffers)
+        count = scene.count if self.view_rows is None else len(self.view_rows)
+        shown, pairs = self._sort(count, buffers)
         self.splats_shown = shown
         batches = [(0, shown)] if pairs <= buffers.capacity else self._batches(buffers, shown)
-        return _View(buffers, camera, batches)
+        return _View(buffers, camera, batches, count)
+
+    def _project(self, scene: DeviceScene, camera: Camera, buffers: _ViewBuffers) -> None:
+        self.backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
+        for chunk in scene.chunks():
+            self._project_chunk(scene, chunk, chunk.base, buffers, (buffers.records, buffers.keys, buffers.bounds))
+
+    def _project_chunk(
+        self, scene: DeviceScene, chunk: Chunk, base: int, buffers: _ViewBuffers, out: tuple[Any, ...]
+    ) -> None:
+        self.backend.launch(
+            "project", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, self.inria_extent,
+            int(scene.antialiased), buffers.camera, chunk.means, chunk.cov, chunk.log2_opacity, chunk.sh_dc, chunk.sh_rest,
+            *out,
+        )  # fmt: skip
+
+    def _project_compact(
+        self, scene: DeviceScene, camera: Camera, buffers: _ViewBuffers
+    ) -> tuple[_ViewBuffers, np.ndarray]:
+        """Project, and keep what is shown: in order of rows, so that all that follows gives the same bits.
+
+        When a view shows more than there is room for, the buffers are made anew for what its first part lets expect.
+        """
+        while True:
+            self.backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
+            rows, seen = self._fill_compact(scene, buffers)
+            assert buffers.rows is not None
+            if seen == scene.count:
+                return buffers, rows
+            expected = int(GROWTH * max(len(rows) * scene.count / max(seen, 1), buffers.rows))
+            scene.shown = min(-(-expected // CAPACITY_STEP) * CAPACITY_STEP, scene.count)
+            scene.drop_statistics()
+            self.release()
+            self._buffers = buffers = _ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
+
+    def _fill_compact(self, scene: DeviceScene, buffers: _ViewBuffers) -> tuple[np.ndarray, int]:
+        """[m] u32, rows shown; and up to which row of the scene they are complete."""
+        backend, (records, keys, bounds) = self.backend, buffers.chunk
+        assert buffers.rows is not None
+        found: list[np.ndarray] = []
+        at = 0
+        for chunk in scene.chunks():
+            self._project_chunk(scene, chunk, 0, buffers, buffers.chunk)
+            depth = backend.read(keys, np.empty(chunk.count, np.uint32))
+            shown = np.flatnonzero(depth != CULLED)
+            if at + len(shown) > buffers.rows:
+                return np.concatenate([*found, shown]), chunk.base + chunk.count
+            backend.write(
+                buffers.records, backend.read(records, np.empty((chunk.count, 16), np.float32))[shown], 16 * at
+            )
+            backend.write(buffers.keys, depth[shown], at)
+            backend.write(buffers.bounds, backend.read(bounds, np.empty(chunk.count, np.uint32))[shown], at)
+            found.append((chunk.base + shown).astype(np.uint32))
+            at += len(shown)
+        return np.concatenate(found) if found else np.zeros(0, np.uint32), scene.count
 
     def _blend(self, view: _View, blend: str, extra: tuple[Any, ...] = (), again: bool = False) -> None:
         """Blend all batches; `again`: the lists of a single batch are still there."""
@@ -392,13 +514,26 @@ class Renderer:
     def _view_buffers(self, scene: DeviceScene, camera: Camera) -> _ViewBuffers:
         if self._buffers is None or self._buffers.key != view_key(scene, camera):
             self.release()
+            if scene.shown is None and self._may_be_compact(scene) and not self._fits(scene, camera):
+                scene.be_compact(min(-(-scene.count // FIRST_SHARE // CAPACITY_STEP + 1) * CAPACITY_STEP, scene.count))
             try:
-                self._buffers = _ViewBuffers(self.backend, scene, camera, self.budget)
+                self._buffers = _ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
             except BudgetError:
                 # A larger view than before: the scene gives up its place and is streamed from now on if need be.
                 scene.evict()
-                self._buffers = _ViewBuffers(self.backend, scene, camera, self.budget)
+                self._buffers = _ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
         return self._buffers
+
+    def _may_be_compact(self, scene: DeviceScene) -> bool:
+        """Sums over views that take more than a view's own statistics need a place, and stay where the first view put them."""
+        return not scene.statistics and (self.room.spills or scene.sum_bytes <= SUM_BYTES)
+
+    def _fits(self, scene: DeviceScene, camera: Camera) -> bool:
+        """Whether a view has room for all rows of the scene, beside what sums over views will take."""
+        if self.largest is not None and self.largest.width * self.largest.height > camera.width * camera.height:
+            camera = self.largest
+        size = view_bytes(self.backend, scene.count, camera) + scene.targets * target_bytes(camera) + scene.later_bytes
+        return size + scene.least_chunk_bytes <= self.budget.free + scene.held_bytes
 
     def _sort(self, count: int, buffers: _ViewBuffers) -> tuple[int, int]:
         """Depth order of the shown splats into `buffers.sorted[0]`; how many there are, and a bound on their pairs."""

@@ -6,13 +6,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import PurePath
 from typing import Any
 
-from flexgs_edge.budget import format_mib, format_size
+from flexgs_edge.budget import format_size
 from flexgs_edge.render.quality import Quality
 from flexgs_edge.report import chart, plan, viewer
 from flexgs_edge.report.html import Markup, page, table, text
 from flexgs_edge.report.material import Material, Shot
 from flexgs_edge.report.result import CompressResult, EvaluateResult, RunInfo, SceneInfo, ViewsInfo
-from flexgs_edge.report.summary import decided_words, device_words
+from flexgs_edge.report.summary import decided_words, device_words, memory_words
 from flexgs_edge.report.tones import ERROR_SCALE, css_ramp
 
 _STYLE = """
@@ -275,7 +275,7 @@ def _scene_facts(label: str, scene: SceneInfo) -> list[tuple[str, object]]:
 def _run_section(facts: list[tuple[str, object]], run: RunInfo) -> list[str]:
     facts = list(facts)
     facts.append(("took", f"{run.seconds:.1f} s, of these start-up of the device {run.startup_seconds:.1f} s"))
-    facts.append(("memory", f"peak {format_mib(run.peak_memory)}, limit {format_mib(run.memory_limit)}"))
+    facts.append(("memory", memory_words(run)))
     if run.device is not None:
         facts.append(("device", device_words(run.device)))
     stages = [(name, seconds, [f"{seconds:.2f} s"]) for name, seconds in run.stages.items()]

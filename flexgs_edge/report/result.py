@@ -30,7 +30,11 @@ class RunInfo:
     startup_seconds, compile_seconds : float
         Opening the device, and building kernels (part of the stages that first needed them).
     memory_limit, peak_memory : int
-        The limit, and the largest resident memory of the process.
+        The limit, and the largest resident memory of the process. With scratch files that counts their pages too, which the
+        kernel leaves there as long as nobody needs the room.
+    peak_anonymous, scratch : int or None
+        The largest resident memory without a file behind it (sampled) and the most bytes in scratch files; `None` for runs
+        without scratch files.
     device : dict or None
         What ran the kernels; `None` when nothing was rendered.
     """
@@ -42,6 +46,8 @@ class RunInfo:
     memory_limit: int
     peak_memory: int
     device: dict[str, Any] | None
+    peak_anonymous: int | None = None
+    scratch: int | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Seconds are rounded to milliseconds."""
@@ -52,6 +58,8 @@ class RunInfo:
             "compile_ms": round(self.compile_seconds * 1000, 1),
             "memory_limit": self.memory_limit,
             "peak_memory": self.peak_memory,
+            "peak_anonymous": self.peak_anonymous,
+            "scratch": self.scratch,
             "device": self.device,
         }
 

@@ -217,10 +217,20 @@ def _quality_lines(quality: Quality, where: str) -> list[str]:
 def _run_lines(run: RunInfo) -> list[str]:
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in run.stages.items())
     lines = [_line("took", f"{run.seconds:.1f} s ({stages})")]
-    lines.append(_line("memory", f"peak {format_mib(run.peak_memory)} of a limit of {format_mib(run.memory_limit)}"))
+    lines.append(_line("memory", memory_words(run)))
     if run.device is not None:
         lines.append(_line("device", device_words(run.device)))
     return lines
+
+
+def memory_words(run: RunInfo) -> str:
+    """Peak and limit; with scratch files what they took, and the peak of what cannot go there."""
+    words = f"peak {format_mib(run.peak_memory)} of a limit of {format_mib(run.memory_limit)}"
+    if run.scratch is None:
+        return words
+    pages = f" (pages of {format_mib(run.scratch)} in scratch files among them)"
+    anonymous = "" if run.peak_anonymous is None else f", {format_mib(run.peak_anonymous)} without a file behind them"
+    return f"{words}{pages}{anonymous}"
 
 
 def device_words(device: dict[str, object]) -> str:

@@ -23,9 +23,15 @@ FIELDS = ("means", "log_scales", "quats", "opacity_logits")
 
 
 def fingerprint(
-    source: SceneSource, cameras: Sequence[Camera], kind: str, near: float, extent: str, antialiased: bool = False
+    source: SceneSource,
+    cameras: Sequence[Camera],
+    kind: str,
+    near: float,
+    extent: str,
+    antialiased: bool = False,
+    fields: Sequence[str] = FIELDS,
 ) -> str:
-    """A digest of everything that scores depend on; reads the scene once, without its colours.
+    """A digest of everything that scores depend on; reads the scene once, by default without its colours.
 
     Parameters
     ----------
@@ -35,6 +41,8 @@ def fingerprint(
         The training poses, at the size they are drawn. Their names do not count.
     kind, near, extent, antialiased : str, float, str, bool
         Which score, and how views are drawn.
+    fields : sequence of str
+        What the score depends on.
     """
     digest = hashlib.sha256(
         f"{__version__} {kind} {near!r} {extent} {antialiased} {source.count} {len(cameras)}".encode()
@@ -45,7 +53,7 @@ def fingerprint(
         for values in (numbers, camera.rotation, camera.translation):
             digest.update(np.asarray(values, "<f8").tobytes())
     for rows in source.chunks(ROWS):
-        for plane in source.read(rows, FIELDS).values():
+        for plane in source.read(rows, fields).values():
             digest.update(np.ascontiguousarray(plane, "<f4").data)
     return digest.hexdigest()
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,9 @@ from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import FIXED_ERROR, FIXED_WEIGHT
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import DeviceScene, Renderer
+from flexgs_edge.render.device_scene import Chunk
+from flexgs_edge.render.view_sums import Maker, ViewSums
+from flexgs_edge.scratch import MEMORY, Room, blocks
 
 
 @dataclass
@@ -40,15 +44,26 @@ class RemovalCosts:
     sh_mean: np.ndarray
 
     @classmethod
-    def of(cls, parts: Sequence[CostParts]) -> RemovalCosts:
+    def of(cls, parts: Sequence[CostParts], room: Room = MEMORY) -> RemovalCosts:
         """Costs over all poses, from sums over some of them each."""
-        removal, weight2 = sum(part.removal for part in parts), sum(part.weight2 for part in parts)
-        moments = sum(part.moments for part in parts)
-        assert isinstance(removal, np.ndarray) and isinstance(weight2, np.ndarray) and isinstance(moments, np.ndarray)
-        divisor = np.where(weight2 > 0, weight2, 1.0)
-        # Rounding may leave a variance of nothing slightly below zero.
-        sh = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
-        return cls(removal, weight2, sh, (moments[:, :3] / divisor).astype(np.float32))
+        levels, count = parts[0].moments.shape[0], len(parts[0].removal)
+        costs = cls.empty(levels, count, room)
+        for rows in blocks(count):
+            costs.removal[rows] = sum(part.removal[rows] for part in parts)
+            weight2 = costs.weight2[rows] = sum(part.weight2[rows] for part in parts)
+            moments = sum(part.moments[:, :, rows] for part in parts)
+            assert isinstance(weight2, np.ndarray) and isinstance(moments, np.ndarray)
+            divisor = np.where(weight2 > 0, weight2, 1.0)
+            # Rounding may leave a variance of nothing slightly below zero.
+            costs.sh[:, rows] = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
+            costs.sh_mean[:, :, rows] = (moments[:, :3] / divisor).astype(np.float32)
+        return costs
+
+    @classmethod
+    def empty(cls, levels: int, count: int, room: Room = MEMORY) -> RemovalCosts:
+        """Arrays for `count` rows of SH degree `levels`."""
+        one, two = (room.empty((count,), np.float64) for _ in range(2))
+        return cls(one, two, room.empty((levels, count), np.float64), room.empty((levels, 3, count), np.float32))
 
 
 @dataclass
@@ -67,13 +82,13 @@ class CostParts:
     weight2: np.ndarray
     moments: np.ndarray
 
-    def take(self, rows: np.ndarray) -> CostParts:
+    def take(self, rows: np.ndarray, room: Room = MEMORY) -> CostParts:
         """The sums of some rows."""
-        return CostParts(self.removal[rows], self.weight2[rows], self.moments[:, :, rows])
+        return CostParts(*(room.take(values, rows) for values in (self.removal, self.weight2, self.moments)))
 
 
 def moment_bytes(sh_degree: int) -> int:
-    """Bytes a row that the moments of `CostSums` take on the backend."""
+    """Bytes a row that the moments of `cost_sums` take on the backend."""
     return 32 * sh_degree
 
 
@@ -92,35 +107,27 @@ class _Wide:
         return (self.high * 2.0**64 + self.low) / unit
 
 
-class CostSums:
-    """Sums over views of what costs are made of.
+def cost_sums(renderer: Renderer, degree: int, first: int = 0) -> Maker:
+    """Sums over views of what costs are made of; removal sums begin at plane `first` of a view's.
 
     Parameters
     ----------
-    renderer, scene : Renderer, DeviceScene
-    sh_costs : bool
-        Measure the costs of dropping SH degrees as well (empty arrays otherwise).
+    degree : int
+        SH degree of the scene, or 0 to leave the costs of dropping SH degrees out.
     """
+    return partial(_ChunkCosts, renderer, degree, first)
 
-    def __init__(self, renderer: Renderer, scene: DeviceScene, sh_costs: bool = True) -> None:
-        self._renderer, self._count = renderer, scene.count
-        self._removal, self._weight2 = _Wide(scene.count), _Wide(scene.count)
-        self._moments = _Moments(renderer, scene, scene.sh_degree if sh_costs else 0)
 
-    def add_view(self, sums: Any, first: int = 0) -> None:
-        """Add the view drawn last; its removal sums begin at plane `first` of `sums`."""
-        self._moments.add_view(sums, first + 1)
-        errors, weights = self._renderer.read_sums(sums, 2, self._count, first)
-        self._removal.add(errors)
-        self._weight2.add(weights)
+def cost_parts(levels: int, count: int, room: Room) -> CostParts:
+    """Parts of `count` rows of SH degree `levels`, to be filled by `put_costs`."""
+    one, two = (room.empty((count,), np.float64) for _ in range(2))
+    return CostParts(one, two, room.empty((levels, 4, count), np.float64))
 
-    def finish(self) -> CostParts:
-        """The sums over the views added."""
-        return CostParts(self._removal.value(FIXED_ERROR), self._weight2.value(FIXED_ERROR), self._moments.finish())
 
-    def release(self) -> None:
-        """Free what is held on the backend."""
-        self._moments.release()
+def put_costs(parts: CostParts, rows: slice, sums: Any) -> None:
+    """Put the finished sums of a chunk (from `cost_sums`) into their rows."""
+    parts.removal[rows], parts.weight2[rows] = sums.removal.value(FIXED_ERROR), sums.weight2.value(FIXED_ERROR)
+    parts.moments[:, :, rows] = sums.moments()
 
 
 def measure_costs(
@@ -138,48 +145,51 @@ def measure_costs(
     cameras : sequence of Camera
         The scored poses.
     sh_costs : bool
-        As for `CostSums`.
+        Measure the costs of dropping SH degrees as well (empty arrays otherwise).
     """
-    costs = CostSums(renderer, scene, sh_costs)
+    degree = scene.sh_degree if sh_costs else 0
+    costs = ViewSums(renderer, scene, [cost_sums(renderer, degree)])
     try:
         for camera in progress.track(cameras, "measuring costs", len(cameras)):
-            costs.add_view(renderer.removal_sums(scene, camera))
-        return RemovalCosts.of([costs.finish()])
+            costs.add_view(renderer.removal_sums(scene, camera), camera)
+        found = cost_parts(degree, scene.count, renderer.room)
+        for rows, (sums,) in costs.parts():
+            put_costs(found, rows, sums)
+        return RemovalCosts.of([found], renderer.room)
     finally:
         costs.release()
 
 
-class _Moments:
-    """Weighted moments of the colour above each SH degree, chunk by chunk, on the backend."""
+class _ChunkCosts:
+    """Sums of one chunk: squared errors and weights on the host, weighted moments of the colour on the backend."""
 
-    def __init__(self, renderer: Renderer, scene: DeviceScene, degree: int) -> None:
-        self.renderer, self.scene, self.degree = renderer, scene, degree
-        self.arrays: dict[int, tuple[int, Any]] = {}
+    def __init__(self, renderer: Renderer, degree: int, first: int, chunk: Chunk) -> None:
+        self._renderer, self._degree, self._first, self._count = renderer, degree, first, chunk.count
+        self.removal, self.weight2 = _Wide(chunk.count), _Wide(chunk.count)
+        self._moments: Any = None
+        if degree and chunk.degree:
+            self._moments = renderer.backend.array((degree, 4, chunk.stride), np.int64)
+            renderer.backend.fill(self._moments, 0)
 
-    def add_view(self, sums: Any, plane: int) -> None:
-        if not self.degree:
-            return
-        backend, camera = self.renderer.backend, self.renderer.camera_array
-        for chunk in self.scene.chunks():
-            if not chunk.degree:
-                continue
-            if chunk.base not in self.arrays:
-                array = backend.array((self.degree, 4, chunk.stride), np.int64)
-                backend.fill(array, 0)
-                self.arrays[chunk.base] = (chunk.count, array)
-            backend.launch(
-                "sh_costs", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, sums.shape[1],
-                plane, camera, chunk.means, chunk.sh_rest, sums, self.arrays[chunk.base][1],
+    def add(self, chunk: Chunk, sums: Any, base: int) -> None:
+        renderer = self._renderer
+        if self._moments is not None:
+            renderer.backend.launch(
+                "sh_costs", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, sums.shape[1],
+                self._first + 1, renderer.camera_array, chunk.means, chunk.sh_rest, sums, self._moments,
             )  # fmt: skip
+        errors, weights = renderer.read_sums(sums, 2, chunk.count, self._first, base)
+        self.removal.add(errors)
+        self.weight2.add(weights)
 
-    def finish(self) -> np.ndarray:
-        """[D, 4, N] f64."""
-        moments = np.zeros((self.degree, 4, self.scene.count))
-        for base, (count, array) in self.arrays.items():
-            moments[:, :, base : base + count] = self.renderer.backend.read(array)[:, :, :count] / FIXED_WEIGHT
+    def moments(self) -> np.ndarray:
+        """[D, 4, n] f64."""
+        if self._moments is None:
+            return np.zeros((self._degree, 4, self._count))
+        moments: np.ndarray = self._renderer.backend.read(self._moments)[:, :, : self._count] / FIXED_WEIGHT
         return moments
 
     def release(self) -> None:
-        for _, array in self.arrays.values():
-            array.release()
-        self.arrays = {}
+        if self._moments is not None:
+            self._moments.release()
+            self._moments = None

@@ -43,7 +43,7 @@ class RankedPath(PrunePath):
         # Rows that no pose sees have no cost to give away, and stay.
         seen = np.flatnonzero(costs.weight2 > 0)
         removal = costs.removal.copy()
-        removal[seen[np.argsort(self._ranks[snapshot.rows[seen]])]] = np.sort(removal[seen])
+        removal[seen[np.argsort(self._ranks[self.rows[snapshot.rows[seen]]])]] = np.sort(removal[seen])
         snapshot.costs = replace(costs, removal=removal)
 
 
@@ -54,7 +54,7 @@ class OnePassPath(PrunePath):
         """See `PrunePath.descend`."""
         last = self.snapshots[-1]
         snapshot = super().descend(share)
-        kept = np.flatnonzero(np.isin(last.rows, snapshot.rows))
+        kept = np.searchsorted(last.rows, snapshot.rows)
         # Weights and mean colours belong to the colours as they are now.
         snapshot.costs = replace(snapshot.costs, removal=last.costs.removal[kept], sh=last.costs.sh[:, kept])
         return snapshot

@@ -1,0 +1,92 @@
+"""The rounds of a path kept in a folder, so that a run that was killed goes on from its last finished round."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.scene.atomic import DISK_FULL
+from flexgs_edge.scratch import Room, blocks
+
+DONE = "done"
+"""File of a round that is there last: without it the round was cut short."""
+
+
+class Checkpoint:
+    """A folder with a folder for each finished round of one path.
+
+    Parameters
+    ----------
+    folder : path
+        Made if missing. Its name says which path it is of.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.folder}: cannot keep the state of the run there ({error.strerror})") from error
+
+    def has(self, number: int) -> bool:
+        """Whether a round was finished."""
+        return (self._place(number) / DONE).is_file()
+
+    @property
+    def rounds(self) -> int:
+        """Finished rounds."""
+        number = 0
+        while self.has(number):
+            number += 1
+        return number
+
+    def load(self, number: int, room: Room) -> dict[str, np.ndarray]:
+        """The arrays of a finished round, by name, in `room`."""
+        arrays = {}
+        for place in sorted(self._place(number).glob("*.npy")):
+            held = np.load(place, mmap_mode="r", allow_pickle=False)
+            arrays[place.stem] = room.copy(held)
+        return arrays
+
+    def save(self, number: int, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
+        """Keep a round; whatever an earlier run left of it is written over.
+
+        Raises
+        ------
+        BudgetError
+            When the disk is full.
+        """
+        place = self._place(number)
+        shutil.rmtree(place, ignore_errors=True)
+        try:
+            place.mkdir()
+            for name, values in arrays:
+                with open(place / f"{name}.npy", "wb") as file:
+                    np.lib.format.write_array_header_1_0(
+                        file, {"descr": values.dtype.str, "fortran_order": False, "shape": values.shape}
+                    )
+                    for plane in values.reshape(-1, values.shape[-1]) if values.size else ():
+                        for rows in blocks(values.shape[-1], 1 << 20):
+                            file.write(np.ascontiguousarray(plane[rows]).data)
+                    file.flush()
+                    os.fsync(file.fileno())
+            (place / DONE).touch()
+        except OSError as error:
+            if error.errno not in DISK_FULL:
+                raise
+            raise BudgetError(
+                f"{place}: the disk is full ({error.strerror}): --resume keeps every round of the search there; free some space, "
+                "name another folder with --scratch, or leave --resume out"
+            ) from error
+
+    def remove(self) -> None:
+        """Remove the folder: the run is done."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _place(self, number: int) -> Path:
+        return self.folder / f"round-{number}"

@@ -1,0 +1,148 @@
+"""Sums over views, chunk by chunk of the scene: added up view by view where memory holds them, else chunk by chunk.
+
+In memory every view is added to the sums of all chunks as soon as it is drawn. Where these do not fit, what each row got in
+each view is written to a file (only the rows that got something, 52 bytes at most), and read again chunk by chunk: then the sums
+of one chunk are held at a time. Both add up the same numbers in the same order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, BinaryIO, Protocol
+
+import numpy as np
+
+from flexgs_edge.cameras import Camera
+from flexgs_edge.render.device_scene import Chunk, DeviceScene
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.scratch import Room
+
+SPOOL_ROWS = 1 << 16
+"""Rows of a view that are read from the backend and written at a time."""
+
+
+class ChunkSums(Protocol):
+    """Sums over views of the rows of one chunk."""
+
+    def add(self, chunk: Chunk, sums: Any, base: int) -> None:
+        """Add the view that `Renderer.camera_array` tells of; the chunk's rows begin at row `base` of its `sums`."""
+
+    def release(self) -> None:
+        """Free what is held on the backend."""
+
+
+Maker = Callable[[Chunk], ChunkSums]
+
+
+class ViewSums:
+    """Sums over the views of a scene.
+
+    Parameters
+    ----------
+    renderer, scene : Renderer, DeviceScene
+    makers : sequence of callable
+        Each makes one kind of sums for a chunk.
+    """
+
+    def __init__(self, renderer: Renderer, scene: DeviceScene, makers: Sequence[Maker]) -> None:
+        self._renderer, self._scene, self._makers = renderer, scene, makers
+        self._held: dict[int, tuple[int, list[ChunkSums]]] = {}
+        self._spool: _Spool | None = None
+
+    def add_view(self, sums: Any, camera: Camera) -> None:
+        """Add the view drawn last, from `camera`. The order of views is part of the result."""
+        if self._renderer.view_rows is not None:
+            if self._spool is None:
+                self._spool = _Spool(self._renderer.room, sums.shape[1], self._scene.starts)
+            self._spool.add(self._renderer, self._renderer.view_rows, sums, camera)
+            return
+        for chunk in self._scene.chunks():
+            if chunk.base not in self._held:
+                self._held[chunk.base] = (chunk.count, [make(chunk) for make in self._makers])
+            for part in self._held[chunk.base][1]:
+                part.add(chunk, sums, chunk.base)
+
+    def parts(self) -> Iterator[tuple[slice, list[Any]]]:
+        """Rows of the scene and their sums over the views added, one of each kind, chunk by chunk; valid until the next."""
+        if self._held:
+            for base, (count, parts) in self._held.items():
+                yield slice(base, base + count), parts
+            return
+        for chunk in self._scene.chunks():
+            parts = [make(chunk) for make in self._makers]
+            try:
+                # Without a spool there was no view, and the sums are those of nothing.
+                for sums in self._spool.replay(self._renderer, self._scene, chunk) if self._spool else ():
+                    for part in parts:
+                        part.add(chunk, sums, 0)
+                yield slice(chunk.base, chunk.base + chunk.count), parts
+            finally:
+                for part in parts:
+                    part.release()
+
+    def release(self) -> None:
+        """Free what is held."""
+        for _, parts in self._held.values():
+            for part in parts:
+                part.release()
+        self._held = {}
+        if self._spool is not None:
+            self._spool.close()
+            self._spool = None
+
+
+class _Spool:
+    """What the rows of a scene got in some views, in a scratch file: view by view, rows ascending."""
+
+    def __init__(self, room: Room, planes: int, starts: np.ndarray) -> None:
+        self._room, self._planes, self._starts = room, planes, starts
+        self._record = np.dtype([("row", "<u4"), ("sums", "<i8", (planes,))])
+        self._file: BinaryIO = room.file()
+        self._end = 0
+        # For each view: its camera, where it begins, and how many of its rows come before each chunk.
+        self._views: list[tuple[Camera, int, np.ndarray]] = []
+
+    def add(self, renderer: Renderer, rows: np.ndarray, sums: Any, camera: Camera) -> None:
+        """Write one view: `rows` [m] u32, sums on the backend."""
+        start, before = self._end, np.zeros(len(self._starts), np.int64)
+        try:
+            self._file.seek(start)
+            for at in range(0, len(rows), SPOOL_ROWS):
+                count = min(SPOOL_ROWS, len(rows) - at)
+                words = np.empty((count, self._planes, 2), np.uint32)
+                values = renderer.backend.read(sums, words, 2 * self._planes * at).view(np.int64)[..., 0]
+                some = np.flatnonzero(values.any(axis=1))
+                block = np.empty(len(some), self._record)
+                block["row"], block["sums"] = rows[at + some], values[some]
+                self._file.write(block.data)
+                self._end += block.nbytes
+                before += np.searchsorted(block["row"], self._starts)
+            self._file.flush()
+        except OSError as error:
+            raise self._room.full(self._end - start, error) from error
+        self._views.append((camera, start, before))
+
+    def replay(self, renderer: Renderer, scene: DeviceScene, chunk: Chunk) -> Iterator[Any]:
+        """For each view in which a row of the chunk got something: its sums, [stride, planes, 2] u32 on the backend."""
+        backend, place = renderer.backend, int(np.searchsorted(self._starts, chunk.base))
+        dense = np.zeros((chunk.stride, self._planes), np.int64)
+        array = backend.array((chunk.stride, self._planes, 2), np.uint32)
+        try:
+            for camera, start, before in self._views:
+                low, high = before[place : place + 2].tolist()
+                if low == high:
+                    continue
+                block = np.empty(high - low, self._record)
+                self._file.seek(start + low * self._record.itemsize)
+                self._file.readinto(block.data.cast("B"))  # type: ignore[attr-defined]
+                dense[...] = 0
+                dense[block["row"].astype(np.int64) - chunk.base] = block["sums"]
+                backend.write(array, dense.view(np.uint32).reshape(array.shape))
+                renderer.aim(camera, scene.origin)
+                yield array
+        finally:
+            array.release()
+
+    def close(self) -> None:
+        """Remove the file."""
+        self._file.close()

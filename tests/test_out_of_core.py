@@ -1,0 +1,232 @@
+"""Scenes that do not fit into memory: the same pictures, sums and bytes as those that do, also after a kill."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flexgs_edge.cameras import Camera
+from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.pipeline import compress as compress_module
+from flexgs_edge.pipeline.compress import compress
+from flexgs_edge.refit import refit_colours
+from flexgs_edge.render import Renderer, Statistics, device_scene
+from flexgs_edge.render import renderer as renderer_module
+from flexgs_edge.render.targets import TargetViews
+from flexgs_edge.scene import write_ply
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.score.removal import measure_costs
+from flexgs_edge.scratch import Scratch
+from kernel_fixtures import FORMS, large_budget, open_form
+from synthetic import joined, look_from, make_camera, random_scene
+from tiny_project import make_project, write_cameras
+
+SCENE = joined(random_scene(700, 5, 2), random_scene(300, 6, 2, size=-1.0))
+TINY: dict[str, Any] = {"effort": "fast", "holdout": 4, "device": "numpy", "min_fidelity": 35.0, "best_effort": True}
+
+
+def cameras() -> list[Camera]:
+    """Views of two sizes; one sees nothing."""
+    views = []
+    for seed, (width, height) in enumerate([(40, 30), (40, 30), (64, 20)]):
+        rotation, translation = look_from(seed)
+        views.append(make_camera(width, height, rotation=rotation, translation=translation, name=f"v{seed}"))
+    rotation, _ = look_from(1)
+    return [*views, make_camera(40, 30, rotation=rotation, translation=(0.0, 0.0, -50.0), name="nothing")]
+
+
+@pytest.fixture
+def compact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views hold what they show, with room for few rows at first, in chunks of 64 rows."""
+    monkeypatch.setattr(Renderer, "_fits", lambda *_: False)
+    monkeypatch.setattr(renderer_module, "CAPACITY_STEP", 32)
+    monkeypatch.setattr(renderer_module, "FIRST_SHARE", 100)
+    for module in (renderer_module, device_scene):
+        monkeypatch.setattr(module, "COMPACT_ROWS", 64)
+
+
+def found_by(form: str, room: Scratch | None) -> dict[str, np.ndarray]:
+    """Pictures, statistics, costs and refitted colours of the scene."""
+    drawer = Renderer(open_form(form), large_budget())
+    if room is not None:
+        drawer.room = room
+    statistics = Statistics.zeros(SCENE.count)
+    found: dict[str, np.ndarray] = {}
+    with drawer.load(SCENE) as scene:
+        for camera in cameras():
+            found[camera.name] = drawer.render(scene, camera)
+            drawer.add_statistics(scene, camera, statistics)
+        assert (scene.shown is not None) == (room is not None)
+    found |= {"hits": statistics.hits, "weights": statistics.weights}
+    with drawer.load(SCENE, 100) as scene, TargetViews() as targets:
+        costs = measure_costs(drawer, scene, cameras())
+        found |= {name: getattr(costs, name) for name in ("removal", "weight2", "sh", "sh_mean")}
+        planes = SCENE.read(slice(0, SCENE.count), list(FIELD))
+        for view, camera in enumerate(cameras()):
+            targets.add(view, drawer.render_planes(scene, camera))
+        planes["sh_dc"] = planes["sh_dc"] + np.float32(0.1)
+        degrees = np.arange(SCENE.count) % 3
+        moved = refit_colours(drawer, planes, degrees, SCENE.origin, cameras(), targets, 2, subsets=2)
+    drawer.release()
+    return {**found, "moved": moved["sh_dc"], "rest": moved["sh_rest"]}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_compact_views_give_the_same_bits(
+    form: str, compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spilled = found_by(form, Scratch(tmp_path))
+    monkeypatch.undo()
+    plain = found_by(form, None)
+    assert plain["removal"].any() and plain["hits"].any()
+    for name, values in plain.items():
+        np.testing.assert_array_equal(spilled[name], values, err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_project(tmp_path_factory.mktemp("tiny") / "scene", photos=False)
+
+
+@pytest.fixture(scope="module")
+def expected(project: Path) -> bytes:
+    compress(project / "point_cloud.ply", project / "plain.fgs", layers=2, **TINY)
+    return (project / "plain.fgs").read_bytes()
+
+
+@pytest.fixture
+def spilled(compact: None, monkeypatch: pytest.MonkeyPatch) -> list[Scratch]:
+    """Every scene goes to scratch files, however small."""
+    rooms: list[Scratch] = []
+
+    def choose(renderer: Any, source: Any, cameras: Any, options: Any, budget: Any, folder: Path) -> Scratch:
+        rooms.append(Scratch(folder))
+        return rooms[-1]
+
+    monkeypatch.setattr(compress_module, "choose_room", choose)
+    monkeypatch.setattr("flexgs_edge.scratch._SMALL", 1)
+    return rooms
+
+
+def test_the_bytes_are_those_of_a_run_in_memory(
+    project: Path, expected: bytes, spilled: list[Scratch], tmp_path: Path
+) -> None:
+    result = compress(project / "point_cloud.ply", tmp_path / "a.fgs", layers=2, **TINY)
+    assert (tmp_path / "a.fgs").read_bytes() == expected
+    assert result.run.scratch == spilled[0].peak > 0 and result.run.peak_anonymous
+    assert os.listdir(tmp_path) == ["a.fgs"]
+
+
+class Stop(BaseException):
+    """What ends a run in the middle, as a kill does."""
+
+
+def test_a_run_goes_on_from_its_last_round(
+    project: Path, expected: bytes, spilled: list[Scratch], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = {**TINY, "layers": 2, "resume": True, "scratch": str(tmp_path / "kept")}
+    (tmp_path / "kept").mkdir()
+    drawn = []
+    both = Renderer.residual_and_removal_sums
+
+    def stop_after(most: int) -> None:
+        def draw(self: Renderer, *arguments: Any) -> Any:
+            if len(drawn) == most:
+                raise Stop
+            drawn.append(1)
+            return both(self, *arguments)
+
+        drawn.clear()
+        monkeypatch.setattr(Renderer, "residual_and_removal_sums", draw)
+
+    for views in (0, 9):  # in the first round, and in a later one
+        stop_after(views)
+        with pytest.raises(Stop):
+            compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
+        assert not (tmp_path / "a.fgs").exists()
+    (kept,) = (tmp_path / "kept").iterdir()
+    rounds = len(list(kept.glob("round-*/done")))
+    assert rounds >= 2
+    # Another scene, other poses: not what was kept.
+    stop_after(0)
+    with pytest.raises(Stop):
+        compress(project / "point_cloud.ply", tmp_path / "b.fgs", **{**words, "holdout": 3})
+    assert len(list((tmp_path / "kept").iterdir())) == 2
+    stop_after(10**6)
+    compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
+    resumed = len(drawn)
+    assert (tmp_path / "a.fgs").read_bytes() == expected and not kept.exists()
+    drawn.clear()
+    compress(project / "point_cloud.ply", tmp_path / "a.fgs", **{**words, "force": True})
+    assert (tmp_path / "a.fgs").read_bytes() == expected and len(drawn) > resumed
+
+
+def test_a_full_disk_leaves_nothing_behind(
+    project: Path, spilled: list[Scratch], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reserve = os.posix_fallocate
+    calls = []
+
+    def full(descriptor: int, offset: int, size: int) -> None:
+        calls.append(size)
+        if len(calls) > 40:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        reserve(descriptor, offset, size)
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(BudgetError, match="the disk is full"):
+        compress(project / "point_cloud.ply", tmp_path / "a.fgs", **TINY)
+    assert not os.listdir(tmp_path)
+
+
+def test_other_formats_stay_in_memory(project: Path, tmp_path: Path) -> None:
+    for words in ({"resume": True}, {"scratch": str(tmp_path)}):
+        with pytest.raises(InputError, match=r"\.fgs files alone"):
+            compress(project / "point_cloud.ply", tmp_path / "a.spz", **{**TINY, **words})
+
+
+def run(folder: Path, *words: str, seconds: float | None = None) -> subprocess.CompletedProcess[str] | None:
+    """`compress` in a process of its own, killed after some seconds (then None)."""
+    command = [
+        sys.executable,
+        "-m",
+        "flexgs_edge",
+        "compress",
+        str(folder / "point_cloud.ply"),
+        "-o",
+        str(folder / "a.fgs"),
+    ]
+    command += ["--effort", "fast", "--min-fidelity", "38", "--best-effort", *words]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    try:
+        return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:  # subprocess kills it then
+        return None
+
+
+def test_kills_lose_no_bytes(tmp_path: Path) -> None:
+    """Killed twice at any moment, and resumed (what lies in scratch files alone is gone with the process: test_scratch.py)."""
+    write_ply(tmp_path / "point_cloud.ply", random_scene(6000, 8, 3, size=-4.0))
+    write_cameras(tmp_path / "cameras.json")
+    started = time.perf_counter()
+    done = run(tmp_path)
+    took = time.perf_counter() - started
+    assert done is not None and done.returncode == 0, done
+    expected = (tmp_path / "a.fgs").read_bytes()
+    (tmp_path / "a.fgs").unlink()
+    for share in (0.5, 0.8):
+        if run(tmp_path, "--resume", seconds=share * took) is None:
+            assert not (tmp_path / "a.fgs").exists()
+            assert all(name.startswith((".flexgs-", "point", "cameras")) for name in os.listdir(tmp_path))
+    done = run(tmp_path, "--resume", "-f")
+    assert done is not None and done.returncode == 0, done
+    assert (tmp_path / "a.fgs").read_bytes() == expected
+    assert sorted(os.listdir(tmp_path)) == ["a.fgs", "cameras.json", "point_cloud.ply"]
