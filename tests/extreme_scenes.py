@@ -42,7 +42,7 @@ class Extreme:
 
 
 _CAMERA = make_camera(45, 37, rotation=look_from(1)[0], translation=look_from(1)[1])
-_AHEAD = make_camera(48, 32)
+AHEAD = make_camera(48, 32)
 
 
 def changed(count: int, seed: int, degree: int = 0, **planes: object) -> MemorySource:
@@ -129,7 +129,7 @@ def _threshold() -> MemorySource:
     steps = [(0.99, 0.99), (0.9, 0.9, 0.9, 0.9), (0.99, 0.9, 0.9), (0.9999, 0.99), (0.9, 0.99, 0.9), (0.9, 0.9, 0.99)]
     means, opacities = [], []
     for place, stack in enumerate(steps):
-        x, y = (12 * (place % 3 - 1) + 0.5) / _AHEAD.fx, (12 * (place // 3) - 6.5) / _AHEAD.fy
+        x, y = (12 * (place % 3 - 1) + 0.5) / AHEAD.fx, (12 * (place // 3) - 6.5) / AHEAD.fy
         for step, opacity in enumerate((*stack, 0.3, 0.02)):
             z = 4 + 0.125 * step
             means.append([x * z, y * z, z])
@@ -162,10 +162,10 @@ EXTREMES = {
     "quaternions tiny, huge and opposite": Extreme(_quaternions, _CAMERA),
     "colours of +-1e4": Extreme(_colours(1e4), _CAMERA, bound=2e-3),
     "colours of +-1e6": Extreme(_colours(1e6), _CAMERA, bound=2e-3),
-    "4000 equal depths": Extreme(_equal_depths, _AHEAD, sure=0.5, bound=2e-3),
-    "across the near plane and behind": Extreme(_near_plane, _AHEAD),
+    "4000 equal depths": Extreme(_equal_depths, AHEAD, sure=0.5, bound=2e-3),
+    "across the near plane and behind": Extreme(_near_plane, AHEAD),
     "1e5 splats on one pixel": Extreme(_one_pixel, make_camera(1, 1), sure=0, bound=1e-2),
-    "transmittance at its threshold": Extreme(_threshold, _AHEAD, edges=6),
+    "transmittance at its threshold": Extreme(_threshold, AHEAD, edges=6),
     "an image of 1x1": Extreme(lambda: random_scene(60, 71, 2), make_camera(1, 1)),
     "an image of 16384x16": Extreme(
         lambda: random_scene(24, 72, spread=4), make_camera(16384, 16, focal=3000, centre=(8000.0, 7.0)), bound=2e-3
@@ -174,6 +174,6 @@ EXTREMES = {
         lambda: random_scene(24, 73, spread=4), make_camera(16, 16384, focal=3000, centre=(7.0, 9000.0)), bound=2e-3
     ),
     "one Gaussian": Extreme(_alone, _CAMERA),
-    "none in view": Extreme(_behind, _AHEAD),
+    "none in view": Extreme(_behind, AHEAD),
 }
 """Every row of the test, by its name."""

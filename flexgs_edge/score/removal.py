@@ -17,6 +17,9 @@ from flexgs_edge.constants import FIXED_ERROR, FIXED_WEIGHT
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import DeviceScene, Renderer
 
+MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
+"""Where the sums of moments stop (colours of some thousands in every view)."""
+
 
 @dataclass
 class RemovalCosts:
@@ -47,7 +50,9 @@ class RemovalCosts:
         assert isinstance(removal, np.ndarray) and isinstance(weight2, np.ndarray) and isinstance(moments, np.ndarray)
         divisor = np.where(weight2 > 0, weight2, 1.0)
         # Rounding may leave a variance of nothing slightly below zero.
-        sh = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
+        variance = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
+        # A sum that stopped growing must not look like no variance at all.
+        sh = np.where(moments[:, 3] >= MOMENT_FULL, moments[:, 3], variance)
         return cls(removal, weight2, sh, (moments[:, :3] / divisor).astype(np.float32))
 
 
