@@ -54,7 +54,7 @@ class Snapshot:
 
 
 class PrunePath:
-    """Walks down from the whole scene; `snapshots[-1]` is the smallest set so far.
+    """Walks down from the whole scene; `snapshots[-1]` is the smallest set so far, and `unseen` rows were in no scored pose.
 
     Parameters
     ----------
@@ -96,6 +96,7 @@ class PrunePath:
         with renderer.load(source, sum_bytes(2) + moment_bytes(source.sh_degree)) as scene:
             self._parts = [self._measure(scene, some, keep=True) for some in self._views]
         costs = RemovalCosts.of(self._parts)
+        self.unseen = int((costs.weight2 <= 0).sum())
         keep = np.flatnonzero(~_hidden(start, costs.weight2, unseen))
         if len(keep) < len(rows):
             rows, start = rows[keep], take_rows(start, keep)

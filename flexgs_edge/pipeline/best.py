@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from flexgs_edge.adapt import Measurement, SearchResult, Step, Target
+from flexgs_edge.adapt import Measurement, Scored, SearchResult, Step, Target
 from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.layers import assign_layers
@@ -24,6 +25,7 @@ from flexgs_edge.kernels import Backend
 from flexgs_edge.pipeline.foreign import FileMaker, WrittenFile, search_pruned_files
 from flexgs_edge.pipeline.foreign_best import FileSearch
 from flexgs_edge.pipeline.judge import Judge, measurement_of
+from flexgs_edge.pipeline.margin import with_margin
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.workspace import Stopwatch, coding_device
 from flexgs_edge.progress import SILENT, Progress
@@ -75,13 +77,16 @@ def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[Writt
     return lambda path, measure, report: FileSearch(path, files, measure, plan, options.refit, report)
 
 
-def scored_poses(cameras: Sequence[Camera], options: CompressOptions) -> list[Camera]:
-    """As many poses as the effort scores, farthest first.
+def scored_poses(
+    cameras: Sequence[Camera], options: CompressOptions, renderer: Renderer, source: SceneSource
+) -> list[Camera]:
+    """As many poses as the effort scores, farthest first; with `views_margin` a part of them made (see `with_margin`).
 
     Names often go round a scene in rings: 8 of the sample's 70 poses evenly spread by name lost 7.8 dB where these lose 1.0 at
     the same bytes (docs/performance.md).
     """
-    return [cameras[i] for i in farthest_order(cameras)[: EFFORTS[options.effort].views]]
+    ordered, most = [cameras[i] for i in farthest_order(cameras)], EFFORTS[options.effort].views
+    return with_margin(renderer, source, ordered, most) if options.views_margin else ordered[:most]
 
 
 def search_best(
@@ -118,7 +123,10 @@ def search_best(
         When the scene does not fit.
     """
     with open_path(renderer, source, cameras, options, budget, clock, progress) as path, clock.stage("search"):
-        return search_path(make, path, renderer, source, judge, target, options, on_step)
+        product, search = search_path(make, path, renderer, source, judge, target, options, on_step)
+        given = {id(camera) for camera in cameras}
+        made = sum(id(camera) not in given for camera in path.cameras)
+        return product, replace(search, scored=Scored(len(path.cameras), made, path.unseen))
 
 
 @contextmanager
@@ -139,7 +147,7 @@ def open_path(
     make : callable, optional
         Builds the path from the arguments of `PrunePath`.
     """
-    scored = scored_poses(cameras, options)
+    scored = scored_poses(cameras, options, renderer, source)
     size = source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep)
     largest = max(scored, key=lambda camera: camera.width * camera.height)
     budget.require(
@@ -218,10 +226,15 @@ def search_files(
 
 
 def layered(
-    grid: GridScene, renderer: Renderer, cameras: list[Camera], options: CompressOptions, progress: Progress = SILENT
+    grid: GridScene,
+    renderer: Renderer,
+    source: SceneSource,
+    cameras: list[Camera],
+    options: CompressOptions,
+    progress: Progress = SILENT,
 ) -> GridScene:
-    """The grid in as many layers as asked for."""
-    poses = scored_poses(cameras, options)
+    """The grid in as many layers as asked for; `source` is the original."""
+    poses = scored_poses(cameras, options, renderer, source)
     return assign_layers(
         grid,
         options.layers,

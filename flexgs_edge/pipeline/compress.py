@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, from_grid
 from flexgs_edge.pipeline.best import grid_search, layered, search_best, search_files
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
+from flexgs_edge.pipeline.doubts import doubts, training_fidelity
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
 from flexgs_edge.pipeline.inputs import Scene, Views, companions_of, find_views, load_scene, resolve_drawing
@@ -130,6 +132,7 @@ class _Job:
         self.groups = options.bit_spec()[1]
         self.sensitivity: list[Sensitivity] = []
         self.scores_reused = False
+        self.trained: float | None = None
 
     def run(self, output: Path | None, scores: np.ndarray | None) -> CompressResult:
         """The whole job; `scores` come from a file, or are computed."""
@@ -210,7 +213,7 @@ class _Job:
             decide.close()
         if options.layers > 1:
             with self.clock.stage("layers"):
-                grid = layered(grid, renderer, self.views.of(self.views.train), options, self.progress)
+                grid = layered(grid, renderer, self.source, self.views.of(self.views.train), options, self.progress)
         settings = make_settings(options, plan, self.scene, self.views, search, None)
         device = coding_device(self.workspace.backend, self.budget, grid)
         if output is None:
@@ -263,8 +266,8 @@ class _Job:
 
     def _measure_source(self, source: SceneSource, report: Judge) -> Quality:
         assert self.workspace is not None
-        with self.clock.stage("measure"), self.workspace.renderer.load(source) as scene:
-            return self._compare(scene, report)
+        renderer = self.workspace.renderer
+        return self._compare(lambda: renderer.load(source), report)
 
     def _judges(self) -> tuple[Judge | None, Judge | None]:
         """The judge that decides and the one that reports; one and the same unless the training poses decide."""
@@ -345,13 +348,20 @@ class _Job:
     def _measure(self, quantized: QuantizedScene, report: Judge | None) -> Quality | None:
         if self.workspace is None or report is None:
             return None
-        with self.clock.stage("measure"), self.workspace.renderer.load_quantized(quantized) as scene:
-            return self._compare(scene, report)
+        renderer = self.workspace.renderer
+        return self._compare(lambda: renderer.load_quantized(quantized), report)
 
-    def _compare(self, scene: DeviceScene, report: Judge) -> Quality:
-        quality = report.compare(scene, with_ssim=True, progress=self.progress)
-        if self.reporter is not None:
-            self.reporter.look(report, scene, quality, self.clock, self.progress)
+    def _compare(self, load: Callable[[], DeviceScene], report: Judge) -> Quality:
+        """Quality of what `load` brings to the device, over the views that report and (fidelity only) some training poses."""
+        assert self.workspace is not None and self.views is not None
+        with self.clock.stage("measure"):
+            with load() as scene:
+                quality = report.compare(scene, with_ssim=True, progress=self.progress)
+                if self.reporter is not None:
+                    self.reporter.look(report, scene, quality, self.clock, self.progress)
+            if self.views.train and self.plan.report == self.views.held_out:
+                train, renderer = self.views.of(self.views.train), self.workspace.renderer
+                self.trained = training_fidelity(renderer, self.source, load, train, self.progress)
         return quality
 
     def _result(
@@ -365,6 +375,11 @@ class _Job:
     ) -> CompressResult:
         options, plan = self.options, self.plan
         fixed = options.fixed is not None
+        scored = search.scored if search else None
+        held_out = quality.fidelity if quality is not None and self.trained is not None else None
+        warnings = doubts(self.views, scored, self.scene.input_count, self.trained, held_out) if self.views else ()
+        for warning in warnings:
+            LOG.warning("warning: %s", warning)
         return CompressResult(
             scene=scene_info(self.scene),
             views=views_info(self.views) if self.views else None,
@@ -394,6 +409,9 @@ class _Job:
             run=run_info(self.budget, self.clock, self.workspace.backend if self.workspace else None),
             format=self.format.suffix[1:] if self.format else "fgs",
             file_sh_degree=scene.sh_degree,
+            scored=scored,
+            training_fidelity=self.trained,
+            warnings=warnings,
         )
 
 
