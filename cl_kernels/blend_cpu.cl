@@ -41,13 +41,13 @@ inline int any_alive(FW t) {
 #if defined(cl_khr_int64_base_atomics) && defined(__ENDIAN_LITTLE__)
 #pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
 // The same words in one step: sums below zero take two with 32 bits.
-inline void add_sum(__global uint *words, float value, float scale) {
-  atom_add((volatile __global long *)words, (long)clamp(value * scale, -FIXED_LARGEST, FIXED_LARGEST));
+inline void add_sum(__global uint *words, float value, float scale, float largest) {
+  atom_add((volatile __global long *)words, (long)clamp(value * scale, -largest, largest));
 }
 #else
 #define add_sum add_fixed
 #endif
-#define ADD_SUM(k, v, scale) add_sum(sums + (size_t)pair.x * (2 * SUMS) + 2 * (k), tree_sum(v), scale)
+#define ADD_SUM(k, v, scale) add_sum(sums + (size_t)pair.x * (2 * SUMS) + 2 * (k), tree_sum(v), scale, largest)
 
 // The fixed pairwise tree over the 16 lanes of a block: l + (l + 8), then + 4, + 2, + 1.
 #if W == 16
@@ -141,6 +141,9 @@ __kernel void blend(
     }
   }
 
+#if STATS
+  const float largest = tile_largest((uint)get_global_size(0));
+#endif
 #if STATS > 1
   FW target_r[BLOCKS * BLOCK_VECTORS], target_g[BLOCKS * BLOCK_VECTORS], target_b[BLOCKS * BLOCK_VECTORS];
   load_blocks(target, tiles_x, height, tile_px, tile_py, target_r, target_g, target_b);

@@ -166,7 +166,8 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
           __local float *s = parts[c];
           for (int l = 0; l < 8; ++l) s[l] += s[l + 8];
           for (int l = 0; l < 4; ++l) s[l] += s[l + 4];
-          add_fixed(sums + ((size_t)row * SUMS + c) * 2, (s[0] + s[2]) + (s[1] + s[3]), SUM_UNIT);
+          add_fixed(sums + ((size_t)row * SUMS + c) * 2, (s[0] + s[2]) + (s[1] + s[3]), SUM_UNIT,
+                    tile_largest((uint)get_num_groups(0)));
         }
       }
       barrier(CLK_LOCAL_MEM_FENCE);

@@ -23,14 +23,24 @@ inline FW sum_value(__global const long *sums, uint planes, uint plane, size_t r
   return LOADF(lanes, 0) * (FW)unit;
 }
 
-// acc[i] += value in fixed point: sums over views in any order give the same bits.
+// acc[i] += value in fixed point: sums over views in any order give the same bits, unless they leave 64 bits: there they stay.
 inline void add_long(__global long *acc, size_t i, FW value) {
   value = fmin(fmax(value * (FW)FIXED_WEIGHT, (FW)-FIXED_LARGEST), (FW)FIXED_LARGEST);
 #if W == 1
-  acc[i] += convert_long_rtz(value);
+  acc[i] = add_sat(acc[i], convert_long_rtz(value));
 #else
-  CAT(vstore, W)(CAT(vload, W)(0, acc + i) + CAT(CAT(convert_long, W), _rtz)(value), 0, acc + i);
+  CAT(vstore, W)(add_sat(CAT(vload, W)(0, acc + i), CAT(CAT(convert_long, W), _rtz)(value)), 0, acc + i);
 #endif
+}
+
+// `view_direction` of rows that this view sees. A row at the camera's own position has none: NaN, which times its weight of 0
+// would still be NaN.
+inline void seen_direction(IW some, __global const float *camera, __global const float *means, size_t s, size_t i, FW *x, FW *y,
+                           FW *z) {
+  view_direction(camera, LOADF(means, i), LOADF(means, s + i), LOADF(means, 2 * s + i), x, y, z);
+  *x = pick(some, *x, (FW)0.0f);
+  *y = pick(some, *y, (FW)0.0f);
+  *z = pick(some, *z, (FW)0.0f);
 }
 
 // For every lower degree L: with d the colour that the bands above L add in this view and w2 the sum of squared weights,
@@ -51,9 +61,10 @@ __kernel void sh_costs(
   const size_t i = get_global_id(0) * W, s = stride;
   if (i >= count) return;
   const FW w2 = sum_value(sums, planes, plane, base + i, (int)min(count - (uint)i, (uint)W), 1.0f / FIXED_ERROR);
-  if (!ANY(MASK(w2 > (FW)0.0f))) return;
+  const IW some = MASK(w2 > (FW)0.0f);
+  if (!ANY(some)) return;
   FW x, y, z;
-  view_direction(camera, LOADF(means, i), LOADF(means, s + i), LOADF(means, 2 * s + i), &x, &y, &z);
+  seen_direction(some, camera, means, s, i, &x, &y, &z);
   FW basis[24];
 #define KEEP_BASIS(k, value) basis[k] = value
   FOR_EACH_BASIS(degree, x, y, z, KEEP_BASIS)
@@ -89,9 +100,10 @@ __kernel void sh_residual(
   FW seen[4];
   for (int c = 0; c < 4; ++c)
     seen[(c + 3) & 3] = sum_value(sums, planes, (uint)c, base + i, (int)min(count - (uint)i, (uint)W), 1.0f / FIXED_WEIGHT);
-  if (!ANY(MASK(seen[3] > (FW)0.0f))) return;
+  const IW some = MASK(seen[3] > (FW)0.0f);
+  if (!ANY(some)) return;
   FW x, y, z;
-  view_direction(camera, LOADF(means, i), LOADF(means, s + i), LOADF(means, 2 * s + i), &x, &y, &z);
+  seen_direction(some, camera, means, s, i, &x, &y, &z);
 #define ADD_NORMAL(k, value)                                                                    \
   {                                                                                             \
     const FW basis = value;                                                                     \

@@ -131,7 +131,7 @@ FIXED_ERROR: Final = 2.0**40
 """Units of the 64-bit fixed-point sums over tiles and views, of weights and of squared errors: any order of adding gives the
 same bits. A pixel's weight is at most 1; errors get finer units since those of small splats decide what goes first."""
 FIXED_LARGEST: Final = 2.0**62
-"""Values are clamped to this before they become integers."""
+"""Values are clamped to this before they become integers: what a view adds, or all tiles of a view together."""
 
 # --- similarity of images (Wang et al. 2004) ----------------------------------------------------
 SSIM_SIGMA: Final = 1.5

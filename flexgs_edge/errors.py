@@ -14,6 +14,23 @@ A message says where (file, field, row or byte), what was expected, what was fou
 from __future__ import annotations
 
 
+def brief(value: object, most: int = 80) -> str:
+    """The beginning of a value, for messages.
+
+    Numbers may have more digits than Python writes, and lists may be nested deeper than it can follow.
+
+    >>> brief([1, 2]), brief("a" * 9, 8)
+    ('[1, 2]', "'aaaa...")
+    """
+    try:
+        text = repr(value)
+    except ValueError:
+        return "an integer of very many digits"
+    except RecursionError:
+        return "lists in lists of very many levels"
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
 class FlexGSError(Exception):
     """Base of all errors that a user can mend."""
 

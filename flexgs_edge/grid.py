@@ -58,7 +58,8 @@ class Steps:
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             numbers = value if name == "sh" else (value,)
-            rounded = tuple(float(np.float32(number)) for number in numbers)
+            with np.errstate(over="ignore"):  # a file may say 1e300
+                rounded = tuple(float(np.float32(number)) for number in numbers)
             # Beyond this, codes of 24 bits times a step times the chroma factor leave float32's normal numbers.
             most = 16 if name == "chroma" else 80
             if not all(2.0**-most <= number <= 2.0**most for number in rounded):

@@ -238,7 +238,8 @@ def render(
     xs, ys = np.arange(width)[None, :], np.arange(height)[:, None]
     image, trans = np.zeros((height, width, 3)), np.ones((height, width))
     bound, trans_error = np.zeros((height, width)), np.zeros((height, width))
-    alive, fragile = np.ones((height, width), bool), np.zeros((height, width), bool)
+    everywhere, alive = np.ones((2, height, width), bool)
+    fragile = np.zeros((height, width), bool)
     hits, unsure = np.zeros((2, count), np.int64)
     weights, weight_bound, weights2, removal = np.zeros((4, count))
     blended: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
@@ -246,6 +247,8 @@ def render(
     for k in np.argsort(splats.depth, kind="stable"):
         if not splats.shown[k]:
             continue
+        if not (alive | fragile).any():
+            break
         dx, dy = xs - splats.mean[k, 0], ys - splats.mean[k, 1]
         (ca, cb, cc), (ea, eb, ec) = splats.conic[k], splats.conic_error[k]
         q = np.maximum(ca * dx * dx + 2 * cb * dx * dy + cc * dy * dy, 0)
@@ -258,14 +261,16 @@ def render(
         alpha = np.minimum(ALPHA_MAX, full)
         alpha_error = np.where(full * (1 - exponent_error) > ALPHA_MAX, EPS, full * exponent_error)
 
-        candidate = alive if extent == "exact" else alive & _inria_mask(splats, k, width, height)
+        reached = everywhere if extent == "exact" else _inria_mask(splats, k, width, height)
+        candidate = alive & reached
         seen = candidate & (alpha >= ALPHA_MIN)
         after = trans * (1 - alpha)
         after_error = trans_error * (1 - alpha) + trans * alpha_error + 2 * EPS * after
         near_stop = seen & (abs(after - stop) <= after_error)
         fragile |= candidate & (abs(alpha - ALPHA_MIN) <= alpha_error) | near_stop
         hit = seen & (after >= stop)
-        possible = fragile & candidate & (alpha + alpha_error >= ALPHA_MIN)
+        # A pixel whose end is on the edge may go on in float32 where it stops here.
+        possible = fragile & reached & (alpha + alpha_error >= ALPHA_MIN)
         weight = np.where(hit, alpha * trans, 0.0)
         weight_error = np.where(hit, alpha * trans_error + trans * alpha_error + EPS * weight, 0.0)
         if hit.any():

@@ -56,6 +56,17 @@ def test_a_row_with_two_faults_counts_once() -> None:
         check_scene(MemorySource(data))
 
 
+@pytest.mark.parametrize("field", ["sh_dc", "sh_rest"])
+def test_coefficients_whose_squares_leave_float32(field: str) -> None:
+    data = arrays()
+    data[field][-1, [2, 7]] = (1.1e15, -3e38)
+    data[field][0, 3] = -9.9e14
+    words = rf"2 of 11 Gaussians .* beyond \+-1e\+15 in {field} in 2 \(first row 2\)"
+    with pytest.raises(InputError, match=words):
+        check_scene(MemorySource(data))
+    assert check_scene(MemorySource(data), drop_invalid=True).count == 9
+
+
 @pytest.mark.parametrize("value", [0.0, -0.0, 1e-25, 1e-42, 3e19])
 def test_quaternions_that_cannot_be_normalised(value: float) -> None:
     data = arrays()

@@ -4,12 +4,13 @@ from flexgs_edge.adapt.search import (
     CANDIDATES,
     REFINE_STEPS,
     Evaluator,
+    Scored,
     SearchResult,
     Step,
     adapt,
     measure_fixed,
 )
-from flexgs_edge.adapt.targets import Judge, MaxDrop, MaxSize, Measurement, MinFidelity, Target, min_ratio
+from flexgs_edge.adapt.targets import Judge, MaxDrop, MaxSize, Measurement, MinFidelity, Target, WorstToo, min_ratio
 
 __all__ = [
     "CANDIDATES",
@@ -20,9 +21,11 @@ __all__ = [
     "MaxSize",
     "Measurement",
     "MinFidelity",
+    "Scored",
     "SearchResult",
     "Step",
     "Target",
+    "WorstToo",
     "adapt",
     "measure_fixed",
     "min_ratio",

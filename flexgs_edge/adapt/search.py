@@ -94,6 +94,25 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Scored:
+    """What a search by measured costs looked at.
+
+    Parameters
+    ----------
+    poses : int
+        Scored poses.
+    made : int
+        How many of them nobody took (`--views-margin`).
+    unseen : int
+        Gaussians that can show at all, but in none of them.
+    """
+
+    poses: int
+    made: int
+    unseen: int
+
+
+@dataclass(frozen=True)
 class SearchResult:
     """The answer of a search and the way to it.
 
@@ -105,11 +124,14 @@ class SearchResult:
         The target holds at `chosen` (always, unless the best effort was asked for).
     steps : tuple of Step
         Every step, in order.
+    scored : Scored or None
+        What it was told by; `None` for searches that are given scores.
     """
 
     chosen: Step
     reached: bool
     steps: tuple[Step, ...]
+    scored: Scored | None = None
 
 
 def adapt(

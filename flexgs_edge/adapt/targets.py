@@ -32,11 +32,14 @@ class Measurement:
         PSNR against the original's renders; `None` when identical.
     modelled_drop : float
         Drop modelled from the error against the original's renders.
+    worst : Measurement or None
+        The same of the worst view alone.
     """
 
     drop: float | None
     fidelity: float | None
     modelled_drop: float
+    worst: Measurement | None = None
 
     def figure(self, judge: Judge) -> float | None:
         """The figure that `judge` names, dB (`None`: identical, or no photos)."""
@@ -85,10 +88,8 @@ class MaxDrop:
             raise InputError(f"--max-drop {self.limit:g}: expected a drop above 0 dB (1.0 is the usual choice)")
 
     def excess(self, size: int, measurement: Measurement | None) -> float:
-        # Log scale: the error grows about exponentially with the rates, so interpolation is near linear in it. The floor
-        # keeps drops at or below zero (compressed beats original) in the domain, far on the side that holds.
         assert measurement is not None
-        return math.log(max(measurement.loss(self.judge) / self.limit, 0.02))
+        return _log_loss(measurement.loss(self.judge), self.limit)
 
     def describe(self) -> str:
         return f"{self.judge} <= {self.limit:g} dB"
@@ -96,6 +97,14 @@ class MaxDrop:
     def report(self, size: int, measurement: Measurement | None) -> str:
         assert measurement is not None
         return f"{self.judge} {measurement.loss(self.judge):.3f} dB at {format_size(size)}"
+
+
+def _log_loss(loss: float, limit: float) -> float:
+    """Log scale: the error grows about exponentially with the rates, so interpolation is near linear in it.
+
+    The floor keeps drops at or below zero (compressed beats original) in the domain, far on the side that holds.
+    """
+    return math.log(max(loss / limit, 0.02))
 
 
 @dataclass(frozen=True)
@@ -123,6 +132,47 @@ class MinFidelity:
         assert measurement is not None
         fidelity = "identical" if measurement.fidelity is None else f"{measurement.fidelity:.3f} dB"
         return f"fidelity {fidelity} at {format_size(size)}"
+
+
+@dataclass(frozen=True)
+class WorstToo:
+    """Hold `target`, and lose at most `limit_worst` dB in the worst view as well."""
+
+    target: MaxDrop | MinFidelity
+    limit_worst: float
+    drop: Judge
+    """What the worst view loses is told by this figure: `drop` or `modelled drop`."""
+    limit_bytes: int | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.limit_worst) and self.limit_worst > 0.0):
+            raise InputError(
+                f"--max-worst-drop {self.limit_worst:g}: expected a drop above 0 dB (1.5 times --max-drop is a usual choice)"
+            )
+
+    @property
+    def judge(self) -> Judge:
+        """The figure of the mean."""
+        return self.target.judge
+
+    @property
+    def limit(self) -> float:
+        """Of the mean."""
+        return self.target.limit
+
+    def _loss(self, measurement: Measurement | None) -> float:
+        assert measurement is not None and measurement.worst is not None
+        return measurement.worst.loss(self.drop)
+
+    def excess(self, size: int, measurement: Measurement | None) -> float:
+        return max(self.target.excess(size, measurement), _log_loss(self._loss(measurement), self.limit_worst))
+
+    def describe(self) -> str:
+        return f"{self.target.describe()}, {self.drop} <= {self.limit_worst:g} dB in every view"
+
+    def report(self, size: int, measurement: Measurement | None) -> str:
+        worst = self._loss(measurement)
+        return f"{self.target.report(size, measurement)}, {self.drop} {worst:.3f} dB in the worst view"
 
 
 @dataclass(frozen=True)

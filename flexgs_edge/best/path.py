@@ -71,7 +71,7 @@ def lowest(values: np.ndarray, count: int) -> np.ndarray:
 
 
 class PrunePath:
-    """Walks down from the whole scene; `snapshots[-1]` is the smallest set so far.
+    """Walks down from the whole scene; `snapshots[-1]` is the smallest set so far, and `unseen` rows were in no scored pose.
 
     Parameters
     ----------
@@ -117,6 +117,9 @@ class PrunePath:
         self.snapshots: list[Snapshot] = []
         if not self._resumed():
             self._begin(planes, unseen)
+        first = self.snapshots[0]
+        # What is gone from the first snapshot was seen by no pose.
+        self.unseen = len(rows) - int(np.count_nonzero(first.costs.weight2 > 0))
 
     def _begin(self, planes: dict[str, np.ndarray], unseen: float) -> None:
         """Measure costs on the whole scene."""

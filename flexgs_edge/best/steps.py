@@ -17,6 +17,7 @@ from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.grid import CODE_LIMIT, POSITION_BITS, Steps
 from flexgs_edge.render import Renderer
+from flexgs_edge.render.targets import to_half
 from flexgs_edge.rotations import tilted, turned
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.scratch import blocks
@@ -56,7 +57,7 @@ def probe_slopes(
     count = planes["means"].shape[1]
     views = [cameras[i * len(cameras) // min(PROBE_VIEWS, len(cameras))] for i in range(min(PROBE_VIEWS, len(cameras)))]
     with renderer.load(MemorySource(planes, origin=origin)) as scene:
-        reference = [renderer.render(scene, camera).astype(np.float16) for camera in views]
+        reference = [to_half(renderer.render(scene, camera)) for camera in views]
     smallest = np.concatenate([planes["log_scales"][:, rows].min(axis=0) for rows in blocks(count)])
     size = float(np.exp(np.median(smallest.astype(np.float64))))
     # Small enough that squared errors grow with squared steps, large enough to stand clear of half precision references.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 from collections.abc import Callable, Iterator, Sequence
@@ -175,7 +176,7 @@ def _camera(path: Path, lens_file: Path, image: _Image, lenses: dict[int, _Lens]
 
 
 def _rotation(place: str, quaternion: Sequence[float]) -> np.ndarray:
-    norm = float(np.linalg.norm(quaternion))
+    norm = math.hypot(*quaternion)
     if not abs(norm - 1) <= QUATERNION_TOLERANCE:
         raise FormatError(f"{place}: rotation: expected a unit quaternion, found one of norm {norm:.4g}")
     w, x, y, z = (value / norm for value in quaternion)

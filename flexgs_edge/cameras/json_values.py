@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.errors import FormatError, InputError
+from flexgs_edge.errors import FormatError, InputError, brief
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of |R R^T - 1|: files keep 6 digits and more, a scaled or sheared matrix is off by far more."""
@@ -76,7 +76,7 @@ class Entry:
         """A string that is not blank."""
         name = self.get(key)
         if not isinstance(name, str) or not name.strip():
-            raise self.fail(key, "a name", repr(name)[:80])
+            raise self.fail(key, "a name", brief(name))
         return name
 
     def number(self, key: str, expected: str) -> float:
@@ -116,11 +116,11 @@ class Entry:
         """Nested lists of finite numbers as an array ([*shape] f64)."""
         expected = " x ".join(map(str, shape)) + " finite numbers"
         value = self.get(key)
-        if _shape(value) != shape:
-            raise self.fail(key, expected, repr(value)[:80])
+        if _shape(value, len(shape)) != shape:
+            raise self.fail(key, expected, brief(value))
         leaves = np.array(value, dtype=object)
         if not all(isinstance(leaf, (int, float)) and not isinstance(leaf, bool) for leaf in leaves.flat):
-            raise self.fail(key, expected, repr(value)[:80])
+            raise self.fail(key, expected, brief(value))
         try:
             array = leaves.astype(np.float64)
         except OverflowError:
@@ -131,7 +131,8 @@ class Entry:
 
     def check_rotation(self, key: str, rotation: np.ndarray) -> None:
         """Raise unless `rotation` ([3, 3]) is orthonormal (to the digits that files keep) and no reflection."""
-        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        with np.errstate(over="ignore", invalid="ignore"):  # entries of 1e200: far off, whatever comes out
+            error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if not error <= ROTATION_TOLERANCE:
             raise self.fail(key, f"an orthonormal matrix (within {ROTATION_TOLERANCE})", f"one off by {error:.3g}")
         if np.linalg.det(rotation) < 0:
@@ -148,10 +149,12 @@ def check_names(path: Path, names: list[str], entries: str, key: str) -> None:
             )
 
 
-def _shape(value: Any) -> tuple[int, ...] | None:
-    """Shape of nested lists, None if they are ragged (which NumPy would raise on)."""
+def _shape(value: Any, depth: int) -> tuple[int, ...] | None:
+    """Shape of lists nested `depth` levels deep, None if they are ragged (which NumPy would raise on) or deeper."""
     if not isinstance(value, list):
         return ()
-    shapes = {_shape(item) for item in value}
+    if not depth:
+        return None
+    shapes = {_shape(item, depth - 1) for item in value}
     inner = shapes.pop() if len(shapes) == 1 else None
     return None if inner is None else (len(value), *inner)

@@ -37,6 +37,13 @@ from flexgs_edge.cli import words
 )
 @words.option(
     "Target (one of them; default --max-drop 1.0)",
+    "--max-worst-drop",
+    metavar="DB",
+    type=float,
+    help="With --max-drop or --min-fidelity: no deciding view may lose more than this either.",
+)
+@words.option(
+    "Target (one of them; default --max-drop 1.0)",
     "--max-size",
     type=words.SIZE,
     help="Best quality in a file of at most so many bytes, such as 8MB (10^6) or 8MiB (2^20).",
@@ -73,6 +80,13 @@ from flexgs_edge.cli import words
     default="keep",
     show_default=True,
     help="Gaussians that no training pose sees (best only): kept without SH, dropped, or the largest N % of them kept.",
+)
+@words.option(
+    "Views",
+    "--views-margin",
+    is_flag=True,
+    help="Score a third of the poses elsewhere (best only): nearer to what is seen, farther from it and in between, so that what "
+    "only such views show stays.",
 )
 @words.option(
     "Method", "--refit/--no-refit", default=True, help="Refit colours to what was pruned and quantized (best only)."

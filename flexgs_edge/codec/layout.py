@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 from flexgs_edge.bitpack import plane_bytes
 from flexgs_edge.bitspec import BitSpec
 from flexgs_edge.constants import MAX_SH_DEGREE
-from flexgs_edge.errors import FormatError, InputError
+from flexgs_edge.errors import FormatError, InputError, brief
 from flexgs_edge.quantize import QuantizedScene, group_count
 from flexgs_edge.scene.fields import FIELD, FIELDS
 
@@ -265,8 +265,7 @@ def _origin(value: object) -> tuple[float, float, float]:
 
 
 def _short(value: object) -> str:
-    text = repr(value) if not isinstance(value, int) or abs(value) < 10**40 else "an integer of more than 40 digits"
-    return text if len(text) <= 80 else text[:77] + "..."
+    return "an integer of more than 40 digits" if isinstance(value, int) and abs(value) >= 10**40 else brief(value)
 
 
 def format_error(path: object, offset: int, message: str) -> FormatError:

@@ -6,21 +6,21 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flexgs_edge.adapt import Measurement, SearchResult, Step, Target
+from flexgs_edge.adapt import Measurement, Scored, SearchResult, Step, Target
 from flexgs_edge.best.checkpoint import Checkpoint
 from flexgs_edge.best.choice import BitModel
-from flexgs_edge.best.effort import EFFORTS, sampled_poses
+from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.layers import assign_layers
 from flexgs_edge.best.path import PARTS, PrunePath, sums_room
 from flexgs_edge.best.search import Measure, MultiplierSearch, Product, RateResult, RateSearch, RateStep
 from flexgs_edge.budget import MemoryBudget, format_size
 from flexgs_edge.cameras import Camera
-from flexgs_edge.cameras.order import farthest_order
 from flexgs_edge.codec.coder import Encoded, encode_grid
 from flexgs_edge.codec.container2 import coded_parts, write_grid
 from flexgs_edge.constants import ALPHA_MIN
@@ -29,6 +29,7 @@ from flexgs_edge.pipeline.foreign import FileMaker, WrittenFile, search_pruned_f
 from flexgs_edge.pipeline.foreign_best import FileSearch
 from flexgs_edge.pipeline.judge import Judge, measurement_of
 from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.pipeline.poses import ScoredPoses
 from flexgs_edge.pipeline.workspace import Stopwatch, coding_device
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice
@@ -125,20 +126,11 @@ def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[Writt
     return lambda path, measure, report: FileSearch(path, files, measure, plan, options.refit, report)
 
 
-def scored_poses(cameras: Sequence[Camera], count: int, options: CompressOptions) -> list[Camera]:
-    """As many poses as the effort scores, farthest first, with no more of their pixels than `count` Gaussians need.
-
-    Names often go round a scene in rings: 8 of the sample's 70 poses evenly spread by name lost 7.8 dB where these lose 1.0 at
-    the same bytes (docs/performance.md).
-    """
-    return sampled_poses([cameras[i] for i in farthest_order(cameras)[: EFFORTS[options.effort].views]], count)
-
-
 def search_best(
     make: SearchMaker[Product],
     renderer: Renderer,
     source: SceneSource,
-    cameras: list[Camera],
+    poses: ScoredPoses,
     judge: Judge,
     target: Target,
     options: CompressOptions,
@@ -156,8 +148,8 @@ def search_best(
         `grid_search` or `file_search`.
     source : SceneSource
         A checked scene; held in `renderer.room` as a whole.
-    cameras : list of Camera
-        Training poses; at most as many as the effort scores are used, farthest first.
+    poses : ScoredPoses
+        From `scored_poses`.
     judge : Judge
         Prepared on the views that decide.
 
@@ -168,16 +160,17 @@ def search_best(
     BudgetError
         When the scene does not fit.
     """
-    path_of = open_path(renderer, source, cameras, options, budget, clock, progress, checkpoint=checkpoint)
+    path_of = open_path(renderer, source, poses.cameras, options, budget, clock, progress, checkpoint=checkpoint)
     with path_of as path, clock.stage("search"):
-        return search_path(make, path, renderer, source, judge, target, options, on_step)
+        product, search = search_path(make, path, renderer, source, judge, target, options, on_step)
+        return product, replace(search, scored=Scored(len(poses.cameras), poses.made, path.unseen))
 
 
 @contextmanager
 def open_path(
     renderer: Renderer,
     source: SceneSource,
-    cameras: Sequence[Camera],
+    scored: Sequence[Camera],
     options: CompressOptions,
     budget: MemoryBudget,
     clock: Stopwatch,
@@ -189,13 +182,14 @@ def open_path(
 
     Parameters
     ----------
+    scored : sequence of Camera
+        From `scored_poses`.
     make : callable, optional
         Builds the path from the arguments of `PrunePath`.
     checkpoint : Checkpoint, optional
         Where the path keeps its rounds.
     """
-    scored, room = scored_poses(cameras, source.count, options), renderer.room
-    largest = largest_of(scored)
+    room, largest = renderer.room, largest_of(scored)
     if room.spills:
         size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest)
     else:
@@ -258,7 +252,7 @@ def search_files(
     order: np.ndarray | None,
     renderer: Renderer | None,
     source: SceneSource,
-    cameras: list[Camera],
+    poses: ScoredPoses | None,
     judge: Judge | None,
     target: Target | None,
     options: CompressOptions,
@@ -271,24 +265,27 @@ def search_files(
     if order is not None:
         with clock.stage("search"):
             return search_pruned_files(files, source, order, target, options, on_step)
-    assert renderer is not None and judge is not None and target is not None
+    assert renderer is not None and judge is not None and target is not None and poses is not None
     make = file_search(options, files)
     return search_best(
-        make, renderer, source, cameras, judge, target, options, budget, clock, on_step=on_step, progress=progress
+        make, renderer, source, poses, judge, target, options, budget, clock, on_step=on_step, progress=progress
     )
 
 
 def layered(
-    grid: GridScene, renderer: Renderer, cameras: list[Camera], options: CompressOptions, progress: Progress = SILENT
+    grid: GridScene,
+    renderer: Renderer,
+    poses: ScoredPoses,
+    options: CompressOptions,
+    progress: Progress = SILENT,
 ) -> GridScene:
     """The grid in as many layers as asked for."""
-    poses = scored_poses(cameras, grid.count, options)
     return assign_layers(
         grid,
         options.layers,
         GridCoder(renderer).size_and_bits(grid)[1],
         renderer,
-        poses,
+        poses.cameras,
         progress,
     )
 
@@ -296,7 +293,7 @@ def layered(
 def choose_room(
     renderer: Renderer,
     source: SceneSource,
-    cameras: Sequence[Camera],
+    scored: Sequence[Camera],
     options: CompressOptions,
     budget: MemoryBudget,
     folder: Path,
@@ -313,7 +310,6 @@ def choose_room(
     BudgetError
         When not even the views fit, or the disk is too small.
     """
-    scored = scored_poses(cameras, source.count, options)
     largest = largest_of(scored)
     rows, keep = source.count, EFFORTS[options.effort].keep
     whole = rows * row_bytes(source.sh_degree, keep)
@@ -337,12 +333,11 @@ def choose_room(
 
 
 def open_checkpoint(
-    renderer: Renderer, source: SceneSource, cameras: Sequence[Camera], options: CompressOptions, folder: Path
+    renderer: Renderer, source: SceneSource, scored: Sequence[Camera], options: CompressOptions, folder: Path
 ) -> Checkpoint:
     """Where the path of a search keeps its rounds: a folder named by all that they depend on."""
     words = f"path {EFFORTS[options.effort].keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r}"
     assert options.near is not None and options.extent is not None
-    scored = scored_poses(cameras, source.count, options)
     key = fingerprint(source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
     checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")
     if checkpoint.rounds:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import tempfile
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from flexgs_edge.pipeline.best import (
     search_files,
 )
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
+from flexgs_edge.pipeline.doubts import doubts, training_fidelity
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
 from flexgs_edge.pipeline.inputs import Scene, Views, companions_of, find_views, load_scene, resolve_drawing
@@ -37,6 +39,7 @@ from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.outputs import check_outputs, temporary_name
 from flexgs_edge.pipeline.plan import Plan, make_settings
+from flexgs_edge.pipeline.poses import scored_poses
 from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.pipeline.report import Reporter
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, run_info
@@ -141,6 +144,7 @@ class _Job:
         self.sensitivity: list[Sensitivity] = []
         self.scores_reused = False
         self.room: Room = MEMORY
+        self.trained: float | None = None
 
     def run(self, output: Path | None, scores: np.ndarray | None) -> CompressResult:
         """The whole job; `scores` come from a file, or are computed."""
@@ -208,20 +212,22 @@ class _Job:
                     f"{self.format.suffix} is in memory and in one go; leave it out"
                 )
             return self._run_files(self.format, output, None, decide, report)
-        train = self.views.of(self.views.train)
+        poses = scored_poses(self.views.of(self.views.train), options, renderer, self.source)
         folder = Path(options.scratch or (tempfile.gettempdir() if output is None else output.parent))
-        self.room = renderer.room = room = choose_room(renderer, self.source, train, options, self.budget, folder)
+        self.room = renderer.room = room = choose_room(
+            renderer, self.source, poses.cameras, options, self.budget, folder
+        )
         kept = None
         if options.resume:
             with self.clock.stage("fingerprint"):
-                kept = open_checkpoint(renderer, self.source, train, options, folder)
+                kept = open_checkpoint(renderer, self.source, poses.cameras, options, folder)
         LOG.info("searching for %s", plan.target.describe())
         coder = GridCoder(renderer)
         grid, search = search_best(
             grid_search(options, coder),
             renderer,
             self.source,
-            train,
+            poses,
             decide,
             plan.target,
             options,
@@ -235,7 +241,7 @@ class _Job:
             decide.close()
         if options.layers > 1:
             with self.clock.stage("layers"):
-                grid = layered(grid, renderer, train, options, self.progress)
+                grid = layered(grid, renderer, poses, options, self.progress)
         settings = make_settings(options, plan, self.scene, self.views, search, None)
         if output is None:
             if self.reporter is not None:
@@ -272,12 +278,14 @@ class _Job:
         renderer = self.workspace.renderer if self.workspace else None
         if options.antialiased:
             LOG.warning("%s does not say that the model is antialiased: viewers must be told", format.suffix)
+        poses = None
+        if order is None and renderer is not None and self.views is not None:
+            poses = scored_poses(self.views.of(self.views.train), options, renderer, self.source)
         with open_files(format, output, options.force, self.budget, renderer, decide) as files:
             if plan.target is not None:
                 LOG.info("searching for %s", plan.target.describe())
             file, search = search_files(
-                files, order, renderer, self.source, self.views.of(self.views.train) if self.views else [], decide,
-                plan.target, options, self.budget, self.clock,
+                files, order, renderer, self.source, poses, decide, plan.target, options, self.budget, self.clock,
                 on_step=lambda step: LOG.info("%s", _step_words(step, plan.target)), progress=self.progress,
             )  # fmt: skip
             if decide is not None and decide is not report:
@@ -290,8 +298,8 @@ class _Job:
 
     def _measure_source(self, source: SceneSource, report: Judge) -> Quality:
         assert self.workspace is not None
-        with self.clock.stage("measure"), self.workspace.renderer.load(source) as scene:
-            return self._compare(scene, report)
+        renderer = self.workspace.renderer
+        return self._compare(lambda: renderer.load(source), report)
 
     def _judges(self) -> tuple[Judge | None, Judge | None]:
         """The judge that decides and the one that reports; one and the same unless the training poses decide."""
@@ -372,13 +380,20 @@ class _Job:
     def _measure(self, quantized: QuantizedScene, report: Judge | None) -> Quality | None:
         if self.workspace is None or report is None:
             return None
-        with self.clock.stage("measure"), self.workspace.renderer.load_quantized(quantized) as scene:
-            return self._compare(scene, report)
+        renderer = self.workspace.renderer
+        return self._compare(lambda: renderer.load_quantized(quantized), report)
 
-    def _compare(self, scene: DeviceScene, report: Judge) -> Quality:
-        quality = report.compare(scene, with_ssim=True, progress=self.progress)
-        if self.reporter is not None:
-            self.reporter.look(report, scene, quality, self.clock, self.progress)
+    def _compare(self, load: Callable[[], DeviceScene], report: Judge) -> Quality:
+        """Quality of what `load` brings to the device, over the views that report and (fidelity only) some training poses."""
+        assert self.workspace is not None and self.views is not None
+        with self.clock.stage("measure"):
+            with load() as scene:
+                quality = report.compare(scene, with_ssim=True, progress=self.progress)
+                if self.reporter is not None:
+                    self.reporter.look(report, scene, quality, self.clock, self.progress)
+            if self.views.train and self.plan.report == self.views.held_out:
+                train, renderer = self.views.of(self.views.train), self.workspace.renderer
+                self.trained = training_fidelity(renderer, self.source, load, train, self.progress)
         return quality
 
     def _result(
@@ -392,6 +407,11 @@ class _Job:
     ) -> CompressResult:
         options, plan = self.options, self.plan
         fixed = options.fixed is not None
+        scored = search.scored if search else None
+        held_out = quality.fidelity if quality is not None and self.trained is not None else None
+        warnings = doubts(self.views, scored, self.scene.input_count, self.trained, held_out) if self.views else ()
+        for warning in warnings:
+            LOG.warning("warning: %s", warning)
         return CompressResult(
             scene=scene_info(self.scene),
             views=views_info(self.views) if self.views else None,
@@ -421,6 +441,9 @@ class _Job:
             run=run_info(self.budget, self.clock, self.workspace.backend if self.workspace else None, self.room),
             format=self.format.suffix[1:] if self.format else "fgs",
             file_sh_degree=scene.sh_degree,
+            scored=scored,
+            training_fidelity=self.trained,
+            warnings=warnings,
         )
 
 

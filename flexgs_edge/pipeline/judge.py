@@ -174,8 +174,15 @@ class Judge:
 
 
 def measurement_of(quality: Quality) -> Measurement:
-    """The means that a search decides by."""
-    return Measurement(quality.drop, quality.fidelity, quality.modelled_drop)
+    """The means that a search decides by, and the worst view's own figures."""
+    worst = quality.worst
+    alone = None if worst is None else Quality((worst,), quality.base_psnr)
+    return Measurement(
+        quality.drop,
+        quality.fidelity,
+        quality.modelled_drop,
+        None if alone is None else Measurement(alone.drop, alone.fidelity, alone.modelled_drop),
+    )
 
 
 def _planes(image: np.ndarray) -> np.ndarray:

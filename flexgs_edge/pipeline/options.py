@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from flexgs_edge.adapt import REFINE_STEPS, Judge, MaxDrop, MinFidelity, Target, min_ratio
+from flexgs_edge.adapt import REFINE_STEPS, Judge, MaxDrop, MinFidelity, Target, WorstToo, min_ratio
 from flexgs_edge.adapt.targets import MaxSize
 from flexgs_edge.bitspec import PAPER, BitSpec
 from flexgs_edge.cameras import split_views
@@ -33,6 +33,7 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "bits": ("paper", "paper"),
     "groups": ("paper", None),
     "unseen": ("best", "keep"),
+    "views_margin": ("best", False),
     "refit": ("best", True),
     "layers": ("best", 1),
     "scratch": ("best", None),
@@ -126,6 +127,8 @@ class CompressOptions(ViewOptions):
         Keep the scores here, and take them from here when they are of the same scene, poses and score (`paper`).
     max_drop, min_fidelity : float, optional
         Quality targets, dB.
+    max_worst_drop : float, optional
+        Drop that no deciding view may pass, beside a quality target, dB.
     max_size : int, optional
         Size target, bytes.
     min_ratio : float, optional
@@ -144,6 +147,8 @@ class CompressOptions(ViewOptions):
         Write the closest point when the target cannot be met.
     unseen : str
         What becomes of Gaussians that no training pose sees (`best`): `keep`, `drop`, or the share that stays, such as `20%`.
+    views_margin : bool
+        Score a part of the poses nearer to what is seen, farther from it and in between as well (`best`).
     refit : bool
         Refit colours after pruning and quantizing (`best`).
     layers : int
@@ -168,6 +173,7 @@ class CompressOptions(ViewOptions):
     score_cache: str | None = None
     max_drop: float | None = None
     min_fidelity: float | None = None
+    max_worst_drop: float | None = None
     max_size: int | None = None
     min_ratio: float | None = None
     prune_rate: float | None = None
@@ -178,6 +184,7 @@ class CompressOptions(ViewOptions):
     effort: str = "balanced"
     best_effort: bool = False
     unseen: str = "keep"
+    views_margin: bool = False
     refit: bool = True
     layers: int = 1
     scratch: str | None = None
@@ -221,6 +228,12 @@ class CompressOptions(ViewOptions):
             raise InputError(
                 f"{given[0]} with --prune-rate and --sh-rate: fixed rates leave nothing to search; give one or the other"
             )
+        sized = [word for word in given if word in ("--max-size", "--min-ratio")]
+        if self.max_worst_drop is not None and (sized or self.fixed is not None):
+            other = sized[0] if sized else "--prune-rate and --sh-rate"
+            raise InputError(
+                f"--max-worst-drop with {other}: it goes with --max-drop or --min-fidelity; leave one of them out"
+            )
         self.target("drop", 1)
 
     @property
@@ -251,13 +264,13 @@ class CompressOptions(ViewOptions):
         """The target; `judge` is the figure that decides on drops, `None` comes back for fixed rates."""
         if self.fixed is not None:
             return None
-        if self.min_fidelity is not None:
-            return MinFidelity(self.min_fidelity)
         if self.max_size is not None:
             return MaxSize(self.max_size, judge)
         if self.min_ratio is not None:
             return min_ratio(self.min_ratio, ply_bytes, judge)
-        return MaxDrop(DEFAULT_MAX_DROP if self.max_drop is None else self.max_drop, judge)
+        drop = MaxDrop(DEFAULT_MAX_DROP if self.max_drop is None else self.max_drop, judge)
+        mean = drop if self.min_fidelity is None else MinFidelity(self.min_fidelity)
+        return mean if self.max_worst_drop is None else WorstToo(mean, self.max_worst_drop, judge)
 
     def bit_spec(self) -> tuple[BitSpec | None, int | None]:
         """Bits (`None`: to be searched) and groups that `--bits` and `--groups` ask for."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from flexgs_edge._version import __version__
-from flexgs_edge.adapt import Judge, SearchResult, Target
+from flexgs_edge.adapt import Judge, Measurement, SearchResult, Target
 from flexgs_edge.bitspec import BitSpec
 from flexgs_edge.errors import InputError
 from flexgs_edge.pipeline.inputs import WITHOUT_VIEWS, Scene, Views
@@ -119,10 +119,14 @@ def make_settings(
         "effort": options.effort if plan.target else None,
         "base_psnr": options.base_psnr,
         "quality": {
-            name: None if value is None else round(value, 3) for name, value in (asdict(found) if found else {}).items()
+            name: None if value is None else round(value, 3) for name, value in (_means(found) if found else {}).items()
         },
         "near": options.near,
         "background": list(options.background),
         "extent": options.extent,
         "antialiased": options.antialiased,
     }
+
+
+def _means(found: Measurement) -> dict[str, float | None]:
+    return {"drop": found.drop, "fidelity": found.fidelity, "modelled_drop": found.modelled_drop}

@@ -13,6 +13,13 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 
+HALF_LARGEST = float(np.finfo(np.float16).max)
+
+
+def to_half(values: np.ndarray) -> np.ndarray:
+    """Half precision, at the ends of its range where a value lies beyond: infinity would become NaN in every sum."""
+    return np.clip(values, -HALF_LARGEST, HALF_LARGEST).astype(np.float16)
+
 
 class TargetViews:
     """Renders of one scene from some cameras, as `Renderer.residual_sums` wants them.
@@ -52,7 +59,7 @@ class TargetViews:
 
     def add(self, view: int, planes: np.ndarray) -> None:
         """Keep a view ([3, H, W] f32, as `Renderer.render_planes` gives it)."""
-        half = planes.astype(np.float16)
+        half = to_half(planes)
         self._file.seek(self._end)
         self._file.write(half.data)
         self._places[view] = (self._end, half.shape)

@@ -59,6 +59,7 @@ def compress_page(result: CompressResult, material: Material) -> str:
     if result.reached is False:
         missed = f"The target, {result.target}, was not reached: this is the closest point (--best-effort)."
         parts.append(f'<p class="warn">{text(missed)}</p>')
+    parts += [f'<p class="warn">{text(f"Beware: {words}.")}</p>' for words in result.warnings]
     parts.append(
         _tiles(
             [

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from flexgs_edge._version import __version__
-from flexgs_edge.adapt import SearchResult, Step
+from flexgs_edge.adapt import Measurement, Scored, SearchResult, Step
 from flexgs_edge.render.quality import Quality, ViewQuality
 from flexgs_edge.sensitivity import Sensitivity
 
@@ -150,6 +150,12 @@ class CompressResult:
         `fgs`, `spz`, `sog` or `compressed.ply`.
     file_sh_degree : int or None
         SH degree of the file.
+    scored : Scored or None
+        Poses and unseen Gaussians of a search by measured costs.
+    training_fidelity : float or None
+        Fidelity of the decoded file on some training poses, where `quality` is of held-out views.
+    warnings : tuple of str
+        Reasons to trust the figures less, each with a number.
     """
 
     scene: SceneInfo
@@ -180,6 +186,9 @@ class CompressResult:
     run: RunInfo
     format: str = "fgs"
     file_sh_degree: int | None = None
+    scored: Scored | None = None
+    training_fidelity: float | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def ratio(self) -> float:
@@ -222,6 +231,9 @@ class CompressResult:
             "sensitivity": [{**asdict(item), "loss": item.loss} for item in self.sensitivity],
             "quality": quality_json(self.quality) if self.quality else None,
             "quality_views": self.quality_views,
+            "training_fidelity": _rounded(self.training_fidelity),
+            "scored": asdict(self.scored) if self.scored else None,
+            "warnings": list(self.warnings),
             "scores_saved": self.scores_saved,
             "score_cache": self.score_cache,
             "scores_reused": self.scores_reused,
@@ -355,9 +367,18 @@ def step_json(step: Step) -> dict[str, Any]:
         "drop": _rounded(found.drop if found else None),
         "fidelity": _rounded(found.fidelity if found else None),
         "modelled_drop": _rounded(found.modelled_drop if found else None),
+        "worst": _worst_json(found.worst) if found and found.worst else None,
         "holds": step.holds,
         "estimated": step.estimated,
         "seconds": round(step.seconds, 3),
+    }
+
+
+def _worst_json(worst: Measurement) -> dict[str, float | None]:
+    return {
+        "drop": _rounded(worst.drop),
+        "fidelity": _rounded(worst.fidelity),
+        "modelled_drop": _rounded(worst.modelled_drop),
     }
 
 

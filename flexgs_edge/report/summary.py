@@ -48,6 +48,7 @@ def compress_text(result: CompressResult) -> str:
     if result.quality is not None:
         decoded = "decoded file" if result.output else "as it would decode"
         lines += _quality_lines(result.quality, f"{decoded}, {len(result.quality.views)} {result.quality_views} views")
+    lines += [_line("warning", words) for words in result.warnings]
     if result.scores_saved:
         lines.append(_line("scores", f"saved to {result.scores_saved}"))
     if result.score_cache:

@@ -11,6 +11,8 @@ from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
 
 _TINY = np.finfo(np.float32).tiny
+SH_LARGEST = 1e15
+"""SH coefficients beyond this are invalid: squares of colours made of them leave float32, and infinity times no weight is NaN."""
 
 
 class _Faults:
@@ -33,8 +35,8 @@ class _Faults:
 def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int = 65536) -> SceneSource:
     """Check every value of a scene, one chunk at a time.
 
-    Invalid are rows with NaN or infinity in any field, and quaternions whose norm is zero or outside what float32
-    can normalise. Log-scales of -inf (flat splats) are valid: they read as the smallest finite one of the scene.
+    Invalid are rows with NaN or infinity in any field, SH beyond `SH_LARGEST`, and quaternions whose norm is zero or outside what
+    float32 can normalise. Log-scales of -inf (flat splats) are valid: they read as the smallest finite one of the scene.
 
     Parameters
     ----------
@@ -100,6 +102,10 @@ def _check_chunk(source: SceneSource, rows: slice, faults: _Faults) -> tuple[np.
         broken = np.asarray(~finite.all(axis=0))
         faults.add(rows.start, broken, f"NaN or infinity in {field.name}")
         bad |= broken
+        if field.name in ("sh_dc", "sh_rest"):
+            glaring = ~broken & (np.abs(values) > SH_LARGEST).any(axis=0)
+            faults.add(rows.start, glaring, f"values beyond +-{SH_LARGEST:g} in {field.name}")
+            bad |= glaring
         if field.name == "quats":
             with np.errstate(over="ignore", under="ignore", invalid="ignore"):
                 norm = np.square(values).sum(axis=0, dtype=np.float32)

@@ -21,6 +21,9 @@ from flexgs_edge.render.device_scene import Chunk
 from flexgs_edge.render.view_sums import Maker, ViewSums
 from flexgs_edge.scratch import MEMORY, Room, blocks
 
+MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
+"""Where the sums of moments stop (colours of some thousands in every view)."""
+
 
 @dataclass
 class RemovalCosts:
@@ -55,7 +58,9 @@ class RemovalCosts:
             assert isinstance(weight2, np.ndarray) and isinstance(moments, np.ndarray)
             divisor = np.where(weight2 > 0, weight2, 1.0)
             # Rounding may leave a variance of nothing slightly below zero.
-            costs.sh[:, rows] = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
+            variance = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
+            # A sum that stopped growing must not look like no variance at all.
+            costs.sh[:, rows] = np.where(moments[:, 3] >= MOMENT_FULL, moments[:, 3], variance)
             costs.sh_mean[:, :, rows] = (moments[:, :3] / divisor).astype(np.float32)
         return costs
 

@@ -11,6 +11,7 @@ from flexgs_edge.cameras import Camera
 from flexgs_edge.render import Renderer
 from flexgs_edge.render.quality import mean_psnr, mse, psnr
 from flexgs_edge.render.renderer import EXTENTS
+from flexgs_edge.render.targets import to_half
 from flexgs_edge.scene import Planes, Rows, SceneSource
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.study.bench import Bench
@@ -26,7 +27,6 @@ THRESHOLDS = (1, 4, 8, 16)
 """Opacities, in 255ths, below which splats are left out."""
 SHRINKS = (2, 4)
 """Sides of the small pictures, as parts of the whole."""
-HALF_LARGEST = float(np.finfo(np.float16).max)
 CHUNK = 1 << 16
 EXACT = "exact"
 
@@ -64,7 +64,7 @@ class HalfPrecision(SceneSource):
         self.parent.read(rows, fields, planes)
         for plane in planes.values():
             # Infinite values could not be drawn at all; saturated ones are merely wrong.
-            plane[...] = np.clip(plane, -HALF_LARGEST, HALF_LARGEST).astype(np.float16)
+            plane[...] = to_half(plane)
         return planes
 
 

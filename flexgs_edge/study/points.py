@@ -18,6 +18,7 @@ from flexgs_edge.pipeline.best import GridCoder, grid_search, open_path, search_
 from flexgs_edge.pipeline.foreign import open_files
 from flexgs_edge.pipeline.judge import measurement_of
 from flexgs_edge.pipeline.plan import EVERYTHING, make_settings
+from flexgs_edge.pipeline.poses import scored_poses
 from flexgs_edge.prune import Choice
 from flexgs_edge.render import DeviceScene
 from flexgs_edge.render.quality import Quality
@@ -161,11 +162,18 @@ def best_points(
     """
     workspace, source = bench.workspace, bench.scene.source
     options = replace(bench.options, effort=effort, refit=variant.refit, best_effort=True)
-    cameras = bench.views.of(bench.views.train)
+    poses = scored_poses(bench.views.of(bench.views.train), options, workspace.renderer, source)
     found = NOTHING
     started = time.perf_counter()
     with open_path(
-        workspace.renderer, source, cameras, options, workspace.budget, workspace.clock, bench.progress, variant.path
+        workspace.renderer,
+        source,
+        poses.cameras,
+        options,
+        workspace.budget,
+        workspace.clock,
+        bench.progress,
+        variant.path,
     ) as path:
         coder = GridCoder(workspace.renderer)
         for ratio in sorted(ratios):

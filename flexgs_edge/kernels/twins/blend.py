@@ -54,12 +54,13 @@ class _Entries:
     error: np.ndarray
 
 
-def _fixed(lanes: np.ndarray, unit: float) -> np.ndarray:
-    """[pairs] i64 of [pairs, 16] lanes: the pairwise tree, then fixed point."""
+def _fixed(lanes: np.ndarray, unit: float, tiles: int) -> np.ndarray:
+    """[pairs] i64 of [pairs, 16] lanes: the pairwise tree, then fixed point, at most a tile's part of what 64 bits hold."""
+    largest = f32(FIXED_LARGEST / 2.0 ** tiles.bit_length())
     eight = lanes[:, :8] + lanes[:, 8:]
     four = eight[:, :4] + eight[:, 4:]
     total = (four[:, 0] + four[:, 2]) + (four[:, 1] + four[:, 3])
-    return np.clip(total * f32(unit), f32(-FIXED_LARGEST), f32(FIXED_LARGEST)).astype(np.int64)
+    return np.clip(total * f32(unit), -largest, largest).astype(np.int64)
 
 
 PLANES = {
@@ -73,6 +74,7 @@ PLANES = {
 
 def _add_sums(
     stats: int,
+    tiles: int,
     lists: _Lists,
     entries: _Entries,
     rest: np.ndarray | None,
@@ -105,7 +107,7 @@ def _add_sums(
         np.add.at(hits, rows_of, count)
     for c, name in enumerate(planes):
         unit = FIXED_ERROR if name in ("error", "square") else FIXED_WEIGHT
-        np.add.at(sums.view(np.int64)[:, c, 0], rows_of[some], _fixed(lanes[name][some], unit))
+        np.add.at(sums.view(np.int64)[:, c, 0], rows_of[some], _fixed(lanes[name][some], unit, tiles))
 
 
 def blend(
@@ -153,7 +155,7 @@ def blend(
         own_rest = own_target if rest is None else rest.reshape(image.shape)[:, ys, xs]
         entries = _blend_blocks(lists, part[:, 0], records, (px, py), colour, trans, stats, own_target)
         if entries is not None and hits is not None and sums is not None:
-            _add_sums(stats, lists, entries, own_rest, part[:, 0], hits, sums)
+            _add_sums(stats, size[0], lists, entries, own_rest, part[:, 0], hits, sums)
         if finish:
             image[:, ys, xs] = fma(np.abs(trans), background[:, None, None], colour)
         else:

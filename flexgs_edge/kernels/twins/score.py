@@ -25,7 +25,10 @@ def _directions(camera: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _add_long(acc: np.ndarray, value: np.ndarray) -> None:
-    acc += np.clip(value * f32(FIXED_WEIGHT), f32(-FIXED_LARGEST), f32(FIXED_LARGEST)).astype(np.int64)
+    value = np.clip(value * f32(FIXED_WEIGHT), f32(-FIXED_LARGEST), f32(FIXED_LARGEST)).astype(np.int64)
+    most = np.iinfo(np.int64)
+    value = np.minimum(value, most.max - np.maximum(acc, 0))
+    acc += np.maximum(value, most.min - np.minimum(acc, 0))
 
 
 def sh_costs(

@@ -1,0 +1,473 @@
+"""Mutates files by the million and shows that every reader says what is wrong, or reads what is right.
+
+    python -m benchmarks.fuzz                          # ten processor minutes, and writes the table of docs/fuzzing.md
+    python -m benchmarks.fuzz --tries 2000 --only v2   # so many of one kind; writes nothing
+
+Every try has a number, which is the seed of its random choices: `--from N --tries 1` makes one again. Mutations of containers are
+of two kinds: *plain* ones must all be found by `verify`; *sealed* ones have their checksums corrected, so that the decoders meet
+them: they must end in values that are finite or in an error of ours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import re
+import shutil
+import signal
+import struct
+import sys
+import tempfile
+import time
+import traceback
+import tracemalloc
+import warnings
+import zlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness import ROOT
+from flexgs_edge.budget import peak_rss
+from flexgs_edge.cameras import read_cameras
+from flexgs_edge.codec import open_fgs, read_header, verify
+from flexgs_edge.codec.layout import HEADER_STEP, Section
+from flexgs_edge.errors import FlexGSError, FormatError
+from flexgs_edge.scene import FIELDS, PlySource, SceneSource, check_scene
+
+SEEDS = ROOT / "tests" / "fuzz" / "seeds"
+"""Small valid files that mutations start from."""
+TABLE = ROOT / "docs" / "fuzzing.md"
+SLOW = 1.0
+"""Processor seconds that no try may take."""
+STUCK = 5.0
+"""Processor seconds after which a try is given up."""
+TRACED_EVERY = 50
+"""Allocations are traced on one try in so many: tracing makes it several times as slow."""
+BOUND = 12 << 20
+"""Bytes that reading a file may allocate whatever it holds: the decoder's tables take 7.5 MB."""
+ROW_BOUND = 4096
+"""Bytes a row beyond that, for as many rows as the file's size allows."""
+NUMBERS = (0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x100, 0x7FFF, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
+
+
+def nested(depth: int) -> list[object]:
+    """Lists in lists."""
+    value: list[object] = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+VALUES: tuple[object, ...] = (
+    0, -1, 1, 2**16, 2**31, 2**32 - 1, 2**63, 10**30, 0.5, 1e300, 5e-324, -0.0, float("nan"), float("inf"), True, None, "", "1",
+    "\ud800", [], [1], [[]], {}, {"a": 1}, "x" * 3000,
+    nested(700),
+)  # fmt: skip
+"""What JSON values are replaced with."""
+WORDS = (*b"0 -1 1e999 1e308 nan inf 99999999999999999999 4294967296 list double #".split(b" "), b"", b"\n", b"\xff")
+"""What words of text files are replaced with."""
+
+
+def mutate_bytes(draw: random.Random, data: bytes) -> bytes:
+    """One to four changes: bits, bytes, numbers, and pieces cut, doubled, moved, put in."""
+    made = bytearray(data)
+    for _ in range(draw.choice((1, 1, 1, 2, 4))):
+        size = len(made)
+        at = draw.randrange(size + 1)
+        kind = draw.randrange(9)
+        if kind < 2 and size:
+            made[at % size] ^= 1 << draw.randrange(8)
+        elif kind == 2 and size:
+            made[at % size] = draw.randrange(256)
+        elif kind == 3 and size >= 4:
+            struct.pack_into("<I", made, draw.randrange(size - 3), draw.choice(NUMBERS))
+        elif kind == 4 and size >= 8:
+            struct.pack_into("<Q", made, draw.randrange(size - 7), draw.choice(NUMBERS) << draw.choice((0, 32)))
+        elif kind == 5:
+            del made[at : at + draw.choice((1, 4, 16, 256))]
+        elif kind == 6:
+            made[at:at] = draw.randbytes(draw.choice((1, 2, 4, 64)))
+        elif kind == 7:
+            other = draw.randrange(size + 1)
+            made[at:at] = made[other : other + draw.choice((1, 8, 64))]
+        else:
+            del made[at:]
+    return bytes(made)
+
+
+def mutate_text(draw: random.Random, data: bytes) -> bytes:
+    """Words and lines of a text (or of a PLY's header) replaced, moved and doubled; else any bytes."""
+    if draw.random() < 0.3:
+        return mutate_bytes(draw, data)
+    end = data.find(b"end_header\n")
+    text, rest = (data[: end + 11], data[end + 11 :]) if end >= 0 else (data, b"")
+    pieces = re.split(rb"(\s+|,|:)", text)
+    for _ in range(draw.choice((1, 1, 2, 5))):
+        at = draw.randrange(len(pieces))
+        if draw.random() < 0.6:
+            pieces[at] = draw.choice(WORDS)
+        else:
+            pieces[at:at] = pieces[(other := draw.randrange(len(pieces))) : other + draw.choice((1, 2, 8))]
+    return b"".join(pieces) + rest
+
+
+def mutate_json(draw: random.Random, data: bytes) -> bytes:
+    """One value of a JSON text replaced, or a key dropped; else its text."""
+    if draw.random() < 0.4:
+        return mutate_text(draw, data)
+    record = json.loads(data)
+    places: list[tuple[dict[str, object] | list[object], str | int]] = []
+
+    def walk(value: object) -> None:
+        inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+        for key, below in inner:
+            places.append((value, key))  # type: ignore[arg-type]
+            walk(below)
+
+    walk(record)
+    for _ in range(draw.choice((1, 1, 2))):
+        parent, key = draw.choice(places)
+        try:
+            if draw.random() < 0.2:
+                del parent[key]  # type: ignore[arg-type]
+            else:
+                parent[key] = draw.choice(VALUES)  # type: ignore[index]
+        except (KeyError, IndexError):
+            continue  # gone with what was changed before
+    return json.dumps(record).encode()
+
+
+def mutate_sealed(draw: random.Random, data: bytes, sections: Sequence[Section]) -> bytes:
+    """A change of a container's header, ranges, model, chunks or chunk table, under checksums that are right again.
+
+    `sections` are those of `data`.
+    """
+    section = draw.choice(sections[1:])
+    if section.name == "header":
+        block = data[section.offset : section.offset + section.length]
+        text = mutate_json(draw, block.rstrip())
+        # Version 1 pads its header to whole steps.
+        text = text.ljust(-(-len(text) // HEADER_STEP) * HEADER_STEP) if data[8] == 1 else text
+        return _seal(data[: section.offset] + text + data[section.offset + section.length :], len(text))
+    made = bytearray(data)
+    if section.name.startswith("chunk ") and section.name != "chunk table":
+        body = _same_size(draw, data[section.offset : section.offset + section.length])
+        made[section.offset : section.offset + section.length] = body
+        table = sections[-1]
+        struct.pack_into("<I", made, table.offset + 8 * int(section.name[6:]) + 4, zlib.crc32(body))
+        _sum_behind(made, table)
+    else:
+        body = _same_size(draw, data[section.offset : section.offset + section.length - 4])
+        made[section.offset : section.offset + len(body)] = body
+        _sum_behind(made, section)
+    return bytes(made)
+
+
+def _same_size(draw: random.Random, body: bytes) -> bytes:
+    return mutate_bytes(draw, body)[: len(body)].ljust(len(body), draw.choice((b"\0", b"\xff")))
+
+
+def _sum_behind(data: bytearray, section: Section) -> None:
+    """The checksum at a section's end."""
+    end = section.offset + section.length - 4
+    struct.pack_into("<I", data, end, zlib.crc32(data[section.offset : end]))
+
+
+def _seal(data: bytes, length: int) -> bytes:
+    """Correct file size, header checksum and preamble checksum."""
+    made = bytearray(data)
+    struct.pack_into("<QII", made, 16, len(made), length, zlib.crc32(made[36 : 36 + length]))
+    struct.pack_into("<I", made, 32, zlib.crc32(made[:32]))
+    return bytes(made)
+
+
+def read_all(source: SceneSource) -> str:
+    """Every value of a scene; `read`, or `left out` where rows of it are invalid."""
+    planes = source.read(slice(0, source.count), [field.name for field in FIELDS])
+    good = all(bool(np.isfinite(plane).all()) for plane in planes.values())
+    check_scene(source, drop_invalid=True)
+    return "read" if good else "left out"
+
+
+def read_container(place: Path) -> str:
+    """Decode a `.fgs`; its values must be finite."""
+    source = open_fgs(place)
+    outcome = read_all(source)
+    if outcome != "read":
+        raise AssertionError("a .fgs gave values that are not finite")
+    return outcome
+
+
+def read_ply(place: Path) -> str:
+    """Read a PLY."""
+    return read_all(PlySource(place))
+
+
+def read_views(place: Path) -> str:
+    """Read cameras, in their two orders of strictness."""
+    cameras = read_cameras(place, ignore_distortion=True)
+    for camera in cameras:
+        values = np.concatenate(
+            [camera.rotation.ravel(), camera.translation, [camera.fx, camera.fy, camera.cx, camera.cy]]
+        )
+        if not np.isfinite(values).all() or camera.width < 1 or camera.height < 1:
+            raise AssertionError(f"camera {camera.name!r} is not finite")
+    return "read"
+
+
+def find(place: Path) -> str:
+    """`verify`; reading what it passes is `missed`."""
+    verify(place)
+    return "missed"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What is mutated, how, and what reads it.
+
+    Parameters
+    ----------
+    name : str
+        For the table and `--only`.
+    seeds : tuple of str
+        Files in `SEEDS` (of a COLMAP model one is changed, its folder is read).
+    mutate : callable
+        Another file's bytes from a seed's; containers whose checksums are made right again take their sections as well.
+    read : callable
+        Gives a word for the outcome, or raises.
+    sealed : bool
+    tries : int
+        Of a whole run.
+    folder : bool
+        What is read is the folder that the file lies in.
+    """
+
+    name: str
+    seeds: tuple[str, ...]
+    mutate: Callable[..., bytes]
+    read: Callable[[Path], str]
+    tries: int
+    sealed: bool = False
+    folder: bool = False
+
+
+KINDS = (
+    Kind("v1 plain", ("v1.fgs",), mutate_bytes, find, 500_000),
+    Kind("v2 plain", ("v2.fgs",), mutate_bytes, find, 460_000),
+    Kind("v1 sealed", ("v1.fgs",), mutate_sealed, read_container, 30_000, sealed=True),
+    Kind("v2 sealed", ("v2.fgs",), mutate_sealed, read_container, 10_000, sealed=True),
+    Kind("PLY", ("binary.ply", "ascii.ply", "big.ply"), mutate_text, read_ply, 20_000),
+    Kind("cameras.json, transforms.json", ("cameras.json", "transforms.json"), mutate_json, read_views, 10_000),
+    Kind("COLMAP", ("text/cameras.txt", "text/images.txt", "binary/cameras.bin", "binary/images.bin"), mutate_text, read_views,
+         10_000, folder=True),
+)  # fmt: skip
+
+
+@dataclass
+class Tally:
+    """What came of the tries of one kind."""
+
+    kind: Kind
+    outcomes: Counter[str] = field(default_factory=Counter)
+    failures: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    slowest: float = 0.0
+    most_bytes: int = 0
+    most_over: float = 0.0
+    """Largest allocation traced, as a part of what the file's bound allows."""
+
+    @property
+    def tries(self) -> int:
+        """Files read."""
+        return sum(self.outcomes.values())
+
+
+class Fuzzer:
+    """Makes and reads the mutations of one kind, in a folder of its own.
+
+    Parameters
+    ----------
+    kind : Kind
+    folder : path
+        Best in memory: a file is written for each try.
+    """
+
+    def __init__(self, kind: Kind, folder: Path) -> None:
+        self.kind, self.tally = kind, Tally(kind)
+        self.seeds = [(SEEDS / name).read_bytes() for name in kind.seeds]
+        self.sections = [tuple(verify(SEEDS / name)) if kind.sealed else () for name in kind.seeds]
+        self.places = []
+        for name in kind.seeds:
+            place = folder / name
+            shutil.copytree((SEEDS / name).parent, place.parent, dirs_exist_ok=True)
+            # Also so that nothing is imported while allocations are counted.
+            outcome = kind.read(place.parent if kind.folder else place)
+            if outcome not in ("read", "missed"):
+                raise AssertionError(f"{SEEDS / name} is not as it should be: {outcome}")
+            self.places.append(place)
+
+    def made(self, number: int) -> tuple[int, bytes]:
+        """The seed that try `number` starts from, and its mutation."""
+        draw = random.Random(f"{self.kind.name} {number}")
+        index = draw.randrange(len(self.seeds))
+        seed = self.seeds[index]
+        for _ in range(8):
+            data = self.kind.mutate(draw, seed, *([self.sections[index]] if self.kind.sealed else []))
+            if data != seed:
+                break
+        return index, data
+
+    def run(self, number: int, traced: bool = False) -> str:
+        """One try: the outcome, which goes into the tally as well."""
+        index, data = self.made(number)
+        place = self.places[index]
+        place.write_bytes(data)
+        if traced:
+            tracemalloc.start()
+        started = time.thread_time()
+        signal.setitimer(signal.ITIMER_VIRTUAL, STUCK)
+        try:
+            outcome = self.kind.read(place.parent if self.kind.folder else place)
+        except FlexGSError as error:
+            outcome = "refused"
+            if str(place.name) not in str(error) and not self.kind.folder:
+                self._fail(number, f"an error that does not name the file: {error}")
+        except Exception:
+            outcome = "crashed"
+            self._fail(number, traceback.format_exc())
+        finally:
+            signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        seconds = time.thread_time() - started
+        if traced:
+            self._weigh(number, place, tracemalloc.get_traced_memory()[1])
+            tracemalloc.stop()
+        if self.kind.folder:
+            place.write_bytes(self.seeds[index])
+        if outcome == "missed" and data != self.seeds[index]:
+            self._fail(number, "a change that `verify` did not find")
+        if seconds > SLOW and not traced:
+            self._fail(number, f"took {seconds:.2f} s")
+        self.tally.outcomes[outcome] += 1
+        self.tally.seconds += seconds
+        self.tally.slowest = max(self.tally.slowest, 0.0 if traced else seconds)
+        return outcome
+
+    def _weigh(self, number: int, place: Path, peak: int) -> None:
+        rows = 16 * place.stat().st_size
+        if self.kind.sealed:
+            try:
+                rows = read_header(place).count
+            except FormatError:
+                rows = 0
+        allowed = BOUND + ROW_BOUND * rows
+        self.tally.most_bytes = max(self.tally.most_bytes, peak)
+        self.tally.most_over = max(self.tally.most_over, peak / allowed)
+        if peak > allowed:
+            self._fail(number, f"allocated {peak} bytes where {rows} rows allow {allowed}")
+
+    def _fail(self, number: int, words: str) -> None:
+        self.tally.failures.append(f"{self.kind.name}, try {number}: {words}")
+
+
+def _stuck(number: int, frame: object) -> None:
+    raise TimeoutError(f"no end after {STUCK:g} s")
+
+
+def fuzz(kind: Kind, first: int, tries: int, keep: Path | None = None) -> Tally:
+    """Tries `first` and on of one kind; what fails is kept in the folder `keep`."""
+    memory = Path("/dev/shm")
+    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as name, warnings.catch_warnings():
+        signal.signal(signal.SIGVTALRM, _stuck)
+        warnings.simplefilter("error")  # arithmetic that overflowed was not thought of
+        fuzzer = Fuzzer(kind, Path(name))
+        for number in range(first, first + tries):
+            before = len(fuzzer.tally.failures)
+            fuzzer.run(number, number % TRACED_EVERY == 0)
+            if len(fuzzer.tally.failures) > before and keep is not None:
+                keep.mkdir(parents=True, exist_ok=True)
+                index, data = fuzzer.made(number)
+                (keep / f"{kind.name.split()[0]}-{number}-{Path(kind.seeds[index]).name}").write_bytes(data)
+    return fuzzer.tally
+
+
+HEAD = """# Fuzzing
+
+Small valid files (`tests/fuzz/seeds`) are changed and read. `python -m benchmarks.fuzz` makes this page; each try has a number,
+which is the seed of its choices, so all of it can be made again. A part of it runs with the tests (`tests/fuzz`), and so do the
+files of `tests/fuzz/corpus`, each of which must be refused.
+
+*Plain* changes of a container leave its checksums as they were: `verify` has to find every one. *Sealed* ones have their
+checksums made right again, so that the decoders meet them: they may give values, all finite, or an error that names the file. A
+change is of one to four bits, bytes or numbers, or pieces cut out, put in, doubled and moved; of text, words and lines; of JSON,
+values and keys. Warnings of arithmetic count as crashes.
+
+| what | tries | refused | read | not found | crashes, warnings | over {slow:g} s | slowest | most allocated | of its bound |
+|---|---|---|---|---|---|---|---|---|---|
+"""
+TAIL = """
+{containers} of the tries were of containers; {found} of {plain} plain changes were found. All of it took {minutes:.1f} processor
+minutes, and the process never held more than {peak:.0f} MiB. Times are processor time of one try. Allocations are traced on one
+try in {every}; the bound is {fixed} MiB and {row} bytes for each row that the checked header says or the file's size allows.
+"""
+
+
+def table(tallies: Sequence[Tally], minutes: float) -> str:
+    """The page of a run."""
+    lines = []
+    for tally in tallies:
+        slow = sum("took" in words for words in tally.failures)
+        got = tally.outcomes
+        read = got["read"] + got["left out"]
+        lines.append(
+            f"| {tally.kind.name} | {tally.tries} | {got['refused']} | {read} | {got['missed']} | {got['crashed']} | {slow} | "
+            f"{1000 * tally.slowest:.0f} ms | {tally.most_bytes / 1e6:.2f} MB | {100 * tally.most_over:.0f} % |"
+        )
+    containers = [tally for tally in tallies if tally.kind.name.startswith("v")]
+    plain = [tally for tally in containers if not tally.kind.sealed]
+    tail = TAIL.format(
+        containers=sum(tally.tries for tally in containers),
+        found=sum(tally.outcomes["refused"] for tally in plain),
+        plain=sum(tally.tries for tally in plain),
+        minutes=minutes,
+        peak=peak_rss() / 2**20,
+        every=TRACED_EVERY,
+        fixed=BOUND >> 20,
+        row=ROW_BOUND,
+    )
+    return HEAD.format(slow=SLOW) + "\n".join(lines) + "\n" + tail
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tries", type=int, help="of each kind; default: as many as the table has")
+    parser.add_argument("--from", type=int, default=0, dest="first", help="number of the first one; default: 0")
+    parser.add_argument("--only", default="", help="kinds whose name begins so")
+    parser.add_argument("--keep", type=Path, help="folder for files that failed")
+    options = parser.parse_args()
+    started = time.process_time()
+    tallies = []
+    for kind in KINDS:
+        if not kind.name.startswith(options.only):
+            continue
+        tally = fuzz(kind, options.first, options.tries or kind.tries, keep=options.keep)
+        tallies.append(tally)
+        print(
+            f"{kind.name}: {tally.tries} tries, {dict(tally.outcomes)}, {tally.seconds:.0f} s",
+            file=sys.stderr,
+            flush=True,
+        )
+        print("\n".join(tally.failures), end="\n" if tally.failures else "", file=sys.stderr, flush=True)
+    page = table(tallies, (time.process_time() - started) / 60)
+    if options.tries is None and not options.only and not options.first:
+        TABLE.write_text(page)
+    print(page)
+    return int(any(tally.failures for tally in tallies))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

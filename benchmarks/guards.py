@@ -1,0 +1,93 @@
+"""How far a compressed scene holds away from the poses that were scored, and how far its worst view is from the mean.
+
+Fidelity at the training poses and at those of held-out views at other distances from what they look at, the held-out views' drop,
+bytes and processor seconds, with --views-margin off and on.
+
+python -m benchmarks.guards [--scene fox|sample] [--effort fast|balanced|thorough] [--only off|on]
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness import SCENES, Bench, backend_of, parse
+from flexgs_edge.cameras import Camera
+from flexgs_edge.codec import open_fgs
+from flexgs_edge.pipeline.compress import compress
+from flexgs_edge.pipeline.inputs import companions_of, find_views, load_scene, resolve_drawing
+from flexgs_edge.pipeline.margin import at_distance, between, visible_depths
+from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.render import Renderer
+from flexgs_edge.render.quality import mean_psnr, mse, psnr
+from flexgs_edge.scene import SceneSource
+
+FACTORS = (0.25, 0.35, 0.5, 0.71, 1.0, 1.41, 2.0, 2.83, 4.0)
+
+
+def fidelities(renderer: Renderer, original: SceneSource, coded: SceneSource, cameras: Sequence[Camera]) -> np.ndarray:
+    """[n] dB, of each camera."""
+    with renderer.load(original) as scene:
+        images = [renderer.render(scene, camera) for camera in cameras]
+    with renderer.load(coded) as scene:
+        found = [psnr(mse(renderer.render(scene, camera), image)) for camera, image in zip(cameras, images)]
+    renderer.release()
+    return np.array([200.0 if value is None else value for value in found])
+
+
+def main() -> None:
+    more = (
+        ("--effort", {"default": "fast"}),
+        ("--only", {"choices": ("off", "on")}),
+        ("--max-drop", {"type": float, "default": 1.0}),
+    )
+    options = parse(__doc__, repeats=1, scene="sample", more=more)
+    backend, budget = backend_of(options)
+    bench = Bench(backend.name, 1)
+    path = SCENES[options.scene] / "point_cloud.ply"
+    scene, companions = load_scene(path), companions_of(path)
+    drawing = resolve_drawing(CompressOptions(), scene, companions)
+    views = find_views(drawing, companions, scene.source)
+    assert views is not None and drawing.near is not None and drawing.background is not None
+    renderer = Renderer(backend, budget, drawing.near, drawing.background)
+    train, held_out = views.of(views.train), views.of(views.held_out)
+    depths = visible_depths(renderer, scene.source, held_out)
+    sets = {"training poses": train}
+    for factor in FACTORS:
+        sets[f"held-out poses at {factor:g}x"] = [at_distance(c, d, factor) for c, d in zip(held_out, depths)]
+    nearest = [min(train, key=lambda other: float(np.linalg.norm(other.center - c.center))) for c in held_out]
+    sets["half way to the nearest pose"] = [between(c, other) for c, other in zip(held_out, nearest)]
+    for margin in (False, True):
+        if options.only == ("off" if margin else "on"):
+            continue
+        with tempfile.TemporaryDirectory() as name:
+            place = Path(name) / "out.fgs"
+            started = time.process_time()
+            chosen = CompressOptions(effort=options.effort, max_drop=options.max_drop, views_margin=margin)
+            result = compress(path, place, chosen)
+            seconds = time.process_time() - started
+            label = f"{options.scene}, {options.effort}, margin {'on' if margin else 'off'}"
+            bench.add(f"{label}: bytes", [result.size], "B")
+            bench.add(f"{label}: processor seconds", [seconds], "s")
+            quality = result.quality
+            assert quality is not None
+            worst = quality.worst
+            assert worst is not None
+            mean, most = (quality.drop, worst.drop) if quality.drop is not None else (quality.modelled_drop, None)
+            bench.add(f"{label}: mean drop", [mean], "dB")
+            if most is not None:
+                bench.add(f"{label}: worst view's drop", [most], "dB", f"allowed {1.5 * mean + 0.2:.3f}")
+            coded = open_fgs(place)
+            for kind, cameras in sets.items():
+                found = fidelities(renderer, scene.source, coded, cameras)
+                usual = mean_psnr(list(found))
+                assert usual is not None
+                bench.add(f"{label}: {kind}", [usual], "dB", f"worst {found.min():.2f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""What a run has to say about how far its figures can be trusted: sentences with a number each, or nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from flexgs_edge.adapt import Scored
+from flexgs_edge.cameras import Camera
+from flexgs_edge.pipeline.inputs import Views
+from flexgs_edge.pipeline.options import AUTO_CAMERAS
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.render import DeviceScene, Renderer
+from flexgs_edge.render.quality import mean_psnr, mse, psnr
+from flexgs_edge.render.targets import TargetViews
+from flexgs_edge.scene import SceneSource
+
+FIT_VIEWS = 8
+"""Training poses that the finished file is compared on, evenly spread."""
+FIT_STEP = 2
+"""Pixels of them from one to the next, in both directions."""
+FIT_GAP = 2.0
+"""Fidelity on training poses above that on held-out views, dB, from which a choice counts as fitted to what was scored."""
+NEEDED_VIEWS = 16
+"""Scored poses from which more change little: on the sample, ranked by costs from 8, 16 and all 70 poses, 0.99, 0.81 and 0.75 dB
+are lost at one size (docs/performance.md)."""
+UNSEEN_SHARE = 0.01
+"""Share of the Gaussians in none of the automatic views that is worth a word."""
+
+
+def training_fidelity(
+    renderer: Renderer,
+    source: SceneSource,
+    load: Callable[[], DeviceScene],
+    cameras: Sequence[Camera],
+    progress: Progress = SILENT,
+) -> float | None:
+    """Fidelity of what `load` brings to the device, mean over some training poses; `None` when all are identical."""
+    count = min(FIT_VIEWS, len(cameras))
+    few = [cameras[i * len(cameras) // count].every(FIT_STEP) for i in range(count)]
+    with renderer.load(source) as scene:
+        targets = TargetViews.of(renderer, scene, few, progress=progress)
+    found = []
+    with targets, load() as scene:
+        for view, camera in enumerate(few):
+            inside = (slice(None), slice(camera.height), slice(camera.width))
+            found.append(psnr(mse(renderer.render_planes(scene, camera)[inside], targets[view][inside])))
+    renderer.release()
+    return mean_psnr(found)
+
+
+def doubts(
+    views: Views, scored: Scored | None, count: int, trained: float | None, held_out: float | None
+) -> tuple[str, ...]:
+    """Warnings of a run.
+
+    Parameters
+    ----------
+    scored : Scored or None
+        What the search was told by.
+    count : int
+        Gaussians of the scene.
+    trained, held_out : float or None
+        Fidelity on training poses and on held-out views, dB.
+    """
+    found = []
+    if trained is not None and held_out is not None and trained - held_out > FIT_GAP:
+        found.append(
+            f"fidelity is {trained:.1f} dB on training poses and {held_out:.1f} dB on held-out views, {trained - held_out:.1f} "
+            "dB less: the choice fits what was scored, and views from elsewhere may look worse; score more poses "
+            "(--effort thorough, more cameras) or try --views-margin"
+        )
+    if scored is not None and scored.poses < NEEDED_VIEWS:
+        found.append(
+            f"{scored.poses} poses were scored, and ranks settle from about {NEEDED_VIEWS}: the loss away from them is not known "
+            "well; give more cameras, or --views-margin, which makes some"
+        )
+    if scored is not None and views.cameras_from == AUTO_CAMERAS and scored.unseen > UNSEEN_SHARE * count:
+        found.append(
+            f"{scored.unseen} of {count} Gaussians ({100 * scored.unseen / count:.1f} %) are in none of the {scored.poses} "
+            "automatic views that were scored: what they show was not judged; give the scene's cameras (--cameras PATH), and see "
+            "--unseen"
+        )
+    return tuple(found)
