@@ -19,7 +19,7 @@ from flexgs_edge.codec.container import write_container
 from flexgs_edge.errors import TargetError
 from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, from_grid
-from flexgs_edge.pipeline.best import grid_search, layered, search_best, search_files
+from flexgs_edge.pipeline.best import grid_search, kept_as_it_is, layered, search_best, search_files
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
@@ -193,7 +193,9 @@ class _Job:
         if self.format is not None:
             return self._run_files(self.format, output, None, decide, report)
         LOG.info("searching for %s", plan.target.describe())
-        grid, search = search_best(
+        with self.clock.stage("search"):
+            found = kept_as_it_is(renderer, self.source, decide, plan.target, options, self.budget)
+        grid, search = found or search_best(
             grid_search(options, renderer=renderer),
             renderer,
             self.source,

@@ -15,6 +15,7 @@ from flexgs_edge._version import __version__
 from flexgs_edge.best.path import PrunePath
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.study.bench import Bench, open_bench, scene_names
 from flexgs_edge.study.charts import require_matplotlib
 from flexgs_edge.study.cliffs import bits, removal
@@ -36,6 +37,10 @@ LOG = logging.getLogger("flexgs_edge")
 
 EFFORT = "fast"
 """Of all searches: what breaks does so at every effort, and there are some twenty of them."""
+
+
+COPIES = 6
+"""Times the scene's planes that moving it holds at once: as they are, in float64, turned, in float32."""
 
 
 @dataclass(frozen=True)
@@ -119,9 +124,12 @@ _INTRO = (
 
 
 def _experiments(bench: Bench, amounts: Amounts, folder: Path) -> list[Experiment]:
-    train = bench.views.of(bench.views.train)
+    source, train = bench.scene.source, bench.views.of(bench.views.train)
+    bench.workspace.budget.require(
+        "copies of the scene", COPIES * source.count * sum(4 * source.width(name) for name in FIELD)
+    )
     temporary = tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder)
-    with temporary as place, walked(bench, bench.scene.source, train) as path:
+    with temporary as place, walked(bench, source, train) as path:
         return _along_the_path(bench, path, amounts, Path(place))
 
 

@@ -55,7 +55,7 @@ class Amounts:
         "moved 1e3, float32", "moved 1e3, float64", "moved 1e5, float64", "moved 1e6, float64", "scaled 1e-4",
         "scaled 1e-3", "scaled 1e3", "scaled 1e4", "turned",
     )  # fmt: skip
-    few: int = 12
+    few: int = 8
     few_width: int = 320
     generations: int = 5
     fewest: int = 1

@@ -93,7 +93,7 @@ def _path_rows(bench: Bench, path: PrunePath, most: int) -> list[dict[str, Cell]
     """The snapshots of the path, until so many thousandths are gone."""
     keep = EFFORTS[bench.options.effort].keep
     count = bench.scene.source.count
-    while path.snapshots[-1].count > (1 - most / 1000) * count / keep and path.snapshots[-1].count > 16:
+    while path.snapshots[-1].count > (1 - most / 1000) * count and path.snapshots[-1].count > 16:
         path.descend(keep)
     rows: list[dict[str, Cell]] = []
     for snapshot in path.snapshots[1:]:
