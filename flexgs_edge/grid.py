@@ -281,8 +281,10 @@ def steps_of(comments: Sequence[str]) -> Steps | None:
     for words in comments:
         if words.startswith(_COMMENT):
             try:
-                return Steps.from_json(json.loads(words.removeprefix(_COMMENT)))
-            except (InputError, ValueError, TypeError, KeyError, AttributeError):
+                with np.errstate(over="ignore"):  # a step beyond float32 is infinite, and refused
+                    return Steps.from_json(json.loads(words.removeprefix(_COMMENT)))
+            # Anybody may have written it: lists a thousand deep, integers beyond floats.
+            except (InputError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError):
                 return None
     return None
 

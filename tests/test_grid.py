@@ -202,4 +202,7 @@ def test_comments_that_say_nothing_of_a_grid(words: str) -> None:
 def test_comments_of_senseless_steps() -> None:
     record = {**STEPS.to_json(), "position": -1.0}
     assert steps_of((f"flexgs-edge grid {json.dumps(record)}",)) is None
-    assert steps_of((f"flexgs-edge grid {json.dumps({**record, 'position': None})}",)) is None
+    for senseless in (None, 1e300, 10**400, "wide", [1.0]):
+        assert steps_of((f"flexgs-edge grid {json.dumps({**record, 'position': senseless})}",)) is None
+    assert steps_of((f"flexgs-edge grid {json.dumps({**record, 'sh': 7})}",)) is None
+    assert steps_of(("flexgs-edge grid " + "[" * 100_000,)) is None

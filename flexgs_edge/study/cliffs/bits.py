@@ -112,9 +112,8 @@ def groups(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
     for name in bench.progress.track(ORDERS, "groups", len(ORDERS)):
         turned = source.select(orders[name]) if name != "file" else source
         evaluator = _evaluator(bench, turned, bench.has_sh[orders[name]])
-        for share in amounts.group_rows:
-            together = min(share or count, count)
-            evaluator.groups = max(count // together, 1)
+        for ranges in dict.fromkeys(max(count // (share or count), 1) for share in amounts.group_rows):
+            evaluator.groups, together = ranges, count // ranges
             rows.append(
                 {"order": name, "together": together, **of_choice(bench, lambda: evaluator).cells(bench)}  # noqa: B023
             )
@@ -154,7 +153,7 @@ def _losses(rows: Sequence[Row]) -> list[float]:
 def _reordered(grid: GridScene, order: np.ndarray) -> GridScene:
     """The grid of the same rows, handed over in another order."""
     planes = {name: values[:, order] for name, values in from_grid(grid).items()}
-    return to_grid(planes, grid.sh_degrees[order], grid.steps, grid.origin)[0]
+    return to_grid(planes, grid.sh_degrees[order], grid.steps, grid.origin, rename=False)[0]
 
 
 def _evaluator(bench: Bench, source: SceneSource, has_sh: np.ndarray, bits: BitSpec = PAPER) -> SceneEvaluator:

@@ -31,7 +31,7 @@ BY_MULTIPLIER, SIZE_BY_MULTIPLIER = 0.6, -0.45
 MIDDLE, BYTES = 1e-4, 500_000
 """Multiplier that loses 1 dB, and the bytes that it takes."""
 FARTHEST = 1e5
-"""The multipliers that the best possible is looked for among go so far to both sides."""
+"""Beyond so many times the middle nothing is left to remove."""
 SEEDS = 5
 TOLERATED = 1.01
 """A loss so many times the limit still holds: more than rounding, less than anybody sees."""
@@ -99,12 +99,12 @@ class World:
         return _measurement(self.curve.measured(self.place(choice), self.seed, (choice.prune, choice.sh)))
 
     def size_at(self, multiplier: float) -> int:
-        """Bytes at a multiplier."""
-        return round(BYTES * (multiplier / MIDDLE) ** SIZE_BY_MULTIPLIER)
+        """Bytes at a multiplier: no fewer than at the farthest."""
+        return round(BYTES * min(multiplier / MIDDLE, FARTHEST) ** SIZE_BY_MULTIPLIER)
 
     def place_at(self, multiplier: float) -> float:
         """Log of the smooth loss at a multiplier: never less than that of the whole scene."""
-        return max(BY_MULTIPLIER * math.log(multiplier / MIDDLE), GENTLEST)
+        return max(BY_MULTIPLIER * math.log(min(multiplier / MIDDLE, FARTHEST)), GENTLEST)
 
     def measure_at(self, multiplier: float) -> Measurement:
         """What a search is told of a multiplier."""
