@@ -60,8 +60,8 @@ class Series:
         Figures of the paper and not of this run: grey, open marks.
     notes : sequence of str
         Words beside the points.
-    broken : float, optional
-        The x of the first point at which what is shown has broken: crossed out, at the head of the chart if it has no y.
+    broken : sequence of float
+        Where what is shown has broken: points that are crossed out, at the head of the chart if they have no y.
     """
 
     label: str
@@ -70,7 +70,7 @@ class Series:
     line: bool = True
     published: bool = False
     notes: Sequence[str] = ()
-    broken: float | None = None
+    broken: Sequence[float] = ()
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class BarChart:
     bars : dict
         One value a group, by label.
     limit : float, optional
-        A level to mark; bars that pass it are crossed.
+        A level to mark; bars that pass it get a cross.
     """
 
     title: str
@@ -265,8 +265,8 @@ def _lines(axes: Axes, chart: LineChart) -> None:
             clip_on=False,  # marks at zero are shown whole
             **style,
         )
-        if series.broken is not None:
-            _cross(axes, series.broken, next((y for x, y, _ in points if x == series.broken), None), style["color"])
+        for place in series.broken:
+            _cross(axes, place, next((y for x, y, _ in points if x == place), None), style["color"])
         for x, y, i in points:
             if series.notes:
                 words = series.notes[i]
@@ -354,13 +354,9 @@ def _bars(axes: Axes, chart: BarChart) -> None:
         left = [group - 0.4 + (number + 0.5) * width for group in range(len(chart.groups))]
         shown = [value or 0.0 for value in values]
         bars = axes.bar(left, shown, width * 0.94, color=COLOURS[number], label=label)
-        if chart.limit is not None:
-            for bar, value in zip(bars, shown):
-                bar.set_hatch("xx" if value > chart.limit else "")
-                bar.set_edgecolor("white")
         axes.bar_label(
             bars,
-            ["-" if value is None else f"{value:.{chart.digits}f}" for value in values],
+            [_bar_words(value, chart) for value in values],
             padding=2,
             fontsize=7.5,
             color=INK,
@@ -374,6 +370,13 @@ def _bars(axes: Axes, chart: BarChart) -> None:
     axes.set_ylabel(chart.y_label)
     if len(chart.bars) > 1:
         axes.legend()
+
+
+def _bar_words(value: float | None, chart: BarChart) -> str:
+    if value is None:
+        return "-"
+    beyond = chart.limit is not None and value > chart.limit
+    return ("\N{MULTIPLICATION SIGN}\n" if beyond else "") + f"{value:.{chart.digits}f}"
 
 
 def _plane(figure: Figure, axes: Axes, chart: PlaneChart) -> None:

@@ -149,7 +149,7 @@ def _along_the_path(bench: Bench, path: PrunePath, amounts: Amounts, place: Path
         made += [bits.rounding(bench, ours, amounts), bits.groups(bench, ours, amounts), strays(bench, ours, amounts)]
     with part("views"):
         made.append(removal.views(bench, amounts))
-        if amounts.halves and (sides := removal.halves(bench, ours, amounts)) is not None:
+        if amounts.halves and (sides := removal.halves(bench, ours)) is not None:
             made.append(sides)
     with part("held-out views"):
         made.append(held_out(bench, path, contenders, amounts))

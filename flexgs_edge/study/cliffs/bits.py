@@ -66,7 +66,7 @@ def rounding(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
             "ratio to the PLY",
             f"loss: {bench.plan.judge} (dB)",
             (
-                *(curve(part, method, "ratio", notes=None) for method, part in parts.items()),
+                *(curve(part, method, "ratio") for method, part in parts.items()),
                 curve([row for row in rows if row["method"] == MPQ], MPQ, "ratio", line=False),
                 curve(own, f"{BEST}, coarser grids", "ratio"),
             ),

@@ -121,19 +121,16 @@ def number(row: Row, column: str) -> float:
     return float(value)
 
 
-def curve(
-    rows: Sequence[Row], label: str, x: str, y: str = "loss", notes: str | None = None, line: bool = True
-) -> Series:
-    """Rows as a series that is marked where it breaks first; points that ended in an error have no place on it."""
+def curve(rows: Sequence[Row], label: str, x: str, y: str = "loss", line: bool = True, every: bool = False) -> Series:
+    """Rows as a series that is marked where it breaks first, or everywhere; points that ended in an error have no y."""
     shown = [row for row in rows if row[x] is not None]
-    broken = next((number(row, x) for row in shown if row["broke"] is not None), None)
+    broken = [number(row, x) for row in shown if row["broke"] is not None]
     return Series(
         label,
         [number(row, x) for row in shown],
         [None if row[y] is None else number(row, y) for row in shown],
         line=line,
-        notes=[str(row[notes]) for row in shown] if notes else (),
-        broken=broken,
+        broken=broken if every else broken[:1],
     )
 
 

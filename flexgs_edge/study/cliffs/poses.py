@@ -233,7 +233,7 @@ def _by_distance(rows: list[dict[str, Cell]], contenders: Contenders, base: floa
             "Poses nearer and farther than any that was scored",
             "distance to what the pose looks at, times",
             "fidelity (dB)",
-            tuple(curve(part, name, "amount", "fidelity") for name, part in series.items()),
+            tuple(curve(part, name, "amount", "fidelity", every=True) for name, part in series.items()),
             limit=round(base - BREAK, 2) if math.isfinite(base) else None,
             doublings=True,
             floating=True,

@@ -11,6 +11,7 @@ from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.path import PrunePath
 from flexgs_edge.bitspec import BitSpec
 from flexgs_edge.cameras import Camera
+from flexgs_edge.pipeline.best import SETTINGS_MOST
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.prune import Choice, order_from_scores
 from flexgs_edge.render.quality import ViewQuality
@@ -182,7 +183,7 @@ def longest_axis(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
     return axis, float(np.median(places @ axis))
 
 
-def halves(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment | None:
+def halves(bench: Bench, ours: Whole) -> Experiment | None:
     """Scores from one half of the training poses, judged on held-out views of that half and of the other."""
     cameras = bench.views.of(bench.views.train)
     axis, middle = longest_axis(cameras)
@@ -209,7 +210,7 @@ def halves(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment | None:
             assert found.quality is not None
             add(f"paper, {score}", scored, found.quality.views)
     with walked(bench, bench.scene.source, some) as path:
-        half = search(bench, path, MaxSize(ours.size + _ROOM, bench.plan.judge))
+        half = search(bench, path, MaxSize(ours.size + SETTINGS_MOST, bench.plan.judge))
     for scored, whole in (("all", ours), ("one half", half)):
         found = of_source(bench, lambda: (whole.size, whole.source))  # noqa: B023
         assert found.quality is not None
@@ -237,10 +238,6 @@ def halves(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment | None:
         ),
         tuple(_one_side(rows, method) for method in methods),
     )
-
-
-_ROOM = 1536
-"""Bytes for the header's settings that the search counts (`pipeline.best.SETTINGS_MOST`) and sizes here do not."""
 
 
 def _one_side(rows: Sequence[Row], method: str) -> str:
