@@ -33,7 +33,7 @@ def command(scene: str, output: str, quick: bool, json_path: str | None, quiet: 
 
     \b
     bits, groups, strays   fewer bits, other groups and orders of rows, stray values
-    pruning, views, halves more removed, by nine ways; scores from few views, or
+    pruning, views, halves more removed, in eight ways; scores from few views, or
                            from one side
     heldout, distance,     the worst view; poses nearer, farther, between and above
     poses                  the path, other lenses and sizes; the worst tile

@@ -16,8 +16,7 @@ from flexgs_edge.study.pruning import nearest
 BEST, PAPER, RTN, ROWS, SH = "best", "paper", "RTN, 8 bits", "rows only", "SH only"
 WORDS = (
     f"best and paper: the results at the study's target. {RTN}: one range a channel, nothing removed. {ROWS}, {SH}: "
-    f"the paper's bits, "
-    "and Gaussians or SH alone removed by gs, to paper's bytes or as near as they come."
+    "the paper's bits, and Gaussians or SH alone removed by gs, to paper's bytes or as near as they come."
 )
 
 

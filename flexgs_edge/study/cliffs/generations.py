@@ -103,9 +103,8 @@ def generations(bench: Bench, path: PrunePath, ours: Whole, amounts: Amounts, fo
         "generations",
         "Generation after generation",
         "Compressed, decompressed to a PLY and compressed again, each time to the bytes of the first file, judged "
-        "against the first "
-        f"original. {RTN}: one range a channel. {IN_A_ROW}: first to {FIRST_TIMES:g} times the bytes, then what that "
-        "decompresses to, to the bytes of the first generation.",
+        f"against the first original. {RTN}: one range a channel. {IN_A_ROW}: first to {FIRST_TIMES:g} times the "
+        "bytes, then what that decompresses to, to the bytes of the first generation.",
         table,
         LineChart(
             "Loss of every generation",
@@ -171,8 +170,8 @@ def _beyond(rows: list[dict[str, Cell]], name: str) -> str:
     beyond = number(last, "loss") - number(first, "loss")
     return (
         f"{name}: generation {last['generation']} loses {beyond:+.3f} dB against the first ({last['loss']} and "
-        f"{first['loss']} dB, "
-        f"{last['size']} and {first['size']} bytes): {'within' if beyond <= MOST_LOSS else 'NOT within'} {MOST_LOSS:g} dB."
+        f"{first['loss']} dB, {last['size']} and {first['size']} bytes): "
+        f"{'within' if beyond <= MOST_LOSS else 'NOT within'} {MOST_LOSS:g} dB."
     )
 
 

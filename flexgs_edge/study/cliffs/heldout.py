@@ -66,8 +66,8 @@ def held_out(bench: Bench, path: PrunePath, contenders: Contenders, amounts: Amo
         "heldout",
         "The worst view, and views that decided nothing",
         f"The {len(cameras)} held-out views one by one, against {views}. A worst view within {WORST_TIMES:g} times "
-        f"the mean and "
-        f"{WORST_MORE:g} dB more counts as within. {EVEN}: the search stops by the first, third, ... of them; the "
+        f"the mean and {WORST_MORE:g} dB more counts as within. {EVEN}: the search stops by the first, third, ... of "
+        "them; the "
         f"others decided nothing. " + WORDS,
         table,
         BarChart(
@@ -148,10 +148,9 @@ def _words(row: Row) -> str:
         apart = number(row, "odd") - number(row, "even")
         gap = f" Odd views lose {apart:+.3f} dB against even ones ({row['odd']} and {row['even']} dB)."
     return (
-        f"{row['method']}: mean {row['loss']} dB, worst view {row['view']} {row['worst']} dB, allowed {row['allowed']} dB: "
-        f"{'within' if row['within'] else 'NOT within'}; worst tile {row['tile']} dB ({row['tile_view']}); fidelity "
-        f"{row['fidelity']} dB, "
-        f"at training poses {row['training']} dB.{gap}"
+        f"{row['method']}: mean {row['loss']} dB, worst view {row['view']} {row['worst']} dB, allowed "
+        f"{row['allowed']} dB: {'within' if row['within'] else 'NOT within'}; worst tile {row['tile']} dB "
+        f"({row['tile_view']}); fidelity {row['fidelity']} dB, at training poses {row['training']} dB.{gap}"
     )
 
 

@@ -209,9 +209,9 @@ def poses(bench: Bench, contenders: Contenders, amounts: Amounts) -> list[Experi
 
 
 _LOOK = (
-    f"Fidelity to the original's renders, mean over the views, of the worst view and of the worst tile of "
-    f"{TILE_SIDE}x{TILE_SIDE} pixels; "
-    f"a method has broken where it is more than {BREAK:g} dB below its own at training poses. "
+    "Fidelity to the original's renders, mean over the views, of the worst view and of the worst tile of "
+    f"{TILE_SIDE}x{TILE_SIDE} pixels; a method has broken where it is more than {BREAK:g} dB below its own at "
+    "training poses. "
 )
 
 
@@ -267,8 +267,7 @@ def _by_kind(rows: list[dict[str, Cell]], contenders: Contenders) -> Experiment:
         tiles = {row["poses"]: row["tile"] for row in own if row["poses"] in (TRAINING, HELD_OUT)}
         findings.append(
             f"{name}: {'broken at ' + ', '.join(broken) if broken else 'stands everywhere'}; worst tile "
-            f"{tiles[TRAINING]} dB at "
-            f"training poses, {tiles[HELD_OUT]} dB at held-out ones."
+            f"{tiles[TRAINING]} dB at training poses, {tiles[HELD_OUT]} dB at held-out ones."
         )
     return Experiment(
         "poses",

@@ -68,12 +68,10 @@ def pruning(bench: Bench, path: PrunePath, amounts: Amounts) -> Experiment:
         "pruning",
         "More and more removed",
         "Gaussians go in the order of a score, all values in 16 bits in sub-groups, so that only removal loses "
-        "anything. gs: the "
-        "paper's score; meson: MesonGS's; dSE: the measured squared error of removing each alone. SH only: every "
-        "Gaussian stays and "
-        "the SH of a share go, by gs. best's path: removed in rounds, costs measured again and colours refitted after "
-        "each; its "
-        "bytes are those of 16 bits a value, for the share that stays.",
+        "anything. gs: the paper's score; meson: MesonGS's; dSE: the measured squared error of removing each alone. "
+        "SH only: every Gaussian stays and the SH of a share go, by gs. best's path: removed in rounds, costs "
+        "measured again and colours refitted after each; its bytes are those of 16 bits a value, for the share that "
+        "stays.",
         table,
         LineChart(
             "Removing more and more: where each score breaks",
@@ -139,10 +137,9 @@ def views(bench: Bench, amounts: Amounts) -> Experiment:
         "views",
         "Too few views",
         f"Scores from some of the {count} training poses, each next one farthest from those before it, or the first "
-        f"ones by name; "
-        f"then the paper's method removes p = {choice.prune / 1000:g} and the SH of s = {choice.sh / 1000:g}, so all "
-        f"files have one "
-        "size. removal: measured costs. What no scored pose sees has no score, and goes first.",
+        f"ones by name; then the paper's method removes p = {choice.prune / 1000:g} and the SH of s = "
+        f"{choice.sh / 1000:g}, so all files have one size. removal: measured costs. What no scored pose sees has no "
+        "score, and goes first.",
         table,
         LineChart(
             "Views scored, and what they are worth at one size",
@@ -221,8 +218,8 @@ def halves(bench: Bench, ours: Whole) -> Experiment | None:
         "halves",
         "Scored from one side",
         f"{len(some)} of the {len(cameras)} training poses, those on one side of the middle of the path, score (for "
-        f"best also refit "
-        "the colours), at one size for each method; held-out views of that side and of the other judge.",
+        "best also refit the colours), at one size for each method; held-out views of that side and of the other "
+        "judge.",
         table,
         BarChart(
             "Scored from one side, judged on both",
@@ -245,8 +242,8 @@ def _one_side(rows: Sequence[Row], method: str) -> str:
     end = "breaks there" if half["broke"] else "stands"
     return (
         f"{method}: scored from one side it loses {number(half, 'other'):.2f} dB on the other and "
-        f"{number(half, 'same'):.2f} dB on "
-        f"its own ({number(whole, 'other'):.2f} and {number(whole, 'same'):.2f} dB from all poses): it {end}."
+        f"{number(half, 'same'):.2f} dB on its own ({number(whole, 'other'):.2f} and {number(whole, 'same'):.2f} dB "
+        f"from all poses): it {end}."
     )
 
 

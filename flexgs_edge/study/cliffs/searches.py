@@ -235,13 +235,11 @@ def searches(effort: str) -> Experiment:
     return Experiment(
         "search",
         "The searches on curves that scenes need not have",
-        "Three searches over a pretended scene whose loss is a known function of what is removed: smooth, with waves "
-        "(more compression "
-        "may lose less), in steps, nearly flat, with a cliff at the target, and measured with noise, as from a sample "
-        "of tiles (the worst "
-        f"of {SEEDS} draws). A search fails where it takes {100 * FAR:g} % more bytes than the best possible, misses "
-        f"a target that can be "
-        "met, or says that one holds which does not.",
+        "Three searches over a pretended scene whose loss is a known function of what is removed: smooth, with "
+        "waves (more compression may lose less), in steps, nearly flat, with a cliff at the target, and measured "
+        f"with noise, as from a sample of tiles (the worst of {SEEDS} draws). A search fails where it takes "
+        f"{100 * FAR:g} % more bytes than the best possible, misses a target that can be met, or says that one holds "
+        "which does not.",
         table,
         BarChart(
             "Bytes beyond the best possible at 1 dB",

@@ -100,12 +100,10 @@ def strays(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
     return Experiment(
         "strays",
         "Stray values",
-        f"{len(strays_of(planes, 1.0, np.zeros(3))['means'][0])} Gaussians are added where no camera looks, each with "
-        f"one attribute "
-        f"so many standard deviations away from all others, and all of them so far from the scene. RTN with {BITS} "
-        f"bits and the "
-        "paper's bits, nothing removed; best with the rows that it keeps and the strays. Views are those without strays."
-        + note,
+        f"{len(strays_of(planes, 1.0, np.zeros(3))['means'][0])} Gaussians are added where no camera looks, each "
+        "with one attribute so many standard deviations away from all others, and all of them so far from the "
+        f"scene. RTN with {BITS} bits and the paper's bits, nothing removed; best with the rows that it keeps and "
+        "the strays. Views are those without strays." + note,
         table,
         BarChart(
             "A few stray values, and what they cost all others",
