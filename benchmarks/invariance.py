@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -23,104 +23,17 @@ from flexgs_edge.best.search import RateSearch, RateStep
 from flexgs_edge.cameras import Camera, read_cameras
 from flexgs_edge.cameras.inria import inria_json
 from flexgs_edge.constants import DEFAULT_NEAR
-from flexgs_edge.kernels.twins.project import sh_basis
 from flexgs_edge.pipeline.best import GridCoder, grid_search
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.progress import Progress
 from flexgs_edge.scene import write_ply
-from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.ply import PlySource
-from flexgs_edge.scene.source import MemorySource, SceneSource
+from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.study.cliffs.similarity import Similarity
 
 LEAST_SAME, MOST_BYTES = 0.99, 0.02
 """Share of the kept Gaussians that must be the same, and difference of the bytes that is allowed."""
-
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """x' = factor * turn @ x + shift.
-
-    Parameters
-    ----------
-    factor : float
-    turn : np.ndarray
-        [4] f64, unit quaternion w x y z.
-    shift : np.ndarray
-        [3] f64.
-    """
-
-    factor: float
-    turn: np.ndarray
-    shift: np.ndarray
-
-    @classmethod
-    def drawn(cls, factor: float, seed: int = 0) -> Similarity:
-        """With a turn and a shift (of about 3 units of the new scene) drawn at random."""
-        rng = np.random.default_rng(seed)
-        turn = rng.normal(size=4)
-        return cls(factor, turn / np.linalg.norm(turn), 3 * factor * rng.normal(size=3))
-
-    @property
-    def matrix(self) -> np.ndarray:
-        """[3, 3] f64: the rotation."""
-        w, x, y, z = self.turn
-        rows = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return np.array(rows)
-
-    def scene(self, source: SceneSource) -> MemorySource:
-        """The scene moved: positions, sizes, rotations and the SH, which turn degree by degree."""
-        planes = source.read(slice(0, source.count), list(FIELD))
-        means = planes["means"].astype(np.float64) + source.origin[:, None]
-        moved = {
-            **planes,
-            "means": self.factor * (self.matrix @ means),
-            "log_scales": planes["log_scales"] + np.log(self.factor),
-            "quats": _product(self.turn, planes["quats"].astype(np.float64)),
-        }
-        rest = planes["sh_rest"].reshape(3, sh_rest_count(source.sh_degree), source.count)
-        turned = rest.astype(np.float64)
-        for degree in range(1, source.sh_degree + 1):
-            band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
-            turned[:, band] = turn_of_band(self.matrix, degree) @ rest[:, band]
-        moved["sh_rest"] = turned.reshape(planes["sh_rest"].shape)
-        return MemorySource(
-            {name: values.astype(np.float32) for name, values in moved.items()}, source.sh_degree, self.shift
-        )
-
-    def camera(self, camera: Camera) -> Camera:
-        """The same view of the moved scene."""
-        rotation = camera.rotation @ self.matrix.T
-        return replace(camera, rotation=rotation, translation=self.factor * camera.translation - rotation @ self.shift)
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[4, n] Hamilton products of one quaternion ([4]) and many ([4, n])."""
-    w, x, y, z = a
-    matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    product: np.ndarray = matrix @ b
-    return product
-
-
-def turn_of_band(matrix: np.ndarray, degree: int) -> np.ndarray:
-    """[2l + 1, 2l + 1] f64: SH coefficients of one degree after the world was turned by `matrix`.
-
-    Fitted by least squares: a colour seen along d before is seen along `matrix @ d` after, and functions of one degree stay
-    functions of that degree.
-    """
-    directions = np.random.default_rng(degree).normal(size=(3, 200))
-    directions /= np.linalg.norm(directions, axis=0)
-    band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
-    before = np.array(sh_basis(degree, *directions)[band]).T
-    after = np.array(sh_basis(degree, *(matrix @ directions))[band]).T
-    fitted, *_ = np.linalg.lstsq(after, before, rcond=None)
-    check(bool(np.abs(after @ fitted - before).max() < 1e-6), f"SH of degree {degree} turn into SH of that degree")
-    result: np.ndarray = fitted
-    return result
 
 
 def write_project(folder: Path, source: SceneSource, cameras: Sequence[Camera], images: Path | None) -> Path:
@@ -167,7 +80,7 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
         result = compress(path, output, method="best", near=near, force=True, progress=progress, **words)
     assert result.search is not None
     chosen = steps[result.search.steps.index(result.search.chosen)]
-    rows = searches[0].kept(chosen.multiplier).rows
+    rows = searches[0].path.scene_rows(searches[0].kept(chosen.multiplier).rows)
     check(len(rows) == result.count, "the rows of the file")
     return Found(searches[0], chosen.multiplier, np.sort(rows), result.size)
 
@@ -208,7 +121,7 @@ def compare(
     )
     first = compress_and_look(source.path, scratch / "first.fgs", DEFAULT_NEAR, progress, **words)
     second = compress_and_look(moved, scratch / "second.fgs", DEFAULT_NEAR * factor, progress, **words)
-    choice = second.search.kept(first.multiplier).rows
+    choice = second.search.path.scene_rows(second.search.kept(first.multiplier).rows)
     note = f"{len(first.rows)} and {len(second.rows)} Gaussians, {first.size} and {second.size} bytes"
     return Likeness(_same(first.rows, second.rows), second.size / first.size, _same(first.rows, choice)), note
 

@@ -7,6 +7,7 @@ machine gets the same bits.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -21,6 +22,7 @@ from flexgs_edge.scratch import MEMORY, Room, blocks, stable_order
 
 POSITION_BITS = 21
 """Cells along an axis of a scene as a power of two: three of them fill a 63-bit curve index."""
+_COMMENT = "flexgs-edge grid "
 
 Planes = Mapping[str, np.ndarray]
 
@@ -169,6 +171,7 @@ def to_grid(
     origin: np.ndarray | Sequence[float],
     layer: np.ndarray | None = None,
     room: Room = MEMORY,
+    rename: bool = True,
 ) -> tuple[GridScene, np.ndarray]:
     """Put a scene on its grid.
 
@@ -189,6 +192,8 @@ def to_grid(
         [n], 0 to 255.
     room : Room, optional
         Where the grid goes.
+    rename : bool
+        Look for that form; False leaves rotations and scales as they are.
 
     Returns
     -------
@@ -211,7 +216,9 @@ def to_grid(
     ordered = _Ordered(planes, order, room)
     for part in blocks(count):
         rows = order[part]
-        quats, log_scales = canonical_axes(ordered.of("quats", part), ordered.of("log_scales", part))
+        quats, log_scales = ordered.of("quats", part), ordered.of("log_scales", part)
+        if rename:
+            quats, log_scales = canonical_axes(quats, log_scales)
         scale[:, part] = _codes("log_scales", log_scales, steps.scale, rows)
         rotation[:, part] = _codes("quats", quats[1:], steps.rotation, rows)
         opacity[part] = _codes("opacity_logits", ordered.of("opacity_logits", part), steps.opacity, rows)[0]
@@ -302,6 +309,55 @@ def from_grid(
         "quats": lambda: _quats(_values(grid.rotation[:, rows], steps.rotation)),
     }
     return {field: makers[field]() for field in fields}
+
+
+def grid_comment(steps: Steps) -> str:
+    """What a PLY says of the grid that its values lie on."""
+    return f"{_COMMENT}{json.dumps(steps.to_json())}"
+
+
+def steps_of(comments: Sequence[str]) -> Steps | None:
+    """The steps that such a comment holds; None without one that can be read."""
+    for words in comments:
+        if words.startswith(_COMMENT):
+            try:
+                with np.errstate(over="ignore"):  # a step beyond float32 is infinite, and refused
+                    return Steps.from_json(json.loads(words.removeprefix(_COMMENT)))
+            # Anybody may have written it: lists a thousand deep, integers beyond floats.
+            except (InputError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError):
+                return None
+    return None
+
+
+def on_grid(planes: Planes, steps: Steps, origin: np.ndarray) -> GridScene | None:
+    """The grid that values lie on, if every one of them lies on it to the bit: nothing is lost by taking it.
+
+    Parameters
+    ----------
+    planes : mapping
+        {field: [width, n] f32}, finite.
+    steps : Steps
+        What a comment says: it may be of other values.
+    origin : np.ndarray
+        [3] f64.
+    """
+    rest = planes["sh_rest"]
+    bands = rest.reshape(3, len(rest) // 3, rest.shape[1])
+    degrees = np.zeros(rest.shape[1], np.uint8)
+    for degree in range(1, MAX_SH_DEGREE + 1):
+        degrees[bands[:, degree * degree - 1 : (degree + 1) ** 2 - 1].any(axis=(0, 1))] = degree
+    try:
+        grid, order = to_grid(planes, degrees, steps, origin, rename=False)
+    except InputError:
+        return None
+    for name, values in from_grid(grid).items():
+        given = planes[name][:, order]
+        # Coefficients are channel by channel: those of degrees that no row has are zero, and left out.
+        if name == "sh_rest":
+            given = bands[:, : sh_rest_count(grid.sh_degree), order].reshape(values.shape)
+        if not np.array_equal(values, given):
+            return None
+    return grid
 
 
 def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:

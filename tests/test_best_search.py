@@ -232,6 +232,18 @@ def test_unseen_gaussians_stay() -> None:
     assert found.reached and all(tuple(p) in kept for p in positions.T.tolist())
 
 
+def test_unseen_gaussians_that_would_coarsen_the_grid_go() -> None:
+    calm, astray = FakePath(unseen=60), FakePath(unseen=60)
+    astray.snapshots[0].planes["means"][:, 7] = 1e7
+    steps, counts = zip(
+        *(
+            (found.product.steps, found.product.count)
+            for found in (search(powers(), MaxDrop(1.0), path) for path in (calm, astray))
+        )
+    )
+    assert steps[0] == steps[1] and counts[1] == counts[0] - 1
+
+
 @pytest.mark.parametrize("count", [1, 2, 15, 17])
 @pytest.mark.parametrize("target", [MaxDrop(1.0), MaxSize(3000, "drop")])
 def test_few_gaussians(count: int, target: Target) -> None:

@@ -8,7 +8,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from flexgs_edge.best.steps import GEOMETRY, VALUES, Slopes, choose_steps, probe_slopes
+from flexgs_edge.best.steps import GEOMETRY, VALUES, Slopes, choose_steps, holdable, probe_slopes, reachable
 from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.grid import Steps
@@ -127,3 +127,20 @@ def test_a_slope_predicts_the_error_of_a_step() -> None:
             images.append([renderer.render(loaded, camera).astype(np.float64) for camera in cameras])
     error = sum(float(((a - b) ** 2).sum()) for a, b in zip(*images, strict=True))
     assert error == pytest.approx(slopes.per_row["opacity"] * 150 * 0.05**2, rel=0.6)
+
+
+def test_far_rows_that_nobody_sees_are_out_of_reach() -> None:
+    planes = {name: values.copy() for name, values in scene().items()}
+    steps = steps_at(1e-3, slopes=probe(planes, views()))
+    seen = np.ones(planes["means"].shape[1], bool)
+    assert reachable(steps, planes, seen).all()
+    planes["means"][0, 3] = 1e7 * steps.position
+    planes["sh_dc"][1, 4] = 1e8 * steps.dc
+    planes["opacity_logits"][0, 5] = -1e8 * steps.opacity
+    # What is seen stays, and coarsens the grid; the same unseen goes, and the grid is as fine as it was.
+    assert reachable(steps, planes, seen).all() and holdable(steps, planes).position > 4 * steps.position
+    seen[:6] = False
+    keep = reachable(steps, planes, seen)
+    assert np.flatnonzero(~keep).tolist() == [3, 4, 5]
+    assert holdable(steps, {name: values[:, keep] for name, values in planes.items()}) == steps
+    assert reachable(steps, planes, np.zeros_like(seen)).all()

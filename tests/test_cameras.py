@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexgs_edge.cameras import Camera, limit_width, read_cameras, split_views
+from flexgs_edge.cameras.order import farthest_order
 from flexgs_edge.errors import InputError
 from synthetic import look_from, make_camera
 
@@ -151,3 +153,19 @@ def test_paths_that_are_no_cameras(tmp_path: Path, name: str, words: str) -> Non
         (tmp_path / file).touch()
     with pytest.raises(InputError, match=words):
         read_cameras(tmp_path / name)
+
+
+def test_rotations_of_six_digits_far_from_the_origin() -> None:
+    """By the transpose, the place was off by a unit 10^6 units away, and poses were scored in another order."""
+    rotation = np.round(look_from(3)[0], 6)
+    place = np.array([1e6, -2e6, 3e5])
+    camera = make_camera(rotation=rotation, translation=tuple(-rotation @ place))
+    assert np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-8
+    np.testing.assert_allclose(camera.center, place, rtol=1e-13)
+    # Written and read again it still looks at the same things.
+    np.testing.assert_allclose(-rotation @ camera.center, camera.translation, rtol=1e-13)
+    near = [
+        make_camera(rotation=np.round(look_from(i)[0], 6), translation=look_from(i)[1], name=str(i)) for i in range(12)
+    ]
+    far = [replace(camera, translation=camera.translation - camera.rotation @ place) for camera in near]
+    assert farthest_order(far) == farthest_order(near)

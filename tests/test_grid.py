@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.grid import GridScene, Steps, from_grid, morton, to_grid
+from flexgs_edge.grid import GridScene, Steps, from_grid, grid_comment, morton, on_grid, steps_of, to_grid
 from flexgs_edge.rotations import canonical_axes
 from grid_scenes import STEPS, make_grid, make_planes
 
@@ -163,3 +164,45 @@ def test_steps_through_json() -> None:
     assert steps.position == float(np.float32(0.1))
     assert Steps.from_json(json.loads(json.dumps(steps.to_json()))) == steps
     assert isinstance(make_grid(3), GridScene)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_values_of_a_grid_are_found_on_it_again(degree: int) -> None:
+    grid = make_grid(300, degree, 17)
+    planes = from_grid(grid)
+    steps = steps_of(("flexgs-edge knows", grid_comment(grid.steps)))
+    assert steps == grid.steps
+    order = np.random.default_rng(3).permutation(300)
+    again = on_grid({name: values[:, order] for name, values in planes.items()}, grid.steps, grid.origin)
+    assert again is not None and again.steps.sh == grid.steps.sh[: again.sh_degree]
+    for name, values in from_grid(again).items():
+        np.testing.assert_array_equal(values, planes[name][: len(values)] if name != "sh_rest" else values)
+    np.testing.assert_array_equal(again.rotation, grid.rotation)
+    np.testing.assert_array_equal(again.dc, grid.dc)
+
+
+@pytest.mark.parametrize("field", ["means", "quats", "sh_dc", "log_scales", "opacity_logits"])
+def test_values_that_were_changed_lie_on_no_grid(field: str) -> None:
+    grid = make_grid(60, 1, 18)
+    planes = from_grid(grid)
+    planes[field][-1, 7] = np.nextafter(planes[field][-1, 7], np.float32(9))
+    assert on_grid(planes, grid.steps, grid.origin) is None
+    # Steps of another scene: nothing fits, and codes may be out of range.
+    tiny = replace(grid.steps, position=1e-20)
+    assert on_grid(from_grid(grid), tiny, grid.origin) is None
+
+
+@pytest.mark.parametrize(
+    "words", ["flexgs-edge grid", "flexgs-edge grid {", "flexgs-edge grid [1]", 'flexgs-edge grid {"position": 1}', "x"]
+)
+def test_comments_that_say_nothing_of_a_grid(words: str) -> None:
+    assert steps_of((words,)) is None and steps_of(()) is None
+
+
+def test_comments_of_senseless_steps() -> None:
+    record = {**STEPS.to_json(), "position": -1.0}
+    assert steps_of((f"flexgs-edge grid {json.dumps(record)}",)) is None
+    for senseless in (None, 1e300, 10**400, "wide", [1.0]):
+        assert steps_of((f"flexgs-edge grid {json.dumps({**record, 'position': senseless})}",)) is None
+    assert steps_of((f"flexgs-edge grid {json.dumps({**record, 'sh': 7})}",)) is None
+    assert steps_of(("flexgs-edge grid " + "[" * 100_000,)) is None

@@ -114,3 +114,19 @@ def test_memory_follows_the_chunk_not_the_scene(tmp_path: Path) -> None:
         tracemalloc.stop()
     # A chunk as planes (236 B a row), as rows (248 B) and the reader's block of 1000 rows; the file has 8.2 MB.
     assert peak < 1.2e6
+
+
+def test_what_a_scene_says_of_its_values_is_kept_and_other_comments_are_not(tmp_path: Path) -> None:
+    source = scene(5, 1)
+    source.comments = ("flexgs-edge grid {}",)
+    write_ply(tmp_path / "a.ply", source)
+    head = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode().splitlines()
+    assert head[:4] == ["ply", "format binary_little_endian 1.0", "comment flexgs-edge grid {}", "element vertex 5"]
+    back = PlySource(tmp_path / "a.ply")
+    assert back.comments == source.comments
+    np.testing.assert_array_equal(
+        back.read(slice(0, 5), ["means"])["means"], source.read(slice(0, 5), ["means"])["means"]
+    )
+    data = (tmp_path / "a.ply").read_bytes().replace(b"comment flexgs-edge grid {}", b"comment of another, \xff")
+    (tmp_path / "b.ply").write_bytes(data)
+    assert PlySource(tmp_path / "b.ply").comments == ()

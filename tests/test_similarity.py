@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.invariance import LEAST_SAME, MOST_BYTES, Similarity, compare, turn_of_band
+from benchmarks.invariance import LEAST_SAME, MOST_BYTES, compare
 from flexgs_edge.best.steps import probe_slopes
 from flexgs_edge.cameras import read_cameras
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.render import Renderer
 from flexgs_edge.scene import open_scene
 from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.study.cliffs.similarity import Similarity, turn_of_band
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, random_scene
 from tiny_project import make_project

@@ -190,7 +190,6 @@ def test_a_ratio_out_of_reach_is_said(bench: Bench, project: Path) -> None:
 
 def test_ranks_decide_who_goes_and_costs_how_many(bench: Bench) -> None:
     order = np.random.default_rng(5).permutation(COUNT)
-    ranks = ranks_from_order(order)
 
     def walk(make: object) -> PrunePath:
         cameras = bench.views.of(bench.views.train)
@@ -201,7 +200,8 @@ def test_ranks_decide_who_goes_and_costs_how_many(bench: Bench) -> None:
             path.descend(0.8)
         return path
 
-    measured = walk(PrunePath).snapshots
+    path = walk(PrunePath)
+    measured, ranks = path.snapshots, ranks_from_order(order)[path.rows]
     ranked = walk(lambda *w, **m: ablations.RankedPath(*w, order=order, **m)).snapshots
     seen = measured[0].costs.weight2 > 0
     assert np.array_equal(np.sort(ranked[0].costs.removal[seen]), np.sort(measured[0].costs.removal[seen]))

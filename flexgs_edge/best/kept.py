@@ -72,3 +72,10 @@ class Kept:
     planes: dict[str, np.ndarray]
     degrees: np.ndarray
     weight2: np.ndarray
+
+    def take(self, keep: np.ndarray) -> Kept:
+        """Some of the rows: [n] bool."""
+        if keep.all():
+            return self
+        planes = {name: np.ascontiguousarray(values[:, keep]) for name, values in self.planes.items()}
+        return Kept(self.snapshot, self.rows[keep], planes, self.degrees[keep], self.weight2[keep])

@@ -136,6 +136,10 @@ class PrunePath:
             costs = RemovalCosts.of(self._parts, room)
         self._add(Snapshot(rows, start, costs), keep_views=True)
 
+    def scene_rows(self, places: np.ndarray) -> np.ndarray:
+        """[n] i64, rows of the scene, ascending, of places on the path (`Snapshot.rows`)."""
+        return np.sort(self.rows[places])
+
     def descend(self, share: float) -> Snapshot:
         """Keep `share` of the last snapshot, measure costs again in the next part of the poses, and mend colours by one step.
 

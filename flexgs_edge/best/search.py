@@ -21,7 +21,7 @@ from flexgs_edge.best.choice import BitModel, choose, drop_bands
 from flexgs_edge.best.effort import Effort
 from flexgs_edge.best.kept import Kept, Mended
 from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
-from flexgs_edge.best.steps import Slopes, choose_steps, holdable, probe_slopes
+from flexgs_edge.best.steps import Slopes, choose_steps, holdable, probe_slopes, reachable
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps, recolour, to_grid, values_of
@@ -312,6 +312,7 @@ class RateSearch(MultiplierSearch[GridScene]):
             # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
             self._slopes = probe_slopes(self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras)
         steps = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
+        kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0))
         return kept, holdable(steps, kept.planes)
 
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:

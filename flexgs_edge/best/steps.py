@@ -139,3 +139,32 @@ def holdable(steps: Steps, planes: dict[str, np.ndarray]) -> Steps:
         sh=tuple(max(step, finest("sh_rest", colours), least) for step in steps.sh),
         chroma=steps.chroma,
     )
+
+
+def reachable(steps: Steps, planes: dict[str, np.ndarray], seen: np.ndarray) -> np.ndarray:
+    """[n] bool: rows that a grid of these steps can hold beside those that some pose sees.
+
+    One Gaussian far away, in no view, would ask for position steps as large as the scene is small beside it: five of them, a
+    million spreads away, cost the sample scene 14.6 dB.
+
+    Parameters
+    ----------
+    planes : dict
+        [width, n] f32 by field.
+    seen : np.ndarray
+        [n] bool; these are always in: `holdable` makes room for them.
+    """
+    if not seen.any():
+        return np.ones(len(seen), bool)
+    means = planes["means"].astype(np.float64)
+    low, high = means[:, seen].min(axis=1), means[:, seen].max(axis=1)
+    room = max((2**POSITION_BITS - 2) * steps.position, float((high - low).max()))
+    inside = np.abs(means - (low + high)[:, None] / 2).max(axis=0) <= room / 2
+    for name, step, codes in (
+        ("log_scales", steps.scale, CODE_LIMIT - 2),
+        ("opacity_logits", steps.opacity, CODE_LIMIT - 2),
+        ("sh_dc", steps.dc, CODE_LIMIT // 4),
+    ):
+        inside &= np.abs(planes[name]).max(axis=0) <= codes * step
+    every: np.ndarray = seen | inside
+    return every

@@ -60,7 +60,9 @@ class Camera:
     @property
     def center(self) -> np.ndarray:
         """[3] f64: where the camera stands in the world."""
-        return -self.rotation.T @ self.translation
+        # Not by the transpose: files keep rotations to six digits, and 1e6 units from the origin that is a unit.
+        place: np.ndarray = np.linalg.solve(self.rotation, -self.translation)
+        return place
 
     def scaled(self, width: int, height: int) -> Camera:
         """The same view at another size in pixels."""

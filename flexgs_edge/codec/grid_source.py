@@ -17,7 +17,7 @@ from flexgs_edge.codec.sections import ChunkEntry
 from flexgs_edge.codec.source import by_chunk
 from flexgs_edge.codec.threads import in_order, thread_count
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds
-from flexgs_edge.grid import CODE_LIMIT, GridScene, from_grid
+from flexgs_edge.grid import CODE_LIMIT, GridScene, from_grid, grid_comment
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
 _ROTATION_STEP_MOST = 2.0**38
@@ -54,6 +54,7 @@ class GridSource(SceneSource):
         # values would decode the file twice more.
         self.valid = header.grid_steps.rotation <= _ROTATION_STEP_MOST
         self.settings: dict[str, Any] = header.settings
+        self.comments = (grid_comment(header.grid_steps),)
         self._model = self.container.read_model()
         self._entries = self.container.read_table()
         self._chunks = header.chunks()

@@ -25,6 +25,7 @@ from flexgs_edge.pipeline.best import (
     GridCoder,
     choose_room,
     grid_search,
+    kept_as_it_is,
     layered,
     open_checkpoint,
     search_best,
@@ -223,7 +224,9 @@ class _Job:
                 kept = open_checkpoint(renderer, self.source, poses.cameras, options, folder)
         LOG.info("searching for %s", plan.target.describe())
         coder = GridCoder(renderer)
-        grid, search = search_best(
+        with self.clock.stage("search"):
+            found = kept_as_it_is(coder, renderer, self.source, decide, plan.target, options, self.budget)
+        grid, search = found or search_best(
             grid_search(options, coder),
             renderer,
             self.source,

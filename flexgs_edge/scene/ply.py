@@ -60,6 +60,7 @@ class PlySource(SceneSource):
                 header = read_header(self.path, file)
                 stamp = _stamp(file)
             self.sh_degree, self.notes = gaussian_layout(header)
+            self.comments = header.comments
             self._smoothed = smoothing_of(header)
             self.settings: dict[str, Any] = {"antialiased": True} if self._smoothed else {}
             header.check_size(stamp[1])
@@ -263,7 +264,7 @@ def write_ply(
     """Write a scene in INRIA's layout: x y z, nx ny nz (zeros), f_dc, f_rest, opacity, scale, rot; little endian.
 
     Properties are `float`. Positions are world positions; with an origin other than zero they are `double`, since
-    float32 would lose the digits that the origin kept.
+    float32 would lose the digits that the origin kept. What the source says of its values (`comments`) stands in the header.
 
     Parameters
     ----------
@@ -293,9 +294,10 @@ def write_ply(
     kinds = {"<f4": "float", "<f8": "double"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {source.count}"]
     lines += [f"property {kinds[dtype[name].str]} {name}" for name in dtype.names or ()]
+    lines[2:2] = [f"comment {words}" for words in source.comments]
     with atomic_write(path, force) as file:
         file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
-        table = np.zeros((min(source.count, chunk_rows), len(lines) - 3), np.float32)
+        table = np.zeros((min(source.count, chunk_rows), len(dtype.names or ())), np.float32)
         block = np.zeros(len(table), dtype) if wide else None
         for rows in source.chunks(chunk_rows):
             part = source.read_table(rows, table)

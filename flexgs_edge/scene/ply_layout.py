@@ -37,6 +37,8 @@ _HEADER_LIMIT = 1 << 20
 """Bytes: headers of scenes have 2 kB; a file without `end_header` is not read to its end."""
 _SILENT = ("nx", "ny", "nz")
 """INRIA's own properties that carry nothing."""
+PROGRAM = "flexgs-edge"
+"""First word of our comments."""
 SMOOTHING = "filter_3D"
 """Mip-Splatting's own property: standard deviation, scene units, of a filter that scales and opacities are stored without."""
 
@@ -86,12 +88,15 @@ class PlyHeader:
         In the file's order.
     data_offset : int
         Byte where the data starts.
+    comments : tuple of str
+        Of this program.
     """
 
     path: Path
     order: str
     elements: list[Element]
     data_offset: int
+    comments: tuple[str, ...] = ()
 
     @property
     def vertex(self) -> Element:
@@ -171,7 +176,7 @@ def read_header(path: Path, file: BinaryIO) -> PlyHeader:
     FormatError
         Names the line and what was expected there.
     """
-    number, order, elements = 0, None, list[Element]()
+    number, order, elements, comments = 0, None, list[Element](), list[str]()
     while True:
         number += 1
         raw = file.readline(_HEADER_LIMIT + 1 - min(file.tell(), _HEADER_LIMIT))
@@ -192,11 +197,13 @@ def read_header(path: Path, file: BinaryIO) -> PlyHeader:
             if not elements:
                 raise FormatError(f"{place}: a property before any element")
             elements[-1].properties.append(_property(place, words, elements[-1]))
+        elif words[:2] == ["comment", PROGRAM]:
+            comments.append(" ".join(words[1:]))
         elif words and words[0] not in ("comment", "obj_info"):
             raise FormatError(f"{place}: expected format, element, property, comment or end_header, found {words[0]!r}")
     if order is None:
         raise FormatError(f"{path}: the header has no 'format' line; expected one of {', '.join(_FORMATS)}")
-    return PlyHeader(path, order, elements, file.tell())
+    return PlyHeader(path, order, elements, file.tell(), tuple(comments))
 
 
 def _format(place: str, words: list[str], order: str | None) -> str:

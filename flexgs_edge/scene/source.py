@@ -43,6 +43,8 @@ class SceneSource(ABC):
         What the reader left out or changed, for the summary.
     valid : bool
         No row can be one that `check_scene` refuses, so that it need not read them.
+    comments : tuple of str
+        What this program says of the values in the header of a PLY, or said there: of the grid that they lie on.
     """
 
     name: str
@@ -52,6 +54,7 @@ class SceneSource(ABC):
     origin: np.ndarray
     notes: tuple[str, ...] = ()
     valid: bool = False
+    comments: tuple[str, ...] = ()
 
     @abstractmethod
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:

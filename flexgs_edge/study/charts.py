@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INCHES, TALL, DPI = (7.2, 4.4), (7.2, 6.2), 144
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#A0A000")
 GREY, INK = "#7a7a7a", "#222222"
 SHORT = 8
 """Letters up to which a note is centred over its point."""
-MARKS, OPEN_MARKS = ("o", "s", "^", "D", "v", "P"), ("*", "d")
+MARKS, OPEN_MARKS = ("o", "s", "^", "D", "v", "P", "<", ">"), ("*", "d")
 LINEAR_BELOW = 0.1
 LEVELS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 _STYLE: dict[Any, Any] = {
@@ -60,6 +60,8 @@ class Series:
         Figures of the paper and not of this run: grey, open marks.
     notes : sequence of str
         Words beside the points.
+    broken : sequence of float
+        Where what is shown has broken: points that are crossed out, at the head of the chart if they have no y.
     """
 
     label: str
@@ -68,6 +70,7 @@ class Series:
     line: bool = True
     published: bool = False
     notes: Sequence[str] = ()
+    broken: Sequence[float] = ()
 
 
 @dataclass(frozen=True)
@@ -119,6 +122,8 @@ class BarChart:
         Along the axis.
     bars : dict
         One value a group, by label.
+    limit : float, optional
+        A level to mark; bars that pass it get a cross.
     """
 
     title: str
@@ -126,6 +131,7 @@ class BarChart:
     groups: Sequence[str]
     bars: dict[str, Sequence[float | None]]
     digits: int = 2
+    limit: float | None = None
 
 
 @dataclass(frozen=True)
@@ -259,6 +265,8 @@ def _lines(axes: Axes, chart: LineChart) -> None:
             clip_on=False,  # marks at zero are shown whole
             **style,
         )
+        for place in series.broken:
+            _cross(axes, place, next((y for x, y, _ in points if x == place), None), style["color"])
         for x, y, i in points:
             if series.notes:
                 words = series.notes[i]
@@ -291,6 +299,8 @@ def _lines(axes: Axes, chart: LineChart) -> None:
     # Losses start at zero, or below where compression helped: no axis makes small ones look large.
     shown = [y for series in chart.series for y in series.y if y is not None]
     low, high = min(shown, default=0.0), max(shown, default=1.0)
+    if chart.limit is not None:
+        high = max(high, chart.limit)  # a mark outside the axes would leave them no room
     if chart.magnitudes:
         axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
         axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)
@@ -306,6 +316,14 @@ def _lines(axes: Axes, chart: LineChart) -> None:
     axes.set_ylabel(chart.y_label + (", log above 0.1" if chart.magnitudes else ""))
     if any(series.label for series in chart.series):
         axes.legend()
+
+
+def _cross(axes: Axes, x: float, y: float | None, colour: str) -> None:
+    cross: dict[str, Any] = {"color": colour, "markersize": 13, "markeredgewidth": 2.2, "clip_on": False, "zorder": 6}
+    if y is None:
+        axes.plot([x], [0.98], "x", transform=axes.get_xaxis_transform(), **cross)
+    else:
+        axes.plot([x], [y], "x", **cross)
 
 
 def _dots(axes: Axes, chart: DotChart) -> None:
@@ -338,18 +356,27 @@ def _bars(axes: Axes, chart: BarChart) -> None:
         bars = axes.bar(left, shown, width * 0.94, color=COLOURS[number], label=label)
         axes.bar_label(
             bars,
-            ["-" if value is None else f"{value:.{chart.digits}f}" for value in values],
+            [_bar_words(value, chart) for value in values],
             padding=2,
             fontsize=7.5,
             color=INK,
         )
     axes.axhline(0.0, color=INK, linewidth=0.8)
+    if chart.limit is not None:
+        axes.axhline(chart.limit, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.set_xticks(range(len(chart.groups)), chart.groups)
     axes.grid(axis="x", visible=False)
     axes.margins(y=0.12)
     axes.set_ylabel(chart.y_label)
     if len(chart.bars) > 1:
         axes.legend()
+
+
+def _bar_words(value: float | None, chart: BarChart) -> str:
+    if value is None:
+        return "-"
+    beyond = chart.limit is not None and value > chart.limit
+    return ("\N{MULTIPLICATION SIGN}\n" if beyond else "") + f"{value:.{chart.digits}f}"
 
 
 def _plane(figure: Figure, axes: Axes, chart: PlaneChart) -> None:

@@ -22,18 +22,24 @@ from flexgs_edge.study.tables import Cell, Table, columns
 
 FEWEST = 4
 SCORES = {"gs": "the paper's score gs", "removal": "measured costs of removal"}
-ORDERS = {"farthest": "each next pose farthest from those before it", "even": "poses spread evenly by name"}
+ORDERS = {
+    "farthest": "each next pose farthest from those before it",
+    "even": "poses spread evenly by name",
+    "first": "the first poses by name",
+}
+COMPARED = ("farthest", "even")
+"""Of `ORDERS`, those of `study speed`."""
 ALL = "all"
 HEADS = {"score": "score", "poses": "poses", "views": "views scored"}
 
 
-def view_counts(count: int) -> list[int]:
-    """4, 8, 16, ... below the number of views, and all of them.
+def view_counts(count: int, fewest: int = FEWEST) -> list[int]:
+    """4, 8, 16, ... (or from another number on) below the number of views, and all of them.
 
-    >>> view_counts(20), view_counts(3)
-    ([4, 8, 16, 20], [3])
+    >>> view_counts(20), view_counts(3), view_counts(3, 1)
+    ([4, 8, 16, 20], [3], [1, 2, 3])
     """
-    counts, views = [], FEWEST
+    counts, views = [], fewest
     while views < count:
         counts.append(views)
         views *= 2
@@ -60,13 +66,34 @@ def _ranks(values: np.ndarray) -> np.ndarray:
 
 def scoring(bench: Bench) -> list[Experiment]:
     """Scores from ever more views: their time, their ranks and the quality that they leave."""
+    rows = score_rows(bench)
+    best = front([float(row["seconds"] or 0) for row in rows], [-float(row[bench.figure] or 0) for row in rows])
+    for row, on in zip(rows, best):
+        row["front"] = on
+    count = len(bench.views.train)
+    return [_quality(bench, rows, count), _stability(rows, count)]
+
+
+def score_rows(bench: Bench, fewest: int = FEWEST, orders: Sequence[str] = COMPARED) -> list[dict[str, Cell]]:
+    """Rows of each score from ever more views, and from all of them: seconds, ranks, and what the answer of the search is worth.
+
+    Parameters
+    ----------
+    fewest : int
+        Views of the smallest set.
+    orders : sequence of str
+        Of `ORDERS`: which views make a set.
+    """
     cameras = bench.views.of(bench.views.train)
-    counts = view_counts(len(cameras))
+    counts = view_counts(len(cameras), fewest)
     spread = farthest_order(cameras)
+    places: dict[str, Callable[[int], list[int]]] = {
+        "farthest": lambda count: sorted(spread[:count]),
+        "even": lambda count: [i * len(cameras) // count for i in range(count)],
+        "first": lambda count: list(range(count)),
+    }
     sets: list[tuple[str, int, list[Camera]]] = [(ALL, len(cameras), cameras)]
-    for count in counts[:-1]:
-        sets.append(("farthest", count, [cameras[i] for i in sorted(spread[:count])]))
-        sets.append(("even", count, [cameras[i * len(cameras) // count] for i in range(count)]))
+    sets += [(name, n, [cameras[i] for i in places[name](n)]) for n in counts[:-1] for name in orders]
     choice = bench.search.chosen.choice  # before the scene is loaded below: it draws others
     rows: list[dict[str, Cell]] = []
     budget = bench.workspace.budget
@@ -91,10 +118,7 @@ def scoring(bench: Bench) -> list[Experiment]:
     finally:
         budget.give(size)
     rows.sort(key=lambda row: (list(SCORES).index(str(row["score"])), str(row["poses"]) == ALL, int(row["views"] or 0)))
-    best = front([float(row["seconds"] or 0) for row in rows], [-float(row[bench.figure] or 0) for row in rows])
-    for row, on in zip(rows, best):
-        row["front"] = on
-    return [_quality(bench, rows, len(cameras)), _stability(rows, len(cameras))]
+    return rows
 
 
 def _scores(bench: Bench, score: str, sets: Sequence[tuple[str, int, list[Camera]]]) -> list[tuple[np.ndarray, float]]:
@@ -154,7 +178,7 @@ def _quality(bench: Bench, rows: list[dict[str, Cell]], count: int) -> Experimen
             "Time of scoring against what it is worth at one size",
             "seconds of scoring (log)",
             FIGURES[figure],
-            tuple(_series(rows, score, poses, "seconds", figure) for score in SCORES for poses in ORDERS),
+            tuple(_series(rows, score, poses, "seconds", figure) for score in SCORES for poses in COMPARED),
             log_x=True,
             magnitudes=True,
             front=[(float(row["seconds"] or 0), float(row[figure] or 0)) for row in rows if row["front"]],
@@ -183,7 +207,7 @@ def _stability(rows: list[dict[str, Cell]], count: int) -> Experiment:
     for score in SCORES:
         parts = [
             f"{poses} {row['views']} views {row['spearman']:.3f}"
-            for poses in ORDERS
+            for poses in COMPARED
             for row in rows
             if (row["score"], row["poses"]) == (score, poses)
         ]
@@ -198,7 +222,7 @@ def _stability(rows: list[dict[str, Cell]], count: int) -> Experiment:
             "Ranks from a few views against those from all",
             "views scored (log)",
             "rank correlation with all views",
-            tuple(_series(rows, score, poses, "views", "spearman") for score in SCORES for poses in ORDERS),
+            tuple(_series(rows, score, poses, "views", "spearman") for score in SCORES for poses in COMPARED),
             log_x=True,
             floating=True,
         ),

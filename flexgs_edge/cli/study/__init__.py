@@ -10,6 +10,7 @@ COMMANDS = {
     "paper": "The FlexGaussian paper's evaluation: nine experiments on the paper's method, beside its own figures.",
     "rate": "Bytes against quality: both methods at many ratios, other programs' formats, and best without each of its parts.",
     "speed": "Speed against accuracy: drawing, scoring, measuring and whole runs, and how times grow.",
+    "stability": "Where methods break: bits, pruning, views, poses, far origins, generations and the searches.",
 }
 """Subcommands and their line in the overview."""
 
@@ -26,5 +27,6 @@ def command() -> None:
       flexgs-edge study paper point_cloud.ply -o study
       flexgs-edge study rate point_cloud.ply -o rate
       flexgs-edge study speed point_cloud.ply -o speed
+      flexgs-edge study stability point_cloud.ply -o stability
       flexgs-edge study paper --help
     """

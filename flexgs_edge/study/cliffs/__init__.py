@@ -1,0 +1,1 @@
+"""Experiments of `study stability`: where methods break, and where ours stops standing."""
