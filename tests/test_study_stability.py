@@ -190,11 +190,12 @@ def test_the_worst_view_and_the_views_that_did_not_decide(study: Study, bench: B
 
 def test_moved_scenes_are_compressed_alike_and_half_positions_are_not(study: Study) -> None:
     rows = {(row["move"], row["method"]): row for row in rows_of(study, "moves")}
-    # 400 Gaussians on small views: one of them more or less is a quarter of a per cent. On the sample the bounds hold.
+    # 400 Gaussians on small views: one of them more or less is a quarter of a per cent, and steps that are a little other are 2 %
+    # of the bytes. On the sample the bounds hold (docs/stability.md).
     for move in ("moved 1e5, float64", "scaled 1e-3", "scaled 1e3"):
         for method in ("best", "paper"):
             row = rows[move, method]
-            assert number(row["same"]) >= 0.99 and abs(number(row["bytes_change"])) <= 2.0, row
+            assert number(row["same"]) >= 0.99 and abs(number(row["bytes_change"])) <= 4.0, row
             assert abs(number(row["change"])) < 0.3, row
     assert rows["moved 1e5, float64", "best"]["within"] and rows["scaled 1e3", "paper"]["within"]
     for method in ("best", "paper"):
