@@ -11,6 +11,7 @@ them: they must end in values that are finite or in an error of ours.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import random
 import re
@@ -44,9 +45,9 @@ SEEDS = ROOT / "tests" / "fuzz" / "seeds"
 TABLE = ROOT / "docs" / "fuzzing.md"
 SLOW = 1.0
 """Processor seconds that no try may take."""
-STUCK = 5.0
-"""Processor seconds after which a try is given up."""
-TRACED_EVERY = 50
+STUCK = 20.0
+"""Processor seconds after which the try that a run of 32 is at is given up."""
+TRACED_EVERY = 100
 """Allocations are traced on one try in so many: tracing makes it several times as slow."""
 BOUND = 12 << 20
 """Bytes that reading a file may allocate whatever it holds: the decoder's tables take 7.5 MB."""
@@ -257,10 +258,10 @@ class Kind:
 
 
 KINDS = (
-    Kind("v1 plain", ("v1.fgs",), mutate_bytes, find, 500_000),
-    Kind("v2 plain", ("v2.fgs",), mutate_bytes, find, 460_000),
-    Kind("v1 sealed", ("v1.fgs",), mutate_sealed, read_container, 30_000, sealed=True),
-    Kind("v2 sealed", ("v2.fgs",), mutate_sealed, read_container, 10_000, sealed=True),
+    Kind("v1 plain", ("v1.fgs",), mutate_bytes, find, 540_000),
+    Kind("v2 plain", ("v2.fgs",), mutate_bytes, find, 440_000),
+    Kind("v1 sealed", ("v1.fgs",), mutate_sealed, read_container, 16_000, sealed=True),
+    Kind("v2 sealed", ("v2.fgs",), mutate_sealed, read_container, 4_000, sealed=True),
     Kind("PLY", ("binary.ply", "ascii.ply", "big.ply"), mutate_text, read_ply, 20_000),
     Kind("cameras.json, transforms.json", ("cameras.json", "transforms.json"), mutate_json, read_views, 10_000),
     Kind("COLMAP", ("text/cameras.txt", "text/images.txt", "binary/cameras.bin", "binary/images.bin"), mutate_text, read_views,
@@ -275,7 +276,6 @@ class Tally:
     kind: Kind
     outcomes: Counter[str] = field(default_factory=Counter)
     failures: list[str] = field(default_factory=list)
-    seconds: float = 0.0
     slowest: float = 0.0
     most_bytes: int = 0
     most_over: float = 0.0
@@ -329,10 +329,9 @@ class Fuzzer:
         place.write_bytes(data)
         if traced:
             tracemalloc.start()
-        started = time.thread_time()
-        signal.setitimer(signal.ITIMER_VIRTUAL, STUCK)
+        started = time.perf_counter()
         try:
-            outcome = self.kind.read(place.parent if self.kind.folder else place)
+            outcome = self._read(place)
         except FlexGSError as error:
             outcome = "refused"
             if str(place.name) not in str(error) and not self.kind.folder:
@@ -340,22 +339,30 @@ class Fuzzer:
         except Exception:
             outcome = "crashed"
             self._fail(number, traceback.format_exc())
-        finally:
-            signal.setitimer(signal.ITIMER_VIRTUAL, 0)
-        seconds = time.thread_time() - started
+        seconds = time.perf_counter() - started
         if traced:
             self._weigh(number, place, tracemalloc.get_traced_memory()[1])
             tracemalloc.stop()
+        elif seconds > self.tally.slowest:
+            # A busy machine, or a slow try: read again by the processor's clock (asking it costs more than most tries do).
+            self.tally.slowest = max(self.tally.slowest, seconds := self._processor_seconds(place))
+            if seconds > SLOW:
+                self._fail(number, f"took {seconds:.2f} s")
         if self.kind.folder:
             place.write_bytes(self.seeds[index])
         if outcome == "missed" and data != self.seeds[index]:
             self._fail(number, "a change that `verify` did not find")
-        if seconds > SLOW and not traced:
-            self._fail(number, f"took {seconds:.2f} s")
         self.tally.outcomes[outcome] += 1
-        self.tally.seconds += seconds
-        self.tally.slowest = max(self.tally.slowest, 0.0 if traced else seconds)
         return outcome
+
+    def _read(self, place: Path) -> str:
+        return self.kind.read(place.parent if self.kind.folder else place)
+
+    def _processor_seconds(self, place: Path) -> float:
+        started = time.thread_time()
+        with contextlib.suppress(Exception):
+            self._read(place)
+        return time.thread_time() - started
 
     def _weigh(self, number: int, place: Path, peak: int) -> None:
         rows = 16 * place.stat().st_size
@@ -386,12 +393,15 @@ def fuzz(kind: Kind, first: int, tries: int, keep: Path | None = None) -> Tally:
         warnings.simplefilter("error")  # arithmetic that overflowed was not thought of
         fuzzer = Fuzzer(kind, Path(name))
         for number in range(first, first + tries):
+            if number % 32 == 0:
+                signal.setitimer(signal.ITIMER_VIRTUAL, STUCK)
             before = len(fuzzer.tally.failures)
             fuzzer.run(number, number % TRACED_EVERY == 0)
             if len(fuzzer.tally.failures) > before and keep is not None:
                 keep.mkdir(parents=True, exist_ok=True)
                 index, data = fuzzer.made(number)
                 (keep / f"{kind.name.split()[0]}-{number}-{Path(kind.seeds[index]).name}").write_bytes(data)
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
     return fuzzer.tally
 
 
@@ -405,6 +415,10 @@ files of `tests/fuzz/corpus`, each of which must be refused.
 checksums made right again, so that the decoders meet them: they may give values, all finite, or an error that names the file. A
 change is of one to four bits, bytes or numbers, or pieces cut out, put in, doubled and moved; of text, words and lines; of JSON,
 values and keys. Warnings of arithmetic count as crashes.
+
+Found so, and mended: camera files with lists nested hundreds of levels deep ended in a `RecursionError`; rotations and
+quaternions of 1e200 in camera files, and grid steps of 1e300 in a header, gave a warning of NumPy beside the error. The files are
+in the corpus.
 
 | what | tries | refused | read | not found | crashes, warnings | over {slow:g} s | slowest | most allocated | of its bound |
 |---|---|---|---|---|---|---|---|---|---|
@@ -457,7 +471,7 @@ def main() -> int:
         tally = fuzz(kind, options.first, options.tries or kind.tries, keep=options.keep)
         tallies.append(tally)
         print(
-            f"{kind.name}: {tally.tries} tries, {dict(tally.outcomes)}, {tally.seconds:.0f} s",
+            f"{kind.name}: {tally.tries} tries, {dict(tally.outcomes)}",
             file=sys.stderr,
             flush=True,
         )
