@@ -11,19 +11,16 @@ them: they must end in values that are finite or in an error of ours.
 from __future__ import annotations
 
 import argparse
-import json
+import contextlib
 import random
-import re
 import shutil
 import signal
-import struct
 import sys
 import tempfile
 import time
 import traceback
 import tracemalloc
 import warnings
-import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -31,11 +28,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.damage import mutate_bytes, mutate_json, mutate_sealed, mutate_text
 from benchmarks.harness import ROOT
 from flexgs_edge.budget import peak_rss
 from flexgs_edge.cameras import read_cameras
 from flexgs_edge.codec import open_fgs, read_header, verify
-from flexgs_edge.codec.layout import HEADER_STEP, Section
 from flexgs_edge.errors import FlexGSError, FormatError
 from flexgs_edge.scene import FIELDS, PlySource, SceneSource, check_scene
 
@@ -44,146 +41,14 @@ SEEDS = ROOT / "tests" / "fuzz" / "seeds"
 TABLE = ROOT / "docs" / "fuzzing.md"
 SLOW = 1.0
 """Processor seconds that no try may take."""
-STUCK = 5.0
-"""Processor seconds after which a try is given up."""
-TRACED_EVERY = 50
+STUCK = 20.0
+"""Processor seconds after which the try that a run of 32 is at is given up."""
+TRACED_EVERY = 100
 """Allocations are traced on one try in so many: tracing makes it several times as slow."""
 BOUND = 12 << 20
 """Bytes that reading a file may allocate whatever it holds: the decoder's tables take 7.5 MB."""
 ROW_BOUND = 4096
 """Bytes a row beyond that, for as many rows as the file's size allows."""
-NUMBERS = (0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x100, 0x7FFF, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
-
-
-def nested(depth: int) -> list[object]:
-    """Lists in lists."""
-    value: list[object] = []
-    for _ in range(depth):
-        value = [value]
-    return value
-
-
-VALUES: tuple[object, ...] = (
-    0, -1, 1, 2**16, 2**31, 2**32 - 1, 2**63, 10**30, 0.5, 1e300, 5e-324, -0.0, float("nan"), float("inf"), True, None, "", "1",
-    "\ud800", [], [1], [[]], {}, {"a": 1}, "x" * 3000,
-    nested(700),
-)  # fmt: skip
-"""What JSON values are replaced with."""
-WORDS = (*b"0 -1 1e999 1e308 nan inf 99999999999999999999 4294967296 list double #".split(b" "), b"", b"\n", b"\xff")
-"""What words of text files are replaced with."""
-
-
-def mutate_bytes(draw: random.Random, data: bytes) -> bytes:
-    """One to four changes: bits, bytes, numbers, and pieces cut, doubled, moved, put in."""
-    made = bytearray(data)
-    for _ in range(draw.choice((1, 1, 1, 2, 4))):
-        size = len(made)
-        at = draw.randrange(size + 1)
-        kind = draw.randrange(9)
-        if kind < 2 and size:
-            made[at % size] ^= 1 << draw.randrange(8)
-        elif kind == 2 and size:
-            made[at % size] = draw.randrange(256)
-        elif kind == 3 and size >= 4:
-            struct.pack_into("<I", made, draw.randrange(size - 3), draw.choice(NUMBERS))
-        elif kind == 4 and size >= 8:
-            struct.pack_into("<Q", made, draw.randrange(size - 7), draw.choice(NUMBERS) << draw.choice((0, 32)))
-        elif kind == 5:
-            del made[at : at + draw.choice((1, 4, 16, 256))]
-        elif kind == 6:
-            made[at:at] = draw.randbytes(draw.choice((1, 2, 4, 64)))
-        elif kind == 7:
-            other = draw.randrange(size + 1)
-            made[at:at] = made[other : other + draw.choice((1, 8, 64))]
-        else:
-            del made[at:]
-    return bytes(made)
-
-
-def mutate_text(draw: random.Random, data: bytes) -> bytes:
-    """Words and lines of a text (or of a PLY's header) replaced, moved and doubled; else any bytes."""
-    if draw.random() < 0.3:
-        return mutate_bytes(draw, data)
-    end = data.find(b"end_header\n")
-    text, rest = (data[: end + 11], data[end + 11 :]) if end >= 0 else (data, b"")
-    pieces = re.split(rb"(\s+|,|:)", text)
-    for _ in range(draw.choice((1, 1, 2, 5))):
-        at = draw.randrange(len(pieces))
-        if draw.random() < 0.6:
-            pieces[at] = draw.choice(WORDS)
-        else:
-            pieces[at:at] = pieces[(other := draw.randrange(len(pieces))) : other + draw.choice((1, 2, 8))]
-    return b"".join(pieces) + rest
-
-
-def mutate_json(draw: random.Random, data: bytes) -> bytes:
-    """One value of a JSON text replaced, or a key dropped; else its text."""
-    if draw.random() < 0.4:
-        return mutate_text(draw, data)
-    record = json.loads(data)
-    places: list[tuple[dict[str, object] | list[object], str | int]] = []
-
-    def walk(value: object) -> None:
-        inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-        for key, below in inner:
-            places.append((value, key))  # type: ignore[arg-type]
-            walk(below)
-
-    walk(record)
-    for _ in range(draw.choice((1, 1, 2))):
-        parent, key = draw.choice(places)
-        try:
-            if draw.random() < 0.2:
-                del parent[key]  # type: ignore[arg-type]
-            else:
-                parent[key] = draw.choice(VALUES)  # type: ignore[index]
-        except (KeyError, IndexError):
-            continue  # gone with what was changed before
-    return json.dumps(record).encode()
-
-
-def mutate_sealed(draw: random.Random, data: bytes, sections: Sequence[Section]) -> bytes:
-    """A change of a container's header, ranges, model, chunks or chunk table, under checksums that are right again.
-
-    `sections` are those of `data`.
-    """
-    section = draw.choice(sections[1:])
-    if section.name == "header":
-        block = data[section.offset : section.offset + section.length]
-        text = mutate_json(draw, block.rstrip())
-        # Version 1 pads its header to whole steps.
-        text = text.ljust(-(-len(text) // HEADER_STEP) * HEADER_STEP) if data[8] == 1 else text
-        return _seal(data[: section.offset] + text + data[section.offset + section.length :], len(text))
-    made = bytearray(data)
-    if section.name.startswith("chunk ") and section.name != "chunk table":
-        body = _same_size(draw, data[section.offset : section.offset + section.length])
-        made[section.offset : section.offset + section.length] = body
-        table = sections[-1]
-        struct.pack_into("<I", made, table.offset + 8 * int(section.name[6:]) + 4, zlib.crc32(body))
-        _sum_behind(made, table)
-    else:
-        body = _same_size(draw, data[section.offset : section.offset + section.length - 4])
-        made[section.offset : section.offset + len(body)] = body
-        _sum_behind(made, section)
-    return bytes(made)
-
-
-def _same_size(draw: random.Random, body: bytes) -> bytes:
-    return mutate_bytes(draw, body)[: len(body)].ljust(len(body), draw.choice((b"\0", b"\xff")))
-
-
-def _sum_behind(data: bytearray, section: Section) -> None:
-    """The checksum at a section's end."""
-    end = section.offset + section.length - 4
-    struct.pack_into("<I", data, end, zlib.crc32(data[section.offset : end]))
-
-
-def _seal(data: bytes, length: int) -> bytes:
-    """Correct file size, header checksum and preamble checksum."""
-    made = bytearray(data)
-    struct.pack_into("<QII", made, 16, len(made), length, zlib.crc32(made[36 : 36 + length]))
-    struct.pack_into("<I", made, 32, zlib.crc32(made[:32]))
-    return bytes(made)
 
 
 def read_all(source: SceneSource) -> str:
@@ -257,10 +122,10 @@ class Kind:
 
 
 KINDS = (
-    Kind("v1 plain", ("v1.fgs",), mutate_bytes, find, 500_000),
-    Kind("v2 plain", ("v2.fgs",), mutate_bytes, find, 460_000),
-    Kind("v1 sealed", ("v1.fgs",), mutate_sealed, read_container, 30_000, sealed=True),
-    Kind("v2 sealed", ("v2.fgs",), mutate_sealed, read_container, 10_000, sealed=True),
+    Kind("v1 plain", ("v1.fgs",), mutate_bytes, find, 540_000),
+    Kind("v2 plain", ("v2.fgs",), mutate_bytes, find, 440_000),
+    Kind("v1 sealed", ("v1.fgs",), mutate_sealed, read_container, 16_000, sealed=True),
+    Kind("v2 sealed", ("v2.fgs",), mutate_sealed, read_container, 4_000, sealed=True),
     Kind("PLY", ("binary.ply", "ascii.ply", "big.ply"), mutate_text, read_ply, 20_000),
     Kind("cameras.json, transforms.json", ("cameras.json", "transforms.json"), mutate_json, read_views, 10_000),
     Kind("COLMAP", ("text/cameras.txt", "text/images.txt", "binary/cameras.bin", "binary/images.bin"), mutate_text, read_views,
@@ -275,7 +140,6 @@ class Tally:
     kind: Kind
     outcomes: Counter[str] = field(default_factory=Counter)
     failures: list[str] = field(default_factory=list)
-    seconds: float = 0.0
     slowest: float = 0.0
     most_bytes: int = 0
     most_over: float = 0.0
@@ -329,10 +193,9 @@ class Fuzzer:
         place.write_bytes(data)
         if traced:
             tracemalloc.start()
-        started = time.thread_time()
-        signal.setitimer(signal.ITIMER_VIRTUAL, STUCK)
+        started = time.perf_counter()
         try:
-            outcome = self.kind.read(place.parent if self.kind.folder else place)
+            outcome = self._read(place)
         except FlexGSError as error:
             outcome = "refused"
             if str(place.name) not in str(error) and not self.kind.folder:
@@ -340,22 +203,30 @@ class Fuzzer:
         except Exception:
             outcome = "crashed"
             self._fail(number, traceback.format_exc())
-        finally:
-            signal.setitimer(signal.ITIMER_VIRTUAL, 0)
-        seconds = time.thread_time() - started
+        seconds = time.perf_counter() - started
         if traced:
             self._weigh(number, place, tracemalloc.get_traced_memory()[1])
             tracemalloc.stop()
+        elif seconds > self.tally.slowest:
+            # A busy machine, or a slow try: read again by the processor's clock (asking it costs more than most tries do).
+            self.tally.slowest = max(self.tally.slowest, seconds := self._processor_seconds(place))
+            if seconds > SLOW:
+                self._fail(number, f"took {seconds:.2f} s")
         if self.kind.folder:
             place.write_bytes(self.seeds[index])
         if outcome == "missed" and data != self.seeds[index]:
             self._fail(number, "a change that `verify` did not find")
-        if seconds > SLOW and not traced:
-            self._fail(number, f"took {seconds:.2f} s")
         self.tally.outcomes[outcome] += 1
-        self.tally.seconds += seconds
-        self.tally.slowest = max(self.tally.slowest, 0.0 if traced else seconds)
         return outcome
+
+    def _read(self, place: Path) -> str:
+        return self.kind.read(place.parent if self.kind.folder else place)
+
+    def _processor_seconds(self, place: Path) -> float:
+        started = time.thread_time()
+        with contextlib.suppress(Exception):
+            self._read(place)
+        return time.thread_time() - started
 
     def _weigh(self, number: int, place: Path, peak: int) -> None:
         rows = 16 * place.stat().st_size
@@ -386,12 +257,15 @@ def fuzz(kind: Kind, first: int, tries: int, keep: Path | None = None) -> Tally:
         warnings.simplefilter("error")  # arithmetic that overflowed was not thought of
         fuzzer = Fuzzer(kind, Path(name))
         for number in range(first, first + tries):
+            if number % 32 == 0:
+                signal.setitimer(signal.ITIMER_VIRTUAL, STUCK)
             before = len(fuzzer.tally.failures)
             fuzzer.run(number, number % TRACED_EVERY == 0)
             if len(fuzzer.tally.failures) > before and keep is not None:
                 keep.mkdir(parents=True, exist_ok=True)
                 index, data = fuzzer.made(number)
                 (keep / f"{kind.name.split()[0]}-{number}-{Path(kind.seeds[index]).name}").write_bytes(data)
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
     return fuzzer.tally
 
 
@@ -405,6 +279,10 @@ files of `tests/fuzz/corpus`, each of which must be refused.
 checksums made right again, so that the decoders meet them: they may give values, all finite, or an error that names the file. A
 change is of one to four bits, bytes or numbers, or pieces cut out, put in, doubled and moved; of text, words and lines; of JSON,
 values and keys. Warnings of arithmetic count as crashes.
+
+Found so, and mended: camera files with lists nested hundreds of levels deep ended in a `RecursionError`; rotations and
+quaternions of 1e200 in camera files, and grid steps of 1e300 in a header, gave a warning of NumPy beside the error. The files are
+in the corpus.
 
 | what | tries | refused | read | not found | crashes, warnings | over {slow:g} s | slowest | most allocated | of its bound |
 |---|---|---|---|---|---|---|---|---|---|
@@ -457,7 +335,7 @@ def main() -> int:
         tally = fuzz(kind, options.first, options.tries or kind.tries, keep=options.keep)
         tallies.append(tally)
         print(
-            f"{kind.name}: {tally.tries} tries, {dict(tally.outcomes)}, {tally.seconds:.0f} s",
+            f"{kind.name}: {tally.tries} tries, {dict(tally.outcomes)}",
             file=sys.stderr,
             flush=True,
         )

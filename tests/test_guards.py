@@ -184,24 +184,24 @@ def test_margin_poses_see_what_no_pose_does() -> None:
     angles = 2 * np.pi * (np.arange(16) + 0.5) / 16
     gaps = make_splats(np.stack([3 * np.sin(angles), 0 * angles, 3 * np.cos(angles)], axis=1), np.full((16, 3), 0.02))
     renderer = Renderer(open_form("w16"), large_budget())
-    scored = with_margin(renderer, gaps, cameras, 24)
-    again = with_margin(renderer, gaps, cameras, 24)
+    scored = with_margin(renderer, gaps, cameras, 8)
+    again = with_margin(renderer, gaps, cameras, 8)
     assert [camera.name for camera in scored] == [camera.name for camera in again]
-    assert scored[:16] == cameras and len(scored) == 24
-    kinds = [camera.name.split(" ", 1)[1][:2] for camera in scored[16:]]
+    assert scored[:8] == cameras[:8] and len(scored) == 16
+    kinds = [camera.name.split(" ", 1)[1][:2] for camera in scored[8:]]
     assert kinds == ["at"] * 3 + ["to"] + ["at"] * 4
-    assert scored[16].name == f"c0 at {NEARER:g}x" and scored[23].name == f"c7 at {FARTHER:g}x"
+    factors = [camera.name.split(" ")[2] for camera in scored[8:]]
+    near, far = f"{NEARER:g}x", f"{FARTHER:g}x"
+    assert factors == [near, near, far, factors[3], near, near, far, near] and scored[15].name.startswith("c7 ")
     assert not count(open_form("w16"), gaps, cameras).hits.any()
     assert count(open_form("w16"), gaps, scored).hits.any()
 
 
-@pytest.mark.parametrize(
-    ("given", "most", "real", "made"), [(70, 96, 64, 32), (70, 48, 32, 16), (7, 48, 7, 3), (1, 48, 1, 0)]
-)
+@pytest.mark.parametrize(("given", "most", "real", "made"), [(20, 24, 20, 20), (20, 9, 9, 9), (1, 48, 1, 1)])
 def test_margin_poses_are_counted_with_the_others(given: int, most: int, real: int, made: int) -> None:
     cameras = ring(given)
     found = with_margin(Renderer(open_form("w16"), large_budget()), wall(3.0, 6), cameras, most)
-    assert found[:real] == cameras[:real] and len(found) == real + made <= most
+    assert found[:real] == cameras[:real] and len(found) == real + made
 
 
 def test_a_compression_with_margin(project: Path, tmp_path: Path) -> None:
@@ -210,9 +210,9 @@ def test_a_compression_with_margin(project: Path, tmp_path: Path) -> None:
     again = compress(project, tmp_path / "b.fgs", memory_limit=500 * 2**20, **words)
     assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
     assert result.reached and again.scored == result.scored == Scored(
-        9, 3, result.scored.unseen if result.scored else 0
+        12, 6, result.scored.unseen if result.scored else 0
     )
-    assert result.to_json()["scored"]["made"] == 3
+    assert result.to_json()["scored"]["made"] == 6
 
 
 @pytest.mark.parametrize(

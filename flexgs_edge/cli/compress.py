@@ -85,7 +85,7 @@ from flexgs_edge.cli import words
     "Views",
     "--views-margin",
     is_flag=True,
-    help="Score a third of the poses elsewhere (best only): nearer to what is seen, farther from it and in between, so that what "
+    help="Score as many poses again, made (best only): nearer to what is seen, farther from it and in between, so that what "
     "only such views show stays.",
 )
 @words.option(

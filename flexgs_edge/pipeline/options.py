@@ -148,7 +148,7 @@ class CompressOptions(ViewOptions):
     unseen : str
         What becomes of Gaussians that no training pose sees (`best`): `keep`, `drop`, or the share that stays, such as `20%`.
     views_margin : bool
-        Score a part of the poses nearer to what is seen, farther from it and in between as well (`best`).
+        Score as many poses again, made nearer to what is seen, farther from it and in between (`best`).
     refit : bool
         Refit colours after pruning and quantizing (`best`).
     layers : int

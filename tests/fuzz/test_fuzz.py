@@ -9,22 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fuzz import (
-    BOUND,
-    KINDS,
-    SEEDS,
-    SLOW,
-    TABLE,
-    Fuzzer,
-    Kind,
-    fuzz,
-    mutate_bytes,
-    mutate_json,
-    mutate_sealed,
-    mutate_text,
-    read_container,
-    read_views,
-)
+from benchmarks.damage import mutate_bytes, mutate_json, mutate_sealed, mutate_text
+from benchmarks.fuzz import BOUND, KINDS, SEEDS, SLOW, TABLE, Fuzzer, Kind, fuzz, read_container, read_views
 from flexgs_edge.codec import verify
 from flexgs_edge.errors import FlexGSError
 from flexgs_edge.scene import PlySource, check_scene

@@ -1,0 +1,148 @@
+"""Changes of small files that a reader should survive: bytes, words of texts, values of JSON, sections of containers.
+
+Every function draws its choices from the `random.Random` given, so that the same seed makes the same file.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import struct
+import zlib
+from collections.abc import Sequence
+
+from flexgs_edge.codec.layout import HEADER_STEP, Section
+
+NUMBERS = (0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x100, 0x7FFF, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
+
+
+def nested(depth: int) -> list[object]:
+    """Lists in lists."""
+    value: list[object] = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+VALUES: tuple[object, ...] = (
+    0, -1, 1, 2**16, 2**31, 2**32 - 1, 2**63, 10**30, 0.5, 1e300, 5e-324, -0.0, float("nan"), float("inf"), True, None, "", "1",
+    "\ud800", [], [1], [[]], {}, {"a": 1}, "x" * 3000,
+    nested(700),
+)  # fmt: skip
+"""What JSON values are replaced with."""
+WORDS = (*b"0 -1 1e999 1e308 nan inf 99999999999999999999 4294967296 list double #".split(b" "), b"", b"\n", b"\xff")
+"""What words of text files are replaced with."""
+
+
+def mutate_bytes(draw: random.Random, data: bytes) -> bytes:
+    """One to four changes: bits, bytes, numbers, and pieces cut, doubled, moved, put in."""
+    made = bytearray(data)
+    for _ in range(draw.choice((1, 1, 1, 2, 4))):
+        size = len(made)
+        at = draw.randrange(size + 1)
+        kind = draw.randrange(9)
+        if kind < 2 and size:
+            made[at % size] ^= 1 << draw.randrange(8)
+        elif kind == 2 and size:
+            made[at % size] = draw.randrange(256)
+        elif kind == 3 and size >= 4:
+            struct.pack_into("<I", made, draw.randrange(size - 3), draw.choice(NUMBERS))
+        elif kind == 4 and size >= 8:
+            struct.pack_into("<Q", made, draw.randrange(size - 7), draw.choice(NUMBERS) << draw.choice((0, 32)))
+        elif kind == 5:
+            del made[at : at + draw.choice((1, 4, 16, 256))]
+        elif kind == 6:
+            made[at:at] = draw.randbytes(draw.choice((1, 2, 4, 64)))
+        elif kind == 7:
+            other = draw.randrange(size + 1)
+            made[at:at] = made[other : other + draw.choice((1, 8, 64))]
+        else:
+            del made[at:]
+    return bytes(made)
+
+
+def mutate_text(draw: random.Random, data: bytes) -> bytes:
+    """Words and lines of a text (or of a PLY's header) replaced, moved and doubled; else any bytes."""
+    if draw.random() < 0.3:
+        return mutate_bytes(draw, data)
+    end = data.find(b"end_header\n")
+    text, rest = (data[: end + 11], data[end + 11 :]) if end >= 0 else (data, b"")
+    pieces = re.split(rb"(\s+|,|:)", text)
+    for _ in range(draw.choice((1, 1, 2, 5))):
+        at = draw.randrange(len(pieces))
+        if draw.random() < 0.6:
+            pieces[at] = draw.choice(WORDS)
+        else:
+            pieces[at:at] = pieces[(other := draw.randrange(len(pieces))) : other + draw.choice((1, 2, 8))]
+    return b"".join(pieces) + rest
+
+
+def mutate_json(draw: random.Random, data: bytes) -> bytes:
+    """One value of a JSON text replaced, or a key dropped; else its text."""
+    if draw.random() < 0.4:
+        return mutate_text(draw, data)
+    record = json.loads(data)
+    places: list[tuple[dict[str, object] | list[object], str | int]] = []
+
+    def walk(value: object) -> None:
+        inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+        for key, below in inner:
+            places.append((value, key))  # type: ignore[arg-type]
+            walk(below)
+
+    walk(record)
+    for _ in range(draw.choice((1, 1, 2))):
+        parent, key = draw.choice(places)
+        try:
+            if draw.random() < 0.2:
+                del parent[key]  # type: ignore[arg-type]
+            else:
+                parent[key] = draw.choice(VALUES)  # type: ignore[index]
+        except (KeyError, IndexError):
+            continue  # gone with what was changed before
+    return json.dumps(record).encode()
+
+
+def mutate_sealed(draw: random.Random, data: bytes, sections: Sequence[Section]) -> bytes:
+    """A change of a container's header, ranges, model, chunks or chunk table, under checksums that are right again.
+
+    `sections` are those of `data`.
+    """
+    section = draw.choice(sections[1:])
+    if section.name == "header":
+        block = data[section.offset : section.offset + section.length]
+        text = mutate_json(draw, block.rstrip())
+        # Version 1 pads its header to whole steps.
+        text = text.ljust(-(-len(text) // HEADER_STEP) * HEADER_STEP) if data[8] == 1 else text
+        return _seal(data[: section.offset] + text + data[section.offset + section.length :], len(text))
+    made = bytearray(data)
+    if section.name.startswith("chunk ") and section.name != "chunk table":
+        body = _same_size(draw, data[section.offset : section.offset + section.length])
+        made[section.offset : section.offset + section.length] = body
+        table = sections[-1]
+        struct.pack_into("<I", made, table.offset + 8 * int(section.name[6:]) + 4, zlib.crc32(body))
+        _sum_behind(made, table)
+    else:
+        body = _same_size(draw, data[section.offset : section.offset + section.length - 4])
+        made[section.offset : section.offset + len(body)] = body
+        _sum_behind(made, section)
+    return bytes(made)
+
+
+def _same_size(draw: random.Random, body: bytes) -> bytes:
+    return mutate_bytes(draw, body)[: len(body)].ljust(len(body), draw.choice((b"\0", b"\xff")))
+
+
+def _sum_behind(data: bytearray, section: Section) -> None:
+    """The checksum at a section's end."""
+    end = section.offset + section.length - 4
+    struct.pack_into("<I", data, end, zlib.crc32(data[section.offset : end]))
+
+
+def _seal(data: bytes, length: int) -> bytes:
+    """Correct file size, header checksum and preamble checksum."""
+    made = bytearray(data)
+    struct.pack_into("<QII", made, 16, len(made), length, zlib.crc32(made[36 : 36 + length]))
+    struct.pack_into("<I", made, 32, zlib.crc32(made[:32]))
+    return bytes(made)
