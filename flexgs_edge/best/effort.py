@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from flexgs_edge.cameras import Camera
 
 LEAST_VIEWS = 6
@@ -55,12 +57,16 @@ class Effort:
 def sampled_poses(cameras: Sequence[Camera], count: int) -> list[Camera]:
     """The views at every pixel, or at a part of them where that is enough to measure `count` Gaussians.
 
-    The part is the same lattice in every view, begun at another pixel from view to view.
+    The part is the same lattice in every view, begun at another pixel from view to view in the order of their names: ties among
+    poses, which rounding of a scene that was moved may break, decide no pixel.
     """
     step = 1
     while step < LARGEST_STEP and sum(_lattice(camera, step + 1) for camera in cameras) >= PIXELS_A_ROW * count:
         step += 1
-    return [camera.every(step, *divmod(place % step**2, step)) for place, camera in enumerate(cameras)]
+    places = np.argsort(np.argsort([camera.name for camera in cameras], kind="stable"), kind="stable")
+    return [
+        camera.every(step, *divmod(int(place) % step**2, step)) for place, camera in zip(places, cameras, strict=True)
+    ]
 
 
 def _lattice(camera: Camera, step: int) -> int:
