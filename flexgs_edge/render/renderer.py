@@ -92,8 +92,7 @@ def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray
     record[9:12] = moved.translation
     record[12:16] = moved.fx, moved.fy, moved.cx, moved.cy
     record[16:21] = near, x_low, x_high, y_low, y_high
-    # By the transpose, as ever: so near to the scene's origin the digits of the rotation cost nothing.
-    record[21:24] = -moved.rotation.T @ moved.translation
+    record[21:24] = -moved.rotation.T @ moved.translation  # so near to the origin the transpose will do
     record[24:27] = moved.width, moved.height, moved.dilation
     return record.astype(np.float32)
 
