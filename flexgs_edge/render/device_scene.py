@@ -223,6 +223,14 @@ class DeviceScene:
         return padded(self._least_rows) * self._chunk_row_bytes
 
     @property
+    def whole_bytes(self) -> int:
+        """Bytes of all chunks, loaded."""
+        planes = self._planes
+        whole = planes.sh_count * plane_bytes(planes.sh_degree) + (self.count - planes.sh_count) * plane_bytes(0)
+        # Two chunks may be padded at most: the last with SH and the last without.
+        return whole + 2 * LANES * self._chunk_row_bytes
+
+    @property
     def later_bytes(self) -> int:
         """Bytes that sums over views will take: none once the first view made them."""
         return 0 if self.statistics else self.sum_bytes * self.count
@@ -255,10 +263,8 @@ class DeviceScene:
             self._rows = min(COMPACT_ROWS, max(self.count, 1))
             self._streamed = True
             return
-        whole = planes.sh_count * plane_bytes(planes.sh_degree) + (self.count - planes.sh_count) * plane_bytes(0)
         most = min(CHUNK_ROWS, max(self.count, 1))
-        # Two chunks may be padded at most: the last with SH and the last without.
-        whole += 2 * LANES * self._chunk_row_bytes + later
+        whole = self.whole_bytes + later
         fits = budget.free >= whole + padded(self._rows or self._least_rows) * planes.upload_bytes
         if not self._rows:
             spare = budget.free - whole if fits else budget.free - later
