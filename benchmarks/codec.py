@@ -20,8 +20,8 @@ import numpy as np
 from benchmarks.harness import SCENES, Bench, backend_of, check, parse
 from flexgs_edge.codec import GridSource, channel_bytes, verify, write_grid
 from flexgs_edge.grid import Steps, from_grid, to_grid
-from flexgs_edge.pipeline.best import size_and_bits
 from flexgs_edge.pipeline.decompress import decompress
+from flexgs_edge.pipeline.grid_coder import size_and_bits
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.ply import PlySource
 

@@ -23,8 +23,9 @@ from flexgs_edge.best.search import RateSearch, RateStep
 from flexgs_edge.cameras import Camera, read_cameras
 from flexgs_edge.cameras.inria import inria_json
 from flexgs_edge.constants import DEFAULT_NEAR
-from flexgs_edge.pipeline.best import GridCoder, grid_search
+from flexgs_edge.pipeline.best import grid_search
 from flexgs_edge.pipeline.compress import compress
+from flexgs_edge.pipeline.grid_coder import GridCoder
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.progress import Progress
 from flexgs_edge.scene import write_ply

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
+from flexgs_edge.curve import near_rows
 from flexgs_edge.errors import BudgetError, FlexGSError, FormatError, InputError
-from flexgs_edge.grid import near_rows
 from flexgs_edge.quantize import normalize_quats
 from flexgs_edge.scene import (
     FIELD,

@@ -7,7 +7,6 @@ machine gets the same bits.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
+from flexgs_edge.curve import morton
 from flexgs_edge.errors import InputError
 from flexgs_edge.rotations import canonical_axes
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
@@ -22,7 +22,6 @@ from flexgs_edge.scratch import MEMORY, Room, blocks, stable_order
 
 POSITION_BITS = 21
 """Cells along an axis of a scene as a power of two: three of them fill a 63-bit curve index."""
-_COMMENT = "flexgs-edge grid "
 
 Planes = Mapping[str, np.ndarray]
 
@@ -311,55 +310,6 @@ def from_grid(
     return {field: makers[field]() for field in fields}
 
 
-def grid_comment(steps: Steps) -> str:
-    """What a PLY says of the grid that its values lie on."""
-    return f"{_COMMENT}{json.dumps(steps.to_json())}"
-
-
-def steps_of(comments: Sequence[str]) -> Steps | None:
-    """The steps that such a comment holds; None without one that can be read."""
-    for words in comments:
-        if words.startswith(_COMMENT):
-            try:
-                with np.errstate(over="ignore"):  # a step beyond float32 is infinite, and refused
-                    return Steps.from_json(json.loads(words.removeprefix(_COMMENT)))
-            # Anybody may have written it: lists a thousand deep, integers beyond floats.
-            except (InputError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError):
-                return None
-    return None
-
-
-def on_grid(planes: Planes, steps: Steps, origin: np.ndarray) -> GridScene | None:
-    """The grid that values lie on, if every one of them lies on it to the bit: nothing is lost by taking it.
-
-    Parameters
-    ----------
-    planes : mapping
-        {field: [width, n] f32}, finite.
-    steps : Steps
-        What a comment says: it may be of other values.
-    origin : np.ndarray
-        [3] f64.
-    """
-    rest = planes["sh_rest"]
-    bands = rest.reshape(3, len(rest) // 3, rest.shape[1])
-    degrees = np.zeros(rest.shape[1], np.uint8)
-    for degree in range(1, MAX_SH_DEGREE + 1):
-        degrees[bands[:, degree * degree - 1 : (degree + 1) ** 2 - 1].any(axis=(0, 1))] = degree
-    try:
-        grid, order = to_grid(planes, degrees, steps, origin, rename=False)
-    except InputError:
-        return None
-    for name, values in from_grid(grid).items():
-        given = planes[name][:, order]
-        # Coefficients are channel by channel: those of degrees that no row has are zero, and left out.
-        if name == "sh_rest":
-            given = bands[:, : sh_rest_count(grid.sh_degree), order].reshape(values.shape)
-        if not np.array_equal(values, given):
-            return None
-    return grid
-
-
 def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:
     """[3 * K, n] f32, zero above each row's degree."""
     if isinstance(rows, slice):
@@ -400,44 +350,6 @@ def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray, room: Room
     colours = _Ordered({"sh_rest": sh_rest}, None, room)
     bands = tuple(_band_codes(colours, d, np.flatnonzero(grid.sh_degrees >= d), grid.steps, room) for d in degrees)
     return replace(grid, dc=dc, sh=bands)
-
-
-def morton(cells: np.ndarray) -> np.ndarray:
-    """[n] u64 index on the Morton curve of `cells` ([3, n], 0 to 2^21 - 1): x has the highest bit of each three.
-
-    >>> morton(np.array([[1, 0], [0, 0], [0, 3]])).tolist()
-    [4, 9]
-    """
-    x, y, z = (_spread(axis.astype(np.uint64)) for axis in cells)
-    index: np.ndarray = x << np.uint64(2) | y << np.uint64(1) | z
-    return index
-
-
-def near_rows(means: np.ndarray, room: Room = MEMORY) -> np.ndarray:
-    """[n] i64: rows of `means` ([3, n]) along a Morton curve, so that neighbours on it are near each other."""
-    # By rank along each axis: a few far rows do not squeeze the rest into one cell.
-    count = means.shape[1]
-    cells, index = room.empty(means.shape, np.int16), room.empty((count,), np.uint64)
-    for line, ranks in zip(means, cells, strict=True):
-        order = stable_order(line, room)
-        for part in blocks(count):
-            ranks[order[part]] = np.arange(part.start, part.stop) * 1024 // count
-    for part in blocks(count):
-        index[part] = morton(cells[:, part])
-    return stable_order(index, room)
-
-
-def _spread(bits: np.ndarray) -> np.ndarray:
-    """Two zero bits before every bit of a number of 21 bits."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
-    return bits
 
 
 def _bytes(name: str, values: np.ndarray, count: int, highest: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from flexgs_edge.budget import format_mib, parse_size
-from flexgs_edge.pipeline.best import row_bytes
+from flexgs_edge.pipeline.room import row_bytes
 from flexgs_edge.scene import write_ply
 from synthetic import random_scene
 from tiny_project import write_cameras

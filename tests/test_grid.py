@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flexgs_edge.curve import morton
 from flexgs_edge.errors import InputError
-from flexgs_edge.grid import GridScene, Steps, from_grid, grid_comment, morton, on_grid, steps_of, to_grid
+from flexgs_edge.grid import GridScene, Steps, from_grid, to_grid
+from flexgs_edge.regrid import grid_comment, on_grid, steps_of
 from flexgs_edge.rotations import canonical_axes
 from grid_scenes import STEPS, make_grid, make_planes
 

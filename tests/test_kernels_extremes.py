@@ -28,7 +28,7 @@ from synthetic import look_from, make_camera, random_scene
 @pytest.fixture(autouse=True)
 def _small_pair_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every launch compares every array."""
-    monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", 1 << 14)
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1 << 14)
 
 
 UNSEEN = ("none in view", "needles of 30 pixels, antialiased")

@@ -37,7 +37,7 @@ COUNTS = (0, 1, 15, 16, 17, 63, 64, 65, 2049)
 @pytest.fixture(autouse=True)
 def _small_pair_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every launch compares every array: 32 MB of pairs would be most of it."""
-    monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", 1 << 14)
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1 << 14)
 
 
 def test_every_kernel_has_a_twin() -> None:
@@ -77,7 +77,7 @@ def test_blocks_of_the_serial_passes(form: str, blocks: int) -> None:
 @pytest.mark.parametrize("form", FORMS)
 def test_batches(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A pair buffer as small as it can be: colour and transmittance are carried from batch to batch."""
-    monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", 1)
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1)
     paired = PairedBackend(open_form(form), 3)
     draw(paired, random_scene(60, 5), make_camera(45, 37))
     count(paired, random_scene(60, 5), [make_camera(45, 37)])
@@ -161,7 +161,7 @@ def padded_target(camera: Camera, seed: int) -> np.ndarray:
 @pytest.mark.parametrize("form", FORMS)
 def test_removal_costs_and_residuals(form: str, pairs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Second passes over the same lists, in one batch and in many."""
-    monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", pairs)
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", pairs)
     paired = PairedBackend(open_form(form), 3)
     camera, source = make_camera(45, 37), random_scene(60, 18, 1)
     errors, weights = removal_costs(paired, source, camera, (0.1, 0.5, 1.0))

@@ -25,7 +25,7 @@ from flexgs_edge.codec.coder import decode_chunk
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.refit import refit_colours
-from flexgs_edge.render import Renderer, Statistics, device_scene, renderer
+from flexgs_edge.render import Renderer, Statistics, device_scene
 from flexgs_edge.render.similarity import ssims
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.score.removal import measure_costs
@@ -68,7 +68,7 @@ def results(backend: OpenCLBackend | TwinBackend) -> Iterator[np.ndarray]:
     camera = make_camera(19, 16, focal=18)
     # More splats than a batch of the GPU form holds in one batch of pairs; a few in many batches.
     for rows, pairs, extent in ((70, 1 << 8, "exact"), (9, 1, "inria")):
-        renderer.DEFAULT_PAIRS = pairs
+        view_buffers.DEFAULT_PAIRS = pairs
         source = random_scene(rows, 3, 1, size=-1.2, opacity=-2)
         drawer = Renderer(counting, large_budget(), background=(0.1, 0.2, 0.3), extent=extent)
         with drawer.load(source) as scene:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexgs_edge.codec.octree import CONTEXTS, TooManyNodes, unmorton, walk_octree
-from flexgs_edge.grid import morton
+from flexgs_edge.curve import morton
 
 
 def some_cells(count: int, depth: int, seed: int = 0) -> np.ndarray:

@@ -15,10 +15,11 @@ from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.codec import GridSource, coded_size, file_version, verify
 from flexgs_edge.errors import BudgetError, InputError, TargetError
 from flexgs_edge.grid import from_grid
-from flexgs_edge.pipeline.best import SETTINGS_MOST, alive, size_and_bits
+from flexgs_edge.pipeline.best import alive
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.decompress import decompress
 from flexgs_edge.pipeline.evaluate import evaluate
+from flexgs_edge.pipeline.grid_coder import SETTINGS_MOST, size_and_bits
 from flexgs_edge.pipeline.info import info
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.trim import trim

@@ -188,7 +188,7 @@ def test_each_row_keeps_its_degree() -> None:
 
 
 def test_the_same_bits_every_time_on_every_form(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", 1 << 14)
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1 << 14)
     planes, found = bright_planes(2, 60), []
     for form in ("w16", "w16", "w4", "gpu", "numpy"):
         found.append(Bench(planes, 2, form).refit(perturbed(planes), 2, 2))
@@ -201,7 +201,7 @@ def test_chunks_and_batches_change_nothing(rows: int, monkeypatch: pytest.Monkey
     planes = bright_planes(1, 128)
     expected = Bench(planes, 2).refit(perturbed(planes), 1, 2)
     monkeypatch.setattr("flexgs_edge.render.device_scene.CHUNK_ROWS", rows)
-    monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", 1)
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1)
     found = Bench(planes, 2).refit(perturbed(planes), 1, 2)
     assert same_bits(found["sh_dc"], expected["sh_dc"]) and same_bits(found["sh_rest"], expected["sh_rest"])
 

@@ -255,7 +255,7 @@ def test_nothing_is_measured_of_nothing() -> None:
 @pytest.mark.parametrize("degree", [0, 1, 4])
 def test_every_form_measures_the_same_bits(degree: int, pairs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Vector widths, the GPU form and the twins, in one batch and in many, on an odd image."""
-    monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", pairs)
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", pairs)
     source, cameras = random_scene(77, 37, degree, size=-1.8), poses(2, 33, 19)
     expected = costs_of(open_form("numpy"), source, cameras)
     assert expected.removal.any() and expected.sh.any() == (degree > 0)

@@ -75,7 +75,7 @@ def test_repeated_runs(form: str) -> None:
 @pytest.mark.parametrize("form", ALL_FORMS)
 @pytest.mark.parametrize("pairs", [1, 777, 20000])
 def test_pair_capacity(form: str, pairs: int, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", pairs)
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", pairs)
     assert digest(open_form(form), large_budget()) == expected
 
 

@@ -25,7 +25,7 @@ NEAR = np.float32(0.2)
 @pytest.fixture(autouse=True)
 def _small_pair_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hundreds of small scenes: getting 32 MB for the pairs of each would be most of it."""
-    monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", 1 << 12)
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1 << 12)
 
 
 def assert_matches(

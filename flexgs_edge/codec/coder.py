@@ -16,8 +16,9 @@ from flexgs_edge.codec.records import Device
 from flexgs_edge.codec.tables import merge_contexts, to_levels
 from flexgs_edge.codec.threads import in_order, thread_count
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds, walk_chunk, walk_positions
+from flexgs_edge.curve import morton
 from flexgs_edge.errors import InputError
-from flexgs_edge.grid import POSITION_BITS, GridScene, morton
+from flexgs_edge.grid import POSITION_BITS, GridScene
 from flexgs_edge.scratch import MEMORY, Room, blocks
 
 CHUNK_ROWS = 65536

@@ -17,7 +17,8 @@ from flexgs_edge.codec.sections import ChunkEntry
 from flexgs_edge.codec.source import by_chunk
 from flexgs_edge.codec.threads import in_order, thread_count
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds
-from flexgs_edge.grid import CODE_LIMIT, GridScene, from_grid, grid_comment
+from flexgs_edge.grid import CODE_LIMIT, GridScene, from_grid
+from flexgs_edge.regrid import grid_comment
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
 _ROTATION_STEP_MOST = 2.0**38

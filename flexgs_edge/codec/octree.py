@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from flexgs_edge.constants import CHILD_CLASSES, LEVEL_CLASSES
-from flexgs_edge.grid import POSITION_BITS, morton
+from flexgs_edge.curve import morton
+from flexgs_edge.grid import POSITION_BITS
 
 CONTEXTS = LEVEL_CLASSES * CHILD_CLASSES
 

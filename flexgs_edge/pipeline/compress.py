@@ -21,20 +21,12 @@ from flexgs_edge.codec.container import write_container
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, values_of
-from flexgs_edge.pipeline.best import (
-    GridCoder,
-    choose_room,
-    grid_search,
-    kept_as_it_is,
-    layered,
-    open_checkpoint,
-    search_best,
-    search_files,
-)
+from flexgs_edge.pipeline.best import grid_search, kept_as_it_is, layered, search_best, search_files
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
 from flexgs_edge.pipeline.doubts import doubts, training_fidelity
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
+from flexgs_edge.pipeline.grid_coder import GridCoder
 from flexgs_edge.pipeline.inputs import Scene, Views, companions_of, find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import CompressOptions
@@ -43,6 +35,7 @@ from flexgs_edge.pipeline.plan import Plan, make_settings
 from flexgs_edge.pipeline.poses import scored_poses
 from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.pipeline.report import Reporter
+from flexgs_edge.pipeline.room import choose_room, open_checkpoint
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, run_info
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice, nonzero_sh, order_from_scores

@@ -12,7 +12,8 @@ import numpy as np
 from flexgs_edge.bitpack import pack
 from flexgs_edge.codec import FgsSource, GridSource, coded_size
 from flexgs_edge.codec.source import QuantizedSource
-from flexgs_edge.grid import GridScene, from_grid, morton
+from flexgs_edge.curve import morton
+from flexgs_edge.grid import GridScene, from_grid
 from flexgs_edge.quantize import QuantizedArray, QuantizedScene, codes
 from flexgs_edge.scene import FIELDS, MemorySource, SceneSource, sh_rest_count
 

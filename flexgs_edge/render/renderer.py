@@ -10,7 +10,7 @@ import numpy as np
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
-from flexgs_edge.constants import CULLED, DEFAULT_NEAR, FIXED_WEIGHT, JACOBIAN_MARGIN, TILE
+from flexgs_edge.constants import CULLED, DEFAULT_NEAR, JACOBIAN_MARGIN
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels import Backend
 from flexgs_edge.quantize import QuantizedScene
@@ -26,19 +26,20 @@ from flexgs_edge.render.device_scene import (
     plane_bytes,
     upload_bytes,
 )
+from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.render.view_buffers import (
+    SORT_DIGIT_BITS,
+    SORT_DIGITS,
+    ViewBuffers,
+    chunk_shapes,
+    shapes_bytes,
+    target_bytes,
+    view_bytes,
+    view_key,
+)
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.scratch import MEMORY, Room
 
-SORT_DIGIT_BITS = 11
-SORT_DIGITS = 1 << SORT_DIGIT_BITS
-TARGET_BYTES = 6
-"""Bytes a pixel and channel of a target in half precision, and of the residual against it."""
-PAIR_BYTES = 20
-"""A pair (8) and its draft (12)."""
-DEFAULT_PAIRS = 1 << 21
-"""Pairs of a batch when memory allows: 40 MiB, one batch for most views."""
-PAIR_SHARE = 8
-"""The tile lists take at most this part (one in eight) of what is free beyond the least: the scene comes next."""
 SUM_ROWS = 1 << 18
 """Rows of sums that are on the host at a time."""
 EXTENTS = ("exact", "inria")
@@ -48,33 +49,6 @@ FIRST_SHARE = 4
 """Part of a scene's rows (one in four) that a compact view has room for until one shows more."""
 GROWTH = 1.1
 """Room beyond what the part of a view that was seen lets expect."""
-
-
-@dataclass
-class Statistics:
-    """Sums over the views added so far, one entry a row of the scene.
-
-    Attributes
-    ----------
-    hits : np.ndarray
-        [N] i64, pixels at which the Gaussian was blended.
-    weights : np.ndarray
-        [N] u64, sum of alpha T over pixels in fixed point, units of 1 / `FIXED_WEIGHT`: adding is exact, so any
-        order of views, chunks and workers gives the same bits.
-    """
-
-    hits: np.ndarray
-    weights: np.ndarray
-
-    @classmethod
-    def zeros(cls, count: int) -> Statistics:
-        """Statistics of no view."""
-        return cls(np.zeros(count, np.int64), np.zeros(count, np.uint64))
-
-    @property
-    def weight_sums(self) -> np.ndarray:
-        """[N] f64, sum of alpha T."""
-        return self.weights / FIXED_WEIGHT
 
 
 def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray:
@@ -97,137 +71,11 @@ def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray
     return record.astype(np.float32)
 
 
-def view_key(scene: DeviceScene, camera: Camera) -> tuple[int, int, int]:
-    """What the sizes of a view's buffers depend on."""
-    return scene.count, camera.width, camera.height
-
-
-def view_shapes(backend: Backend, count: int, width: int, height: int) -> dict[str, tuple[tuple[int, ...], Any]]:
-    """Shape and type of the buffers of a view, by name; the lists of pairs take what is left."""
-    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    return {
-        "camera": ((32,), np.float32),
-        "records": ((count, 16), np.float32),
-        "keys": ((count,), np.uint32),
-        "bounds": ((count,), np.uint32),
-        "keys_a": ((count,), np.uint32),
-        "ids_a": ((count,), np.uint32),
-        "keys_b": ((count,), np.uint32),
-        "ids_b": ((count,), np.uint32),
-        "digits": ((SORT_DIGITS * backend.sort_blocks + 1,), np.uint32),
-        "block_pairs": ((backend.sort_blocks,), np.uint64),
-        "room": ((2, backend.tile_blocks), np.uint32),
-        "ends": ((tiles_x * tiles_y * backend.tile_blocks + 1,), np.uint32),
-        "state": ((tiles_x * tiles_y, 4, TILE * TILE), np.float32),
-        "image": ((3, tiles_y * TILE, tiles_x * TILE), np.float32),
-    }
-
-
-def chunk_shapes(rows: int) -> dict[str, tuple[tuple[int, ...], Any]]:
-    """The same of what one chunk of a compact view is projected to."""
-    return {
-        "chunk_records": ((rows, 16), np.float32),
-        "chunk_keys": ((rows,), np.uint32),
-        "chunk_bounds": ((rows,), np.uint32),
-    }
-
-
-def shapes_bytes(shapes: dict[str, tuple[tuple[int, ...], Any]]) -> int:
-    """Bytes of all of `view_shapes`."""
-    return sum(int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
-
-
-def view_bytes(backend: Backend, count: int, camera: Camera) -> int:
-    """Bytes of the buffers of a view of so many rows, with the shortest lists of pairs."""
-    tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
-    return shapes_bytes(view_shapes(backend, count, camera.width, camera.height)) + PAIR_BYTES * tiles
-
-
-def target_bytes(camera: Camera) -> int:
-    """Bytes of a target of a view, and of the residual against it."""
-    return TARGET_BYTES * 3 * TILE * TILE * -(-camera.width // TILE) * -(-camera.height // TILE)
-
-
-class _ViewBuffers:
-    """Buffers that live as long as the views have one size and one number of rows.
-
-    With `rows`, there is room for as many splats only, those that a view shows: the buffers of a compact view, and one chunk's
-    for what `project` writes.
-    """
-
-    def __init__(
-        self, backend: Backend, scene: DeviceScene, camera: Camera, budget: MemoryBudget, rows: int | None = None
-    ) -> None:
-        self.key = view_key(scene, camera)
-        _, width, height = self.key
-        self.rows = rows
-        count = scene.count if rows is None else rows
-        self.tiles_x, self.tiles_y = -(-width // TILE), -(-height // TILE)
-        self.tiles = self.tiles_x * self.tiles_y
-        self.padded_height, self.padded_width = self.tiles_y * TILE, self.tiles_x * TILE
-        self.arrays: list[Any] = []
-        self._backend = backend
-        self._targets: tuple[Any, Any] | None = None
-        shapes = view_shapes(backend, count, width, height)
-        size = shapes_bytes(shapes)
-        # One splat may touch every tile, so no batch can be smaller than that. What the scene and the sums of a scoring pass
-        # need at the least is checked with the view, so that one message names a limit that does.
-        later = PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + scene.targets * self._target_bytes
-        what = (
-            f"a view of {count} Gaussians" if rows is None else f"a view that shows {count} of {scene.count} Gaussians"
-        )
-        if rows is not None:
-            shapes |= chunk_shapes(padded(min(COMPACT_ROWS, scene.count)))
-            later += scene.shown_bytes * rows - scene.later_bytes
-            size = shapes_bytes(shapes)
-        budget.require(f"{what} at {width}x{height}", size + later)
-        try:
-            made = {name: self._array(shape, dtype) for name, (shape, dtype) in shapes.items()}
-            if scene.targets:
-                self.target_arrays()
-                later -= self._target_bytes
-            spare = max(budget.free - later, 0) // (PAIR_SHARE * PAIR_BYTES)
-            self.capacity = min(self.tiles + spare, max(DEFAULT_PAIRS, self.tiles))
-            self.pairs = self._array((self.capacity, 2), np.uint32)
-            self.drafts = self._array((self.capacity, 3), np.uint32)
-        except BaseException:
-            self.release()
-            raise
-        self.camera, self.records, self.keys, self.bounds = (made[n] for n in ("camera", "records", "keys", "bounds"))
-        self.sorted = [(made["keys_a"], made["ids_a"]), (made["keys_b"], made["ids_b"])]
-        self.digits, self.block_pairs = made["digits"], made["block_pairs"]
-        self.room, self.ends = made["room"], made["ends"]
-        self.state, self.image = made["state"], made["image"]
-        self.chunk = tuple(made[name] for name in chunk_shapes(0)) if rows is not None else ()
-
-    @property
-    def _target_bytes(self) -> int:
-        return TARGET_BYTES * 3 * self.padded_height * self.padded_width
-
-    def _array(self, shape: tuple[int, ...], dtype: Any) -> Any:
-        made = self._backend.array(shape, dtype)
-        self.arrays.append(made)
-        return made
-
-    def target_arrays(self) -> tuple[Any, Any]:
-        """A target image in half precision and the residual against it, made when first asked for."""
-        if self._targets is None:
-            pixels = 3 * self.padded_height * self.padded_width
-            self._targets = (self._array((pixels,), np.float16), self._array((pixels,), np.float32))
-        return self._targets
-
-    def release(self) -> None:
-        for array in self.arrays:
-            array.release()
-        self.arrays = []
-        self._targets = None
-
-
 @dataclass
 class _View:
     """A view whose splats are projected and ordered."""
 
-    buffers: _ViewBuffers
+    buffers: ViewBuffers
     camera: Camera
     batches: list[tuple[int, int]]
     count: int
@@ -281,7 +129,7 @@ class Renderer:
         self.splats_shown = 0
         self.view_rows: np.ndarray | None = None
         """[m] u32, rows of the scene that the sums of the view drawn last belong to; None: all of them."""
-        self._buffers: _ViewBuffers | None = None
+        self._buffers: ViewBuffers | None = None
 
     def aim(self, camera: Camera, origin: np.ndarray) -> None:
         """Put the record of a view into `camera_array`."""
@@ -445,13 +293,13 @@ class Renderer:
         batches = [(0, shown)] if pairs <= buffers.capacity else self._batches(buffers, shown)
         return _View(buffers, camera, batches, count)
 
-    def _project(self, scene: DeviceScene, camera: Camera, buffers: _ViewBuffers) -> None:
+    def _project(self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers) -> None:
         self.backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
         for chunk in scene.chunks():
             self._project_chunk(scene, chunk, chunk.base, buffers, (buffers.records, buffers.keys, buffers.bounds))
 
     def _project_chunk(
-        self, scene: DeviceScene, chunk: Chunk, base: int, buffers: _ViewBuffers, out: tuple[Any, ...]
+        self, scene: DeviceScene, chunk: Chunk, base: int, buffers: ViewBuffers, out: tuple[Any, ...]
     ) -> None:
         self.backend.launch(
             "project", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, self.inria_extent,
@@ -460,8 +308,8 @@ class Renderer:
         )  # fmt: skip
 
     def _project_compact(
-        self, scene: DeviceScene, camera: Camera, buffers: _ViewBuffers
-    ) -> tuple[_ViewBuffers, np.ndarray]:
+        self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers
+    ) -> tuple[ViewBuffers, np.ndarray]:
         """Project, and keep what is shown: in order of rows, so that all that follows gives the same bits.
 
         When a view shows more than there is room for, the buffers are made anew for what its first part lets expect.
@@ -476,9 +324,9 @@ class Renderer:
             scene.shown = min(-(-expected // CAPACITY_STEP) * CAPACITY_STEP, scene.count)
             scene.drop_statistics()
             self.release()
-            self._buffers = buffers = _ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
+            self._buffers = buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
 
-    def _fill_compact(self, scene: DeviceScene, buffers: _ViewBuffers) -> tuple[np.ndarray, int]:
+    def _fill_compact(self, scene: DeviceScene, buffers: ViewBuffers) -> tuple[np.ndarray, int]:
         """[m] u32, rows shown; and up to which row of the scene they are complete."""
         backend, (records, keys, bounds) = self.backend, buffers.chunk
         assert buffers.rows is not None
@@ -511,17 +359,17 @@ class Renderer:
                 buffers.ends, buffers.pairs, buffers.records, buffers.state, buffers.image, *extra,
             )  # fmt: skip
 
-    def _view_buffers(self, scene: DeviceScene, camera: Camera) -> _ViewBuffers:
+    def _view_buffers(self, scene: DeviceScene, camera: Camera) -> ViewBuffers:
         if self._buffers is None or self._buffers.key != view_key(scene, camera):
             self.release()
             if scene.shown is None and self._may_be_compact(scene) and not self._fits(scene, camera):
                 scene.be_compact(min(-(-scene.count // FIRST_SHARE // CAPACITY_STEP + 1) * CAPACITY_STEP, scene.count))
             try:
-                self._buffers = _ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
+                self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
             except BudgetError:
                 # A larger view than before: the scene gives up its place and is streamed from now on if need be.
                 scene.evict()
-                self._buffers = _ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
+                self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
         return self._buffers
 
     def _may_be_compact(self, scene: DeviceScene) -> bool:
@@ -540,7 +388,7 @@ class Renderer:
             return size + scene.whole_bytes <= free // 2
         return size + scene.least_chunk_bytes <= free
 
-    def _sort(self, count: int, buffers: _ViewBuffers) -> tuple[int, int]:
+    def _sort(self, count: int, buffers: ViewBuffers) -> tuple[int, int]:
         """Depth order of the shown splats into `buffers.sorted[0]`; how many there are, and a bound on their pairs."""
         backend, blocks = self.backend, self.backend.sort_blocks
         (keys_a, ids_a), (keys_b, ids_b) = buffers.sorted
@@ -559,7 +407,7 @@ class Renderer:
             (keys_a, ids_a), (keys_b, ids_b) = (keys_b, ids_b), (keys_a, ids_a)
         return shown, pairs
 
-    def _batches(self, buffers: _ViewBuffers, shown: int) -> list[tuple[int, int]]:
+    def _batches(self, buffers: ViewBuffers, shown: int) -> list[tuple[int, int]]:
         """Splits of the depth order whose pairs fit the buffer."""
         order = self.backend.read(buffers.sorted[0][1], np.empty(shown, np.uint32))
         ends = np.cumsum(self.backend.read(buffers.bounds)[order], dtype=np.int64)
@@ -570,7 +418,7 @@ class Renderer:
             start, done = stop, int(ends[stop - 1])
         return batches
 
-    def _list_tiles(self, buffers: _ViewBuffers, camera: Camera, start: int, count: int) -> None:
+    def _list_tiles(self, buffers: ViewBuffers, camera: Camera, start: int, count: int) -> None:
         backend, blocks = self.backend, self.backend.tile_blocks
         ids = buffers.sorted[0][1]
         backend.launch("tile_room", (blocks,), start, count, ids, buffers.bounds, buffers.room)

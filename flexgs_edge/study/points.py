@@ -14,8 +14,9 @@ from flexgs_edge.budget import format_size
 from flexgs_edge.errors import InputError
 from flexgs_edge.formats import FORMATS, Format, check_converter, near_order
 from flexgs_edge.grid import GridScene, from_grid
-from flexgs_edge.pipeline.best import GridCoder, grid_search, open_path, search_path
+from flexgs_edge.pipeline.best import grid_search, open_path, search_path
 from flexgs_edge.pipeline.foreign import open_files
+from flexgs_edge.pipeline.grid_coder import GridCoder
 from flexgs_edge.pipeline.judge import measurement_of
 from flexgs_edge.pipeline.plan import EVERYTHING, make_settings
 from flexgs_edge.pipeline.poses import scored_poses

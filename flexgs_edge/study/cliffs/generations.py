@@ -11,8 +11,9 @@ from flexgs_edge.best.path import PrunePath
 from flexgs_edge.bitspec import BitSpec
 from flexgs_edge.codec import coded_size, open_fgs, write_grid
 from flexgs_edge.codec.container import write_container
-from flexgs_edge.pipeline.best import SETTINGS_MOST, GridCoder, kept_as_it_is
+from flexgs_edge.pipeline.best import kept_as_it_is
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
+from flexgs_edge.pipeline.grid_coder import SETTINGS_MOST, GridCoder
 from flexgs_edge.pipeline.inputs import load_scene
 from flexgs_edge.pipeline.plan import EVERYTHING
 from flexgs_edge.prune import Choice, nonzero_sh, order_from_scores

@@ -14,7 +14,8 @@ from flexgs_edge.best.search import RateSearch
 from flexgs_edge.cameras import Camera
 from flexgs_edge.codec import coded_size
 from flexgs_edge.grid import GridScene, from_grid
-from flexgs_edge.pipeline.best import GridCoder, grid_search, open_path
+from flexgs_edge.pipeline.best import grid_search, open_path
+from flexgs_edge.pipeline.grid_coder import GridCoder
 from flexgs_edge.pipeline.judge import Judge, measurement_of
 from flexgs_edge.pipeline.poses import scored_poses
 from flexgs_edge.render import Renderer

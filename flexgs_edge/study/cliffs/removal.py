@@ -11,8 +11,8 @@ from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.path import PrunePath
 from flexgs_edge.bitspec import BitSpec
 from flexgs_edge.cameras import Camera
-from flexgs_edge.pipeline.best import SETTINGS_MOST
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
+from flexgs_edge.pipeline.grid_coder import SETTINGS_MOST
 from flexgs_edge.prune import Choice, order_from_scores
 from flexgs_edge.render.quality import ViewQuality
 from flexgs_edge.scene import MemorySource

@@ -1,0 +1,117 @@
+"""Where a search by measured costs keeps its scene: in memory, or in scratch files."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from flexgs_edge.best.checkpoint import Checkpoint
+from flexgs_edge.best.effort import EFFORTS
+from flexgs_edge.best.path import PARTS, sums_room
+from flexgs_edge.budget import MemoryBudget, format_size
+from flexgs_edge.cameras import Camera
+from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.render import Renderer, sum_bytes
+from flexgs_edge.render.device_scene import COMPACT_ROWS, MOST_SUMS
+from flexgs_edge.render.renderer import FIRST_SHARE
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.score.cache import fingerprint
+from flexgs_edge.scratch import MEMORY, Room, Scratch
+
+LOG = logging.getLogger("flexgs_edge")
+
+COST_BYTES = 16
+"""Costs of a row and snapshot beside those of its SH: removal and weight, in double precision."""
+BAND_BYTES = 20
+"""The same for each SH degree: a cost in double precision, a mean colour."""
+WORK_PLANES = 11
+"""What a whole result holds for a moment, in planes of its rows (at degree 3, of 236 bytes): the rows without what was dropped,
+codes, values of codes twice, colours of the last refit and of this one, and sums of the refit twice. With 6, fox at a fidelity
+of 48 dB (nearly all rows stay) had a peak 90 MiB above its limit, with 9 one of 12 MiB."""
+SPILLED_ROW_BYTES = 24
+"""Bytes that each row of a scene in scratch files takes of memory for a moment: choosing the cheapest rows, and lists of rows."""
+SPOOL_ROW_BYTES = 52
+"""Bytes that each row that a view shows takes of the scratch file for its sums (`ViewSums`)."""
+
+
+def choose_room(
+    renderer: Renderer,
+    source: SceneSource,
+    scored: Sequence[Camera],
+    options: CompressOptions,
+    budget: MemoryBudget,
+    folder: Path,
+) -> Room:
+    """Memory, where the scene and the path of its search fit, else scratch files; says which, and how much they may take.
+
+    Parameters
+    ----------
+    folder : path
+        For scratch files.
+
+    Raises
+    ------
+    BudgetError
+        When not even the views fit, or the disk is too small.
+    """
+    largest = largest_of(scored)
+    rows, keep = source.count, EFFORTS[options.effort].keep
+    whole = rows * row_bytes(source.sh_degree, keep)
+    if whole + renderer.least_bytes(source, largest, sums_room(source.sh_degree)) <= budget.free:
+        return MEMORY
+    budget.require(
+        "a search by measured costs with all else in scratch files",
+        SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest),
+    )
+    room = Scratch(folder)
+    renderer.largest = largest
+    spooled = SPOOL_ROW_BYTES * rows * len(scored)
+    LOG.info(
+        "%d Gaussians and the path of their search need %s in memory, %s are free: they go to scratch files in %s "
+        "(at most about %s; --scratch names another folder), %d rows at a time; %d bytes of each Gaussian and views of the "
+        "Gaussians that they show stay in memory; %d passes over %d poses",
+        rows, format_size(whole), format_size(budget.free), room.folder, format_size(whole + spooled), COMPACT_ROWS,
+        SPILLED_ROW_BYTES, 2 + EFFORTS[options.effort].refit_rounds, len(scored),
+    )  # fmt: skip
+    return room
+
+
+def open_checkpoint(
+    renderer: Renderer, source: SceneSource, scored: Sequence[Camera], options: CompressOptions, folder: Path
+) -> Checkpoint:
+    """Where the path of a search keeps its rounds: a folder named by all that they depend on."""
+    words = f"path {EFFORTS[options.effort].keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r}"
+    assert options.near is not None and options.extent is not None
+    key = fingerprint(source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
+    checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")
+    if checkpoint.rounds:
+        LOG.info(
+            "%s: an earlier run was cut short after %d rounds: going on from there",
+            checkpoint.folder,
+            checkpoint.rounds,
+        )
+    return checkpoint
+
+
+def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:
+    """Bytes that the first view of a search in scratch files needs; one that shows more than `FIRST_SHARE` says needs more."""
+    return renderer.compact_bytes(source, largest, -(-source.count // FIRST_SHARE), sum_bytes(MOST_SUMS))
+
+
+def largest_of(cameras: Sequence[Camera]) -> Camera:
+    """The camera with most pixels."""
+    return max(cameras, key=lambda camera: camera.width * camera.height)
+
+
+def row_bytes(sh_degree: int, keep: float) -> int:
+    """Bytes that a search holds for each row of its scene, at most, beside what the renderer counts.
+
+    Either snapshots down to nothing, each `keep` of the one before; or, when nearly all is kept, one of them and all that a
+    whole result of it needs. What lies between is between.
+    """
+    planes = sum(4 * field.width(sh_degree) for field in FIELD.values())
+    snapshot = planes + COST_BYTES + BAND_BYTES * sh_degree
+    parts = PARTS * 8 * (2 + 4 * sh_degree)
+    return round(max(snapshot / (1 - keep), snapshot + WORK_PLANES * planes)) + parts
