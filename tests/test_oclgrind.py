@@ -25,7 +25,7 @@ from flexgs_edge.codec.coder import decode_chunk
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.refit import refit_colours
-from flexgs_edge.render import Renderer, Statistics, device_scene
+from flexgs_edge.render import Renderer, Statistics, device_scene, view_buffers
 from flexgs_edge.render.similarity import ssims
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.score.removal import measure_costs
