@@ -10,7 +10,7 @@
 #define RETIRE_EVERY 16          // splats between two looks for blocks whose pixels have all ended
 
 #ifndef STATS
-#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs) must be defined"
+#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs, 5: gradients) must be defined"
 #endif
 
 // Lane l of vector v is pixel (l + v W) of the block, row by row.
@@ -37,7 +37,7 @@ inline int any_alive(FW t) {
 }
 
 #if STATS
-#define SUMS (STATS == 1 ? 1 : STATS == 2 ? 2 : STATS == 3 ? 4 : 6)
+#define SUMS (STATS == 1 ? 1 : STATS == 2 ? 2 : STATS == 3 ? 4 : STATS == 4 ? 6 : 9)
 #if defined(cl_khr_int64_base_atomics) && defined(__ENDIAN_LITTLE__)
 #pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
 // The same words in one step: sums below zero take two with 32 bits.
@@ -114,9 +114,9 @@ __kernel void blend(
     ,
     __global uint *hits,                  // [N]
     __global uint *sums,                  // [N, SUMS, 2] low and high words of fixed-point sums
-    __global const float *target          // [3, padded height, padded width] 2, 4: the finished image, 3: the residual
+    __global const float *target          // [3, padded height, padded width] 2, 4, 5: the finished image, 3: the residual
 #endif
-#if STATS == 4
+#if STATS >= 4
     ,
     __global const float *rest            // [3, padded height, padded width] the residual
 #endif
@@ -145,7 +145,7 @@ __kernel void blend(
   FW target_r[BLOCKS * BLOCK_VECTORS], target_g[BLOCKS * BLOCK_VECTORS], target_b[BLOCKS * BLOCK_VECTORS];
   load_blocks(target, tiles_x, height, tile_px, tile_py, target_r, target_g, target_b);
 #endif
-#if STATS == 4
+#if STATS >= 4
   FW rest_r[BLOCKS * BLOCK_VECTORS], rest_g[BLOCKS * BLOCK_VECTORS], rest_b[BLOCKS * BLOCK_VECTORS];
   load_blocks(rest, tiles_x, height, tile_px, tile_py, rest_r, rest_g, rest_b);
 #elif STATS == 3
@@ -195,6 +195,10 @@ __kernel void blend(
     IW hit_sum[BLOCK_VECTORS];
     FW weights[BLOCK_VECTORS], squares[BLOCK_VECTORS], errors[BLOCK_VECTORS];
     FW sum_r[BLOCK_VECTORS], sum_g[BLOCK_VECTORS], sum_b[BLOCK_VECTORS];
+#if STATS == 5
+    FW sum_x[BLOCK_VECTORS], sum_y[BLOCK_VECTORS], sum_xx[BLOCK_VECTORS], sum_xy[BLOCK_VECTORS], sum_yy[BLOCK_VECTORS];
+    for (int v = 0; v < BLOCK_VECTORS; ++v) sum_x[v] = sum_y[v] = sum_xx[v] = sum_xy[v] = sum_yy[v] = (FW)0.0f;
+#endif
     for (int v = 0; v < BLOCK_VECTORS; ++v) {
       hit_sum[v] = (IW)0;
       weights[v] = squares[v] = errors[v] = sum_r[v] = sum_g[v] = sum_b[v] = (FW)0.0f;
@@ -214,17 +218,30 @@ __kernel void blend(
 #if STATS
         hit_sum[v] += hit;
 #endif
-#if STATS == 1 || STATS >= 3
+#if STATS == 1 || STATS == 3 || STATS == 4
         weights[v] += weight;
 #endif
-#if STATS == 2 || STATS == 4
+#if STATS == 2 || STATS >= 4
         // What the pixel would change by without this splat: its own light goes, what lies behind it gets brighter.
         const FW ratio = pick(hit, alpha * reciprocal((FW)1.0f - alpha), (FW)0.0f);
         const FW er = fma(weight, cr, -(ratio * (target_r[k] - red[k])));
         const FW eg = fma(weight, cg, -(ratio * (target_g[k] - green[k])));
         const FW eb = fma(weight, cbl, -(ratio * (target_b[k] - blue[k])));
+#endif
+#if STATS == 2 || STATS == 4
         errors[v] += fma(eb, eb, fma(eg, eg, er * er));
         squares[v] = fma(weight, weight, squares[v]);
+#elif STATS == 5
+        // What more light the pixel gets where it lacks some when alpha grows by its own size, unless the cap holds it: the
+        // exponent's gradient. Its moments about the centre are those of the centre and of the conic.
+        const FW light = fma(eb, rest_b[k], fma(eg, rest_g[k], er * rest_r[k]));
+        const FW slope = pick(MASK(alpha < (FW)ALPHA_MAX), light, (FW)0.0f), slope_x = slope * dx, slope_y = slope * dy;
+        errors[v] += slope;
+        sum_x[v] += slope_x;
+        sum_y[v] += slope_y;
+        sum_xx[v] = fma(slope_x, dx, sum_xx[v]);
+        sum_xy[v] = fma(slope_x, dy, sum_xy[v]);
+        sum_yy[v] = fma(slope_y, dy, sum_yy[v]);
 #endif
 #if STATS >= 3
         sum_r[v] = fma(weight, rest_r[k], sum_r[v]);
@@ -239,10 +256,10 @@ __kernel void blend(
 #if STATS == 1
       atomic_add(hits + pair.x, count);
 #endif
-#if STATS == 1 || STATS >= 3
+#if STATS == 1 || STATS == 3 || STATS == 4
       ADD_SUM(0, weights, FIXED_WEIGHT);
 #endif
-#if STATS >= 3
+#if STATS == 3 || STATS == 4
       ADD_SUM(1, sum_r, FIXED_WEIGHT);
       ADD_SUM(2, sum_g, FIXED_WEIGHT);
       ADD_SUM(3, sum_b, FIXED_WEIGHT);
@@ -253,6 +270,16 @@ __kernel void blend(
 #elif STATS == 4
       ADD_SUM(4, errors, FIXED_ERROR);
       ADD_SUM(5, squares, FIXED_ERROR);
+#elif STATS == 5
+      ADD_SUM(0, sum_r, FIXED_WEIGHT);
+      ADD_SUM(1, sum_g, FIXED_WEIGHT);
+      ADD_SUM(2, sum_b, FIXED_WEIGHT);
+      ADD_SUM(3, errors, FIXED_WEIGHT);
+      ADD_SUM(4, sum_x, FIXED_MOMENT);
+      ADD_SUM(5, sum_y, FIXED_MOMENT);
+      ADD_SUM(6, sum_xx, FIXED_MOMENT);
+      ADD_SUM(7, sum_xy, FIXED_MOMENT);
+      ADD_SUM(8, sum_yy, FIXED_MOMENT);
 #endif
     }
 #endif

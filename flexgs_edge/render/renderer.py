@@ -38,6 +38,8 @@ PAIR_SHARE = 8
 """The tile lists take at most this part (one in eight) of what is free beyond the least: the scene comes next."""
 SUM_ROWS = 1 << 18
 """Rows of sums that are on the host at a time."""
+GRADIENT_SUMS = 9
+"""Planes of `Renderer.gradient_sums`."""
 EXTENTS = ("exact", "inria")
 
 
@@ -230,6 +232,12 @@ class Renderer:
         assert self._buffers is not None
         return self._buffers.camera
 
+    @property
+    def records_array(self) -> Any:
+        """The splats of the view drawn last ([N, 16]), in the backend's memory; rows that it does not show hold anything."""
+        assert self._buffers is not None
+        return self._buffers.records
+
     def load(self, source: SceneSource, sum_bytes: int = SUM_BYTES, targets: bool = False) -> DeviceScene:
         """Bring a scene to the backend (all of it, or chunk by chunk for each view when it does not fit).
 
@@ -330,6 +338,25 @@ class Renderer:
         hits, sums = self._sum_arrays(scene, 6)
         residual = self._residual(view, target)
         self._blend(view, "blend_both", (hits, sums, view.buffers.image, residual), again=True)
+        return sums
+
+    def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
+        """What the squared error of one view against `target` changes by when splats change, summed over pixels.
+
+        Of residuals r (target minus view) and the light e that alpha adds when it grows by its own size: sum(alpha T r) for
+        red, green, blue, then sum(r e), and its first and second moments about the splat's centre: x, y, xx, xy, yy.
+
+        Returns
+        -------
+        array of the backend
+            [N, 9, 2] u32, low and high words in units of 1 / `FIXED_WEIGHT`, the moments of 1 / `FIXED_MOMENT`; valid until
+            the next sums.
+        """
+        view = self._prepare(scene, camera)
+        self._blend(view, "blend")
+        hits, sums = self._sum_arrays(scene, GRADIENT_SUMS)
+        residual = self._residual(view, target)
+        self._blend(view, "blend_backward", (hits, sums, view.buffers.image, residual), again=True)
         return sums
 
     def _residual(self, view: _View, target: np.ndarray) -> Any:
