@@ -2,33 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
+COLOURS = ("sh_dc", "sh_rest")
+
 
 @dataclass
 class Mended:
-    """Colours after a refit, by row of the scene (ascending): where the next refit starts."""
+    """Values after a refit (colours) or a descent (all), by row of the scene (ascending): where the next one starts."""
 
     rows: np.ndarray
     degrees: np.ndarray
     planes: dict[str, np.ndarray]
 
     @classmethod
-    def of(cls, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> Mended:
-        """Of refitted `planes`, whose columns belong to `rows` in any order."""
+    def of(
+        cls, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray], fields: Iterable[str] = COLOURS
+    ) -> Mended:
+        """Of the changed fields of `planes`, whose columns belong to `rows` in any order."""
         order = np.argsort(rows)
-        return cls(rows[order], degrees[order], {name: planes[name][:, order] for name in ("sh_dc", "sh_rest")})
+        return cls(rows[order], degrees[order], {name: planes[name][:, order] for name in fields})
 
     def apply(self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """`planes` with these colours where a row was kept with the same SH degree."""
+        """`planes` with these values: geometry wherever a row was kept, colours where it was with the same SH degree."""
         if not len(self.rows) or not len(rows):
             return planes
         at = np.minimum(np.searchsorted(self.rows, rows), len(self.rows) - 1)
-        same = np.flatnonzero((self.rows[at] == rows) & (self.degrees[at] == degrees))
+        kept = self.rows[at] == rows
         changed = {name: planes[name].copy() for name in self.planes}
         for name, values in changed.items():
+            same = np.flatnonzero(kept & (self.degrees[at] == degrees) if name in COLOURS else kept)
+            if name not in COLOURS:
+                values[:, same] = self.planes[name][:, at[same]]
+                continue
             # A grid may have lost its highest degrees: coefficients are channel by channel.
             mended = self.planes[name].reshape(3, -1, len(self.rows))
             values.reshape(3, -1, len(rows))[:, : mended.shape[1], same] = mended[:, :, at[same]]

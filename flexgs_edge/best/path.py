@@ -73,6 +73,9 @@ class PrunePath:
         Mend colours on the way.
     unseen : float
         Share of the Gaussians that no pose sees that stays, the most visible ones from elsewhere first.
+    between : sequence of Camera
+        Further poses that the original is drawn from (targets from `len(cameras)` on): a descent that knew the scored ones alone
+        would fit them at the cost of what lies between.
     """
 
     def __init__(
@@ -86,15 +89,19 @@ class PrunePath:
         refit: bool = True,
         unseen: float = 1.0,
         progress: Progress = SILENT,
+        between: Sequence[Camera] = (),
     ) -> None:
         self.renderer, self.origin, self.refit = renderer, origin, refit
         self.cameras, self.targets, self.progress = cameras, targets, progress
+        self.between = between
         start = take_rows(planes, rows)
         source = MemorySource(start, origin=origin)
         count = max(min(PARTS, len(cameras) // LEAST_VIEWS), 1)
         self._views = [range(first, len(cameras), count) for first in range(count)]
         with renderer.load(source, sum_bytes(2) + moment_bytes(source.sh_degree)) as scene:
             self._parts = [self._measure(scene, some, keep=True) for some in self._views]
+            for view, camera in enumerate(between, start=len(cameras)):
+                targets.add(view, renderer.render_planes(scene, camera))
         costs = RemovalCosts.of(self._parts)
         keep = np.flatnonzero(~_hidden(start, costs.weight2, unseen))
         if len(keep) < len(rows):

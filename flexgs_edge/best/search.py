@@ -25,7 +25,7 @@ from flexgs_edge.best.steps import Slopes, choose_steps, holdable, probe_slopes
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps, from_grid, recolour, to_grid
-from flexgs_edge.refit import refit_colours
+from flexgs_edge.refit import Schedule, distil, refit_colours
 from flexgs_edge.score.removal import RemovalCosts
 
 Product = TypeVar("Product")
@@ -47,6 +47,14 @@ FURTHER = 0.92
 """The same for each further round of the refit over the round before it (fox .92)."""
 DRIFT = -0.12
 """What a second refit, which goes on where the first one ended, adds to the excess (fox -.15, the sample -.3 to 0)."""
+DISTILLED = 0.45
+"""Loss after a descent over the loss before it, until a whole result tells (the sample .42 to .45)."""
+PRUNED_DISTILLED = 1.6
+"""`PRUNED_PART` where a descent follows: it takes more back than pruning may lose."""
+FURTHER_STEPS = 0.4
+"""Steps of a further descent, which goes on where the last one ended, as a share of those of the first."""
+FURTHER_RATE = 0.5
+"""Its rates, as a share of those that the first began with."""
 DECAY = 0.8
 """Part of that which the next refit adds again (fox .9, the sample .4). Above zero where refits fit the scored poses too well."""
 FARTHER = 0.05
@@ -117,6 +125,9 @@ class MultiplierSearch(ABC, Generic[Product]):
     on_step : callable, optional
         Called after each step.
     """
+
+    pruned_part = PRUNED_PART
+    """Part of the allowed loss that the path goes down to."""
 
     def __init__(
         self,
@@ -190,7 +201,7 @@ class MultiplierSearch(ABC, Generic[Product]):
                     break
             elif len(self.path.snapshots) > 1:
                 excess = target.excess(0, self.measure(last.planes))
-                if excess >= math.log(PRUNED_PART):
+                if excess >= math.log(self.pruned_part):
                     break
             if last.count < 16:
                 break
@@ -235,6 +246,8 @@ class RateSearch(MultiplierSearch[GridScene]):
         Exact bytes of a grid's file, and the coder's bit model.
     measure : callable
         Quality of a grid's decoded planes.
+    steps : int
+        Views that the descent to the first whole result looks at; 0: colours are refitted instead.
     """
 
     def __init__(
@@ -245,9 +258,12 @@ class RateSearch(MultiplierSearch[GridScene]):
         effort: Effort,
         refit: bool = True,
         on_step: Callable[[RateStep], None] | None = None,
+        steps: int = 0,
     ) -> None:
         super().__init__(path, measure, effort, on_step)
-        self.size_of, self.refit = size_of, refit
+        self.size_of, self.refit, self.steps = size_of, refit, steps
+        if steps:
+            self.pruned_part = PRUNED_DISTILLED
         self._slopes: Slopes | None = None
         self._mended: Mended | None = None
         self._drift, self._expected = DRIFT, 0.0
@@ -271,7 +287,9 @@ class RateSearch(MultiplierSearch[GridScene]):
         """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
-        mended = math.log(MENDED) + (self.effort.refit_rounds - 1) * math.log(FURTHER)
+        mended = (
+            math.log(DISTILLED) if self.steps else math.log(MENDED) + (self.effort.refit_rounds - 1) * math.log(FURTHER)
+        )
         offset = mended if self.refit and not by_size else 0.0
         if steps:
             offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
@@ -313,13 +331,47 @@ class RateSearch(MultiplierSearch[GridScene]):
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
         started = time.perf_counter()
         kept, steps = self._choice(multiplier)
-        grid = self._finish(kept, steps)
+        grid = self._distilled(kept, steps) if self.steps else self._finish(kept, steps)
         size, _ = self.size_of(grid)
         measurement = self.measure(from_grid(grid))
         excess = target.excess(size, measurement)
         sh_count = int((kept.degrees > 0).sum())
         seconds = time.perf_counter() - started
         return RateStep(multiplier, len(kept.rows), sh_count, size, measurement, excess, seconds), grid
+
+    def _distilled(self, kept: Kept, steps: Steps) -> GridScene:
+        """All values moved towards the original's renders with the grid in view, on the grid, and the constant refitted."""
+        path = self.path
+        first = self._mended is None
+        schedule = Schedule(self.steps) if first else Schedule(math.ceil(FURTHER_STEPS * self.steps), FURTHER_RATE)
+        moved = distil(
+            path.renderer,
+            kept.planes,
+            kept.degrees,
+            path.origin,
+            [*path.cameras, *path.between],
+            path.targets,
+            schedule,
+            steps,
+            progress=path.progress,
+        )
+        self._mended = Mended.of(kept.rows, kept.degrees, moved, moved)
+        grid, order = to_grid(moved, kept.degrees, holdable(steps, moved), path.origin)
+        if not self.refit:
+            return grid
+        moved = refit_colours(
+            path.renderer,
+            from_grid(grid),
+            kept.degrees[order],
+            path.origin,
+            path.cameras,
+            path.targets,
+            rounds=1,
+            bands=False,
+            subsets=self.effort.subsets_of(len(path.cameras)),
+            progress=path.progress,
+        )
+        return recolour(grid, moved["sh_dc"], moved["sh_rest"])
 
     def _finish(self, kept: Kept, steps: Steps) -> GridScene:
         """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""

@@ -16,6 +16,7 @@ from flexgs_edge.best.path import PARTS, PrunePath, sums_room
 from flexgs_edge.best.search import MultiplierSearch, Product, RateResult, RateSearch, RateStep
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
+from flexgs_edge.cameras.between import poses_between
 from flexgs_edge.cameras.order import farthest_order
 from flexgs_edge.codec.container2 import coded_parts
 from flexgs_edge.constants import ALPHA_MIN
@@ -28,7 +29,9 @@ from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.workspace import Stopwatch, coding_device
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice
+from flexgs_edge.refit import descent_bytes
 from flexgs_edge.render import Renderer
+from flexgs_edge.render.device_scene import plane_bytes
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
@@ -66,7 +69,17 @@ def grid_search(
         return (size if options.layers == 1 else round(LAYERS_COST * size)), bits
 
     plan = EFFORTS[options.effort]
-    return lambda path, measure, report: search(path, size_of, measure, plan, options.refit, report)
+
+    def make(path: PrunePath, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
+        steps = distil_steps(options, len(path.cameras))
+        return search(path, size_of, measure, plan, options.refit, report, steps)
+
+    return make
+
+
+def distil_steps(options: CompressOptions, poses: int) -> int:
+    """Steps of the descent to the first whole result; 0 for none."""
+    return round(EFFORTS[options.effort].passes * poses) if options.distil is None else options.distil
 
 
 def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[WrittenFile]:
@@ -142,9 +155,12 @@ def open_path(
     scored = scored_poses(cameras, options)
     size = source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep)
     largest = max(scored, key=lambda camera: camera.width * camera.height)
-    budget.require(
-        "a search by measured costs", size + renderer.least_bytes(source, largest, sums_room(source.sh_degree))
-    )
+    steps = distil_steps(options, len(scored))
+    sums = sums_room(source.sh_degree)
+    if steps:
+        # A descent holds what is kept, with all that it remembers, at once: as much as the whole scene at the most.
+        sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))
+    budget.require("a search by measured costs", size + renderer.least_bytes(source, largest, sums))
     budget.take("the scene and its path", size)
     try:
         planes = source.read(slice(0, source.count), list(FIELD))
@@ -161,6 +177,7 @@ def open_path(
                     refit=options.refit,
                     unseen=options.unseen_share,
                     progress=progress,
+                    between=poses_between(scored) if steps else (),
                 )
             del planes  # the path has its own
             yield path

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexgs_edge.constants import FACTOR_MIN, FIXED_MOMENT, FIXED_WEIGHT, GRADIENT_MIN, LOG2_E, SH_C0, SH_C1, SH_C2, SH_C3, SH_C4
+from flexgs_edge.constants import (
+    FACTOR_MIN,
+    FIXED_MOMENT,
+    FIXED_WEIGHT,
+    GRADIENT_MIN,
+    LOG2_E,
+    SH_C0,
+    SH_C1,
+    SH_C2,
+    SH_C3,
+    SH_C4,
+)
 from flexgs_edge.kernels.twins.arithmetic import Triple, dot3, f32, fexp2, fma
 from flexgs_edge.kernels.twins.project import sh_basis
 
@@ -91,10 +102,10 @@ def project_backward(
     moments[:, :4] *= f32(-2.0 / FIXED_WEIGHT)
     moments[:, 4:] *= f32(-2.0 / FIXED_MOMENT)
     record = records[base + rows, :9]
-    own = [plane[:, rows] for plane in (means, log_scales, quats, sh_rest)]
+    centres, scales, turns = (plane[:, rows] for plane in (means, log_scales, quats))
     out = np.zeros((len(gradient), len(rows)), f32)
-    out[AT_DC:], toward = _colours(degree, camera, own[0], own[3], degrees[rows], record, moments)
-    out[:AT_LOGIT] = _geometry(antialiased, camera, *own[:3], record, moments, toward)
+    out[AT_DC:], toward = _colours(degree, camera, centres, sh_rest[:, rows], degrees[rows], record, moments)
+    out[:AT_LOGIT] = _geometry(antialiased, camera, centres, scales, turns, record, moments, toward)
     opacity = f32(1) / (f32(1) + fexp2(logits.reshape(-1)[rows] * f32(-LOG2_E)))
     out[AT_LOGIT] = moments[:, 3] * (f32(1) - opacity)
     gradient[:, rows] = out
@@ -185,10 +196,7 @@ def _geometry(
     scales = [fma(v0[k], g0[k], v1[k] * g1[k]) for k in range(3)]
 
     v0, v1 = [v0[k] * s[k] for k in range(3)], [v1[k] * s[k] for k in range(3)]
-    turn = [
-        fma(h0[b], v0[a], h1[b] * v1[a]) - fma(h0[a], v0[b], h1[a] * v1[b])
-        for a, b in ((1, 2), (2, 0), (0, 1))
-    ]
+    turn = [fma(h0[b], v0[a], h1[b] * v1[a]) - fma(h0[a], v0[b], h1[a] * v1[b]) for a, b in ((1, 2), (2, 0), (0, 1))]
     twice = two * (inv / big)
     rotation = [
         -(twice * dot3(x, y, z, *turn)),
@@ -273,7 +281,9 @@ def snap(
     for k in range(bands + 1):
         level = int(np.searchsorted((0, 3, 8, 15), k))
         luma_step, chroma_step = steps[4 + 2 * level : 6 + 2 * level]
-        source, to, at = (values[AT_SH:], sh_rest, slice(k - 1, None, bands)) if k else (values[AT_DC:AT_SH], sh_dc, slice(None))
+        source, to, at = (
+            (values[AT_SH:], sh_rest, slice(k - 1, None, bands)) if k else (values[AT_DC:AT_SH], sh_dc, slice(None))
+        )
         red, green, blue = source[at]
         if luma_step > 0:
             both = red + blue
