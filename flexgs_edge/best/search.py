@@ -47,8 +47,10 @@ FURTHER = 0.92
 """The same for each further round of the refit over the round before it (fox .92)."""
 DRIFT = -0.12
 """What a second refit, which goes on where the first one ended, adds to the excess (fox -.15, the sample -.3 to 0)."""
-DISTILLED = 0.45
-"""Loss after a descent over the loss before it, until a whole result tells (the sample .42 to .45)."""
+DISTILLED = 0.33
+"""Loss after a descent over the loss before it, until a whole result tells (the sample .34)."""
+DRIFT_DISTILLED = -0.4
+"""`DRIFT` of a further descent (the sample -.43)."""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` where a descent follows: it takes more back than pruning may lose."""
 FURTHER_STEPS = 0.4
@@ -266,7 +268,7 @@ class RateSearch(MultiplierSearch[GridScene]):
             self.pruned_part = PRUNED_DISTILLED
         self._slopes: Slopes | None = None
         self._mended: Mended | None = None
-        self._drift, self._expected = DRIFT, 0.0
+        self._drift, self._expected = DRIFT_DISTILLED if steps else DRIFT, 0.0
 
     def _calibrate(self, multiplier: float) -> None:
         """Ask the coder what Gaussians cost near the answer. Once: or every step would search another function."""
