@@ -18,7 +18,7 @@ from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.effort import EFFORTS, Effort
 from flexgs_edge.best.kept import Mended
 from flexgs_edge.best.path import Snapshot, take_rows
-from flexgs_edge.best.search import EXTRA_STEPS, RateResult, RateSearch, RateStep
+from flexgs_edge.best.search import DISTILLED, EXTRA_STEPS, RateResult, RateSearch, RateStep
 from flexgs_edge.best.steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps
@@ -248,6 +248,38 @@ def test_efforts_grow() -> None:
         assert getattr(fast, name) <= getattr(balanced, name) <= getattr(thorough, name)
         assert getattr(fast, name) < getattr(thorough, name)
     assert fast.close > balanced.close > thorough.close
+    assert EFFORTS["max"].passes > 0 == fast.passes == balanced.passes == thorough.passes
+
+
+@pytest.mark.parametrize("found", [0.2, 0.33, 0.5])
+def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: float) -> None:
+    """The first whole result takes all steps, the next ones a part; values go on where they were, also those of geometry."""
+    seen: list[tuple[int, float, float]] = []
+
+    def distil(
+        renderer: Any,
+        planes: Any,
+        degrees: Any,
+        origin: Any,
+        cameras: Any,
+        targets: Any,
+        schedule: Any,
+        steps: Any,
+        **_: Any,
+    ) -> Any:
+        seen.append((schedule.steps, schedule.rate, float(planes["opacity_logits"].max())))
+        return {**planes, "opacity_logits": np.full_like(planes["opacity_logits"], 9.0)}
+
+    monkeypatch.setattr(search_module, "distil", distil)
+    monkeypatch.setattr(search_module, "refit_colours", lambda renderer, planes, *_, **__: planes)
+    world = World(lambda m: found / DISTILLED * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
+    path = FakePath()
+    path.cameras, path.between, path.progress = [], [], None  # type: ignore[attr-defined]
+    result = search(world, MaxDrop(1.0), path, refit=True, steps=100)
+    assert result.reached and len(seen) == len(result.steps)
+    first, *others = seen
+    assert first[:2] == (100, 1.0) and first[2] < 9
+    assert others and all(other == (40, 0.5, 9.0) for other in others)
 
 
 def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> None:
@@ -264,3 +296,12 @@ def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> Non
     expected[:, :3, 2:] = 1
     np.testing.assert_array_equal(found["sh_rest"].reshape(3, 8, 4), expected)
     assert not planes["sh_dc"].any() and found["means"] is planes["means"]
+
+
+def test_geometry_goes_on_whatever_the_degree() -> None:
+    moved = {"sh_dc": np.ones((3, 2), np.float32), "means": np.array([[1, 2]] * 3, np.float32)}
+    last = Mended.of(np.array([7, 2]), np.array([1, 0]), moved, moved)
+    planes = {"sh_dc": np.zeros((3, 3), np.float32), "means": np.zeros((3, 3), np.float32)}
+    found = last.apply(np.array([1, 2, 7]), np.array([1, 1, 1]), planes)
+    np.testing.assert_array_equal(found["means"], [[0, 2, 1]] * 3)
+    np.testing.assert_array_equal(found["sh_dc"], [[0, 0, 1]] * 3)

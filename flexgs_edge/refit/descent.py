@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from flexgs_edge.budget import format_mib
 from flexgs_edge.cameras import Camera
+from flexgs_edge.constants import LANES
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.grid import Steps
 from flexgs_edge.render import DeviceScene, Renderer, sum_bytes
@@ -75,17 +77,19 @@ class Descent:
         self.count, self.widths = source.count, widths(source.sh_degree)
         self._parts: list[_Part] = []
         self._arrays: list[Any] = []
-        self._scene = renderer.load(source, descent_bytes(source.sh_degree), targets=True)
+        # Planes of the last chunk with SH and of the last without are padded.
+        size = descent_bytes(source.sh_degree) * (self.count + 2 * LANES)
+        self._scene = renderer.load(source, -(-size // max(self.count, 1)), targets=True)
         try:
             renderer.render_planes(self._scene, camera)
             if not self._scene.resident:
-                short = descent_bytes(source.sh_degree) * source.count
                 raise BudgetError(
                     f"distilling {source.count} Gaussians keeps all of them in memory at once with what their steps remember "
-                    f"({short >> 20} MiB), more than the memory limit leaves: use a larger --memory-limit, or --effort thorough"
+                    f"({format_mib(size)}), more than the memory limit leaves: use a larger --memory-limit, or --effort thorough"
                 )
             self._rates, self._steps = (self._array((n,)) for n in (sum(self.widths.values()), GRID_VALUES))
-            self._parts = [_Part(self._scene, chunk, planes, degrees) for chunk in self._scene.chunks()]
+            for chunk in self._scene.chunks():
+                self._parts.append(_Part(self._scene, chunk, planes, degrees))
             self.put_on(None)
         except BaseException:
             self.close()
