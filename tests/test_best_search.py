@@ -256,17 +256,8 @@ def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: 
     """The first whole result takes all steps, the next ones a part; values go on where they were, also those of geometry."""
     seen: list[tuple[int, float, float]] = []
 
-    def distil(
-        renderer: Any,
-        planes: Any,
-        degrees: Any,
-        origin: Any,
-        cameras: Any,
-        targets: Any,
-        schedule: Any,
-        steps: Any,
-        **_: Any,
-    ) -> Any:
+    def distil(renderer: Any, planes: Any, *rest: Any, **_: Any) -> Any:
+        schedule = rest[-2]
         seen.append((schedule.steps, schedule.rate, float(planes["opacity_logits"].max())))
         return {**planes, "opacity_logits": np.full_like(planes["opacity_logits"], 9.0)}
 
