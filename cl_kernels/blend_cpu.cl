@@ -148,6 +148,12 @@ __kernel void blend(
 #if STATS >= 4
   FW rest_r[BLOCKS * BLOCK_VECTORS], rest_g[BLOCKS * BLOCK_VECTORS], rest_b[BLOCKS * BLOCK_VECTORS];
   load_blocks(rest, tiles_x, height, tile_px, tile_py, rest_r, rest_g, rest_b);
+#if STATS == 5
+  // Gradients ask for one number of what lies behind a splat: its product with the residual. It goes on in the place of red.
+  if (!resume)
+    for (int k = 0; k < BLOCKS * BLOCK_VECTORS; ++k)
+      red[k] = fma(target_b[k], rest_b[k], fma(target_g[k], rest_g[k], target_r[k] * rest_r[k]));
+#endif
 #elif STATS == 3
 #define rest_r target_r
 #define rest_g target_g
@@ -185,6 +191,9 @@ __kernel void blend(
     FETCH(records + ahead * 16);
 #if STATS
     FETCH(sums + ahead * (2 * SUMS));
+#if STATS == 5
+    FETCH(sums + ahead * (2 * SUMS) + 2 * SUMS - 1);  // of a row of 72 bytes the end may lie in the next line
+#endif
 #endif
     uint mask = pair.y & live;
     if (!mask) continue;
@@ -214,27 +223,33 @@ __kernel void blend(
         FW dx = X_OF(b, v) - mx, dy = y_of[(b >> 2) * BLOCK_VECTORS + v] - my;
         FW alpha = splat_alpha(dx, dy, ca, cb, cc, level);
         FW weight;
-        IW hit = blend_over(alpha, cr, cg, cbl, red + k, green + k, blue + k, trans + k, &weight);
+#if STATS == 5
+        const IW hit = pass_through(alpha, trans + k, &weight);
+#else
+        const IW hit = blend_over(alpha, cr, cg, cbl, red + k, green + k, blue + k, trans + k, &weight);
+#endif
 #if STATS
         hit_sum[v] += hit;
 #endif
 #if STATS == 1 || STATS == 3 || STATS == 4
         weights[v] += weight;
 #endif
-#if STATS == 2 || STATS >= 4
-        // What the pixel would change by without this splat: its own light goes, what lies behind it gets brighter.
+#if STATS == 2 || STATS == 4
         const FW ratio = pick(hit, alpha * reciprocal((FW)1.0f - alpha), (FW)0.0f);
+        // What the pixel would change by without this splat: its own light goes, what lies behind it gets brighter.
         const FW er = fma(weight, cr, -(ratio * (target_r[k] - red[k])));
         const FW eg = fma(weight, cg, -(ratio * (target_g[k] - green[k])));
         const FW eb = fma(weight, cbl, -(ratio * (target_b[k] - blue[k])));
-#endif
-#if STATS == 2 || STATS == 4
         errors[v] += fma(eb, eb, fma(eg, eg, er * er));
         squares[v] = fma(weight, weight, squares[v]);
 #elif STATS == 5
-        // What more light the pixel gets where it lacks some when alpha grows by its own size, unless the cap holds it: the
-        // exponent's gradient. Its moments about the centre are those of the centre and of the conic.
-        const FW light = fma(eb, rest_b[k], fma(eg, rest_g[k], er * rest_r[k]));
+        // The same light times the residual, unless alpha is held at its cap: the exponent's gradient. Its moments about the
+        // splat's centre are the gradients of the centre and of the conic.
+        const FW own_light = weight * fma(cbl, rest_b[k], fma(cg, rest_g[k], cr * rest_r[k]));
+        red[k] -= own_light;
+        // Among so much else a division costs less than `reciprocal` (a tenth of this kernel).
+        const FW ratio = pick(hit, alpha / ((FW)1.0f - alpha), (FW)0.0f);
+        const FW light = fma(-ratio, red[k], own_light);
         const FW slope = pick(MASK(alpha < (FW)ALPHA_MAX), light, (FW)0.0f), slope_x = slope * dx, slope_y = slope * dy;
         errors[v] += slope;
         sum_x[v] += slope_x;
@@ -294,6 +309,7 @@ __kernel void blend(
     }
     return;
   }
+#if STATS != 5
   const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
   for (int b = 0; b < BLOCKS; ++b) {
     float lanes[3][16];
@@ -308,4 +324,5 @@ __kernel void blend(
     for (int c = 0; c < 3; ++c)
       for (int row = 0; row < BLOCK; ++row) vstore4(vload4(row, lanes[c]), 0, at + c * plane + row * pitch);
   }
+#endif
 }

@@ -82,6 +82,9 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
 #endif
 #if STATS >= 4
   const float rest_r = rest[here], rest_g = rest[plane + here], rest_b = rest[2 * plane + here];
+#if STATS == 5
+  if (!resume) red = fma(target_b, rest_b, fma(target_g, rest_g, target_r * rest_r));   // see blend_cpu.cl
+#endif
 #elif STATS == 3
   const float rest_r = target_r, rest_g = target_g, rest_b = target_b;
 #endif
@@ -110,24 +113,27 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
         const int seen = alpha >= ALPHA_MIN;
         hit = seen && next >= TRANSMITTANCE_MIN;
         weight = hit ? alpha * t : 0.0f;
+#if STATS != 5
         red = fma(weight, splats[n][6], red);
         green = fma(weight, splats[n][7], green);
         blue = fma(weight, splats[n][8], blue);
+#endif
         t = hit ? next : seen ? -fabs(t) : t;
       }
 #if STATS
       if (p == 0) counts = 0;
-#if STATS == 2 || STATS >= 4
+#if STATS == 2 || STATS == 4
       const float ratio = hit ? alpha * reciprocal(1.0f - alpha) : 0.0f;
       const float er = fma(weight, splats[n][6], -(ratio * (target_r - red)));
       const float eg = fma(weight, splats[n][7], -(ratio * (target_g - green)));
       const float eb = fma(weight, splats[n][8], -(ratio * (target_b - blue)));
-#endif
-#if STATS == 2 || STATS == 4
       const float error = fma(eb, eb, fma(eg, eg, er * er));
 #elif STATS == 5
-      const float light = fma(eb, rest_b, fma(eg, rest_g, er * rest_r));
-      const float error = alpha < ALPHA_MAX ? light : 0.0f;   // the slope, see blend_cpu.cl
+      const float own_light = weight * fma(splats[n][8], rest_b, fma(splats[n][7], rest_g, splats[n][6] * rest_r));
+      red -= own_light;
+      const float ratio = hit ? alpha / (1.0f - alpha) : 0.0f;
+      const float light = fma(-ratio, red, own_light);
+      const float error = alpha < ALPHA_MAX ? light : 0.0f;   // the slope
 #endif
 #if STATS == 2
       parts[0][p] = error;
@@ -195,10 +201,12 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
     }
   }
   if (finish) {
+#if STATS != 5
     __global float *at = image + here;
     at[0] = fma(fabs(t), background_r, red);
     at[plane] = fma(fabs(t), background_g, green);
     at[2 * plane] = fma(fabs(t), background_b, blue);
+#endif
   } else {
     own[0] = red;
     own[256] = green;

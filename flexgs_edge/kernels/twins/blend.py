@@ -174,9 +174,15 @@ def blend(
         ys, xs = py.astype(np.int64), px.astype(np.int64)
         own_target = target.reshape(image.shape)[:, ys, xs] if stats > 1 and target is not None else None
         own_rest = own_target if rest is None else rest.reshape(image.shape)[:, ys, xs]
+        if stats == 5 and not resume and own_target is not None and own_rest is not None:
+            # What lies behind a splat, times the residual, goes on in the place of red.
+            red, green, blue = (own_target[c] for c in range(3))
+            colour[0] = fma(blue, own_rest[2], fma(green, own_rest[1], red * own_rest[0]))
         entries = _blend_blocks(lists, part[:, 0], records, (px, py), colour, trans, stats, own_target, own_rest)
         if entries is not None and hits is not None and sums is not None:
             _add_sums(stats, lists, entries, own_rest, part[:, 0], hits, sums)
+        if finish and stats == 5:
+            continue
         if finish:
             image[:, ys, xs] = fma(np.abs(trans), background[:, None, None], colour)
         else:
@@ -219,7 +225,7 @@ def _blend_blocks(
         seen = alpha >= f32(ALPHA_MIN)
         hit = seen & (after >= f32(TRANSMITTANCE_MIN))
         weight = np.where(hit, alpha * t, f32(0))
-        for c in range(3):
+        for c in range(3 if stats != 5 else 0):
             colour[c, units] = fma(weight, r[:, 6 + c : 7 + c], colour[c, units])
         trans[units] = np.where(hit, after, np.where(seen, -np.abs(t), t))
         if not stats:
@@ -227,15 +233,19 @@ def _blend_blocks(
         entries.hit[entry], entries.weight[entry] = hit, weight
         if stats in (2, 4, 5):
             assert target is not None
-            ratio = np.where(hit, alpha * reciprocal(f32(1) - alpha), f32(0))
-            behind = (target[c, units] - colour[c, units] for c in range(3))
-            er, eg, eb = (fma(weight, r[:, 6 + c : 7 + c], -(ratio * light)) for c, light in enumerate(behind))
+            cr, cg, cb = (r[:, 6 + c : 7 + c] for c in range(3))
             if stats == 5:
                 assert rest is not None
-                light = fma(eb, rest[2, units], fma(eg, rest[1, units], er * rest[0, units]))
+                light = weight * fma(cb, rest[2, units], fma(cg, rest[1, units], cr * rest[0, units]))
+                colour[0, units] -= light
+                ratio = np.where(hit, alpha / (f32(1) - alpha), f32(0))
+                light = fma(-ratio, colour[0, units], light)
                 entries.error[entry] = np.where(alpha < f32(ALPHA_MAX), light, f32(0))
                 entries.place[0, entry], entries.place[1, entry] = dx, dy
             else:
+                ratio = np.where(hit, alpha * reciprocal(f32(1) - alpha), f32(0))
+                behind = (target[c, units] - colour[c, units] for c in range(3))
+                er, eg, eb = (fma(weight, own, -(ratio * b)) for own, b in zip((cr, cg, cb), behind, strict=True))
                 entries.error[entry] = fma(eb, eb, fma(eg, eg, er * er))
     return entries if stats else None
 
