@@ -268,9 +268,35 @@ def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: 
     path.cameras, path.between, path.progress = [], [], None  # type: ignore[attr-defined]
     result = search(world, MaxDrop(1.0), path, refit=True, steps=100)
     assert result.reached and len(seen) == len(result.steps)
-    first, *others = seen
-    assert first[:2] == (100, 1.0) and first[2] < 9
-    assert others and all(other == (40, 0.5, 9.0) for other in others)
+    tried: list[float] = []
+    for step, call in zip(result.steps, seen, strict=True):
+        # From a descent that kept as much or more; else from the beginning.
+        expected = (40, 0.5) if any(multiplier <= step.multiplier for multiplier in tried) else (100, 1.0)
+        assert call[:2] == expected and (call[2] == 9.0) == (expected[0] == 40)
+        tried.append(step.multiplier)
+    assert len(seen) > 1 and 40 in [steps for steps, *_ in seen]
+
+
+@pytest.mark.parametrize(("steps", "after"), [(100, 1), (100, 0), (0, 1)])
+def test_an_interrupted_search_with_descents_keeps_the_best(
+    monkeypatch: pytest.MonkeyPatch, steps: int, after: int
+) -> None:
+    done: list[int] = []
+
+    def whole(self: RateSearch, multiplier: float, target: Target) -> Any:
+        if len(done) == after:
+            raise KeyboardInterrupt
+        done.append(1)
+        grid = self._unmended(multiplier)
+        measurement = Measurement(0.5, 42.0, 0.5)
+        return RateStep(multiplier, 1, 0, 4000, measurement, target.excess(4000, measurement), 0.0), grid
+
+    monkeypatch.setattr(RateSearch, "_whole", whole)
+    if steps and after:
+        assert search(powers(), MaxDrop(1.0), steps=steps).chosen.size == 4000
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            search(powers(), MaxDrop(1.0), steps=steps)
 
 
 def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> None:

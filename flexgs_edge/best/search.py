@@ -6,6 +6,7 @@ was itself measured to hold. Steps are counted, never timed: same command, same 
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from abc import ABC, abstractmethod
@@ -28,6 +29,8 @@ from flexgs_edge.grid import GridScene, Steps, from_grid, recolour, to_grid
 from flexgs_edge.refit import Schedule, distil, refit_colours
 from flexgs_edge.score.removal import RemovalCosts
 
+LOG = logging.getLogger("flexgs_edge")
+
 Product = TypeVar("Product")
 """What a step makes: a grid, or a finished file."""
 
@@ -47,9 +50,10 @@ FURTHER = 0.92
 """The same for each further round of the refit over the round before it (fox .92)."""
 DRIFT = -0.12
 """What a second refit, which goes on where the first one ended, adds to the excess (fox -.15, the sample -.3 to 0)."""
-DISTILLED = 0.33
-"""Loss after a descent over the loss before it, until a whole result tells (the sample .34)."""
-DRIFT_DISTILLED = -0.4
+DISTILLED = 0.5
+"""Loss after a descent over the loss before it, until a whole result tells; above what was seen (the sample .34, fox .38): from
+a result that holds, further descents go on with fewer Gaussians, but not with more."""
+DRIFT_DISTILLED = -0.3
 """`DRIFT` of a further descent (the sample -.43)."""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` where a descent follows: it takes more back than pruning may lose."""
@@ -130,6 +134,8 @@ class MultiplierSearch(ABC, Generic[Product]):
 
     pruned_part = PRUNED_PART
     """Part of the allowed loss that the path goes down to."""
+    keeps_best = False
+    """An interrupted search answers with the best so far, where its results take long; otherwise it ends."""
 
     def __init__(
         self,
@@ -169,7 +175,13 @@ class MultiplierSearch(ABC, Generic[Product]):
         self._calibrate(multiplier)
         multiplier = self._aim(multiplier, steps, target)
         for count in range(self.effort.steps + EXTRA_STEPS):
-            step, product = self._whole(multiplier, target)
+            try:
+                step, product = self._whole(multiplier, target)
+            except KeyboardInterrupt:
+                if best is None or not self.keeps_best:
+                    raise
+                LOG.warning("interrupted: the best of %d results is taken", len(steps))
+                break
             steps.append(step)
             if self.on_step:
                 self.on_step(step)
@@ -265,9 +277,10 @@ class RateSearch(MultiplierSearch[GridScene]):
         super().__init__(path, measure, effort, on_step)
         self.size_of, self.refit, self.steps = size_of, refit, steps
         if steps:
-            self.pruned_part = PRUNED_DISTILLED
+            self.pruned_part, self.keeps_best = PRUNED_DISTILLED, True
         self._slopes: Slopes | None = None
         self._mended: Mended | None = None
+        self._descents: list[tuple[float, Mended]] = []
         self._drift, self._expected = DRIFT_DISTILLED if steps else DRIFT, 0.0
 
     def _calibrate(self, multiplier: float) -> None:
@@ -321,8 +334,9 @@ class RateSearch(MultiplierSearch[GridScene]):
     def _choice(self, multiplier: float) -> tuple[Kept, Steps]:
         """What a multiplier keeps, with the colours of the last refit, and the grid steps."""
         kept = self.kept(multiplier)
-        if self._mended is not None:
-            kept.planes = self._mended.apply(kept.rows, kept.degrees, kept.planes)
+        mended = self._descended(multiplier) if self.steps else self._mended
+        if mended is not None:
+            kept.planes = mended.apply(kept.rows, kept.degrees, kept.planes)
         snapshot = self.path.snapshots[kept.snapshot]
         if self._slopes is None:
             # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
@@ -333,7 +347,7 @@ class RateSearch(MultiplierSearch[GridScene]):
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
         started = time.perf_counter()
         kept, steps = self._choice(multiplier)
-        grid = self._distilled(kept, steps) if self.steps else self._finish(kept, steps)
+        grid = self._distilled(multiplier, kept, steps) if self.steps else self._finish(kept, steps)
         size, _ = self.size_of(grid)
         measurement = self.measure(from_grid(grid))
         excess = target.excess(size, measurement)
@@ -341,10 +355,19 @@ class RateSearch(MultiplierSearch[GridScene]):
         seconds = time.perf_counter() - started
         return RateStep(multiplier, len(kept.rows), sh_count, size, measurement, excess, seconds), grid
 
-    def _distilled(self, kept: Kept, steps: Steps) -> GridScene:
+    def _descended(self, multiplier: float) -> Mended | None:
+        """Values of the last descent that kept what this multiplier keeps and more.
+
+        Not of one that kept less: its values make up for what it lacked, and would be too much of it with that back (fox: .92 dB
+        at 366 kB after 1.15 at 278, where the curve would have .76).
+        """
+        before = [(at, mended) for at, mended in self._descents if at <= multiplier]
+        return max(before, key=lambda pair: pair[0])[1] if before else None
+
+    def _distilled(self, multiplier: float, kept: Kept, steps: Steps) -> GridScene:
         """All values moved towards the original's renders with the grid in view, on the grid, and the constant refitted."""
         path = self.path
-        first = self._mended is None
+        first = self._descended(multiplier) is None
         schedule = Schedule(self.steps) if first else Schedule(math.ceil(FURTHER_STEPS * self.steps), FURTHER_RATE)
         moved = distil(
             path.renderer,
@@ -357,7 +380,7 @@ class RateSearch(MultiplierSearch[GridScene]):
             steps,
             progress=path.progress,
         )
-        self._mended = Mended.of(kept.rows, kept.degrees, moved, moved)
+        self._descents.append((multiplier, Mended.of(kept.rows, kept.degrees, moved, moved)))
         grid, order = to_grid(moved, kept.degrees, holdable(steps, moved), path.origin)
         if not self.refit:
             return grid

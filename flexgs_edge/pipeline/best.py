@@ -46,6 +46,8 @@ codes, values of codes twice, colours of the last refit and of this one, and sum
 of 48 dB (nearly all rows stay) had a peak 90 MiB above its limit, with 9 one of 12 MiB."""
 
 
+DESCENTS = 3
+"""Stored planes of the scene's rows that the values of all descents take: two results at 0.1 dB, six at 1 dB (a third of the rows)."""
 LAYERS_COST = 1.06
 """Bytes of a layered file over those of one without, at most: neighbours on the curve are farther apart (1.052 for fox in four
 layers)."""
@@ -160,6 +162,7 @@ def open_path(
     if steps:
         # A descent holds what is kept, with all that it remembers, at once: as much as the whole scene at the most.
         sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))
+        size += source.count * DESCENTS * stored_bytes(source.sh_degree)
     budget.require("a search by measured costs", size + renderer.least_bytes(source, largest, sums))
     budget.take("the scene and its path", size)
     try:
@@ -249,13 +252,18 @@ def layered(
     )
 
 
+def stored_bytes(sh_degree: int) -> int:
+    """Bytes of a row's stored planes."""
+    return sum(4 * field.width(sh_degree) for field in FIELD.values())
+
+
 def row_bytes(sh_degree: int, keep: float) -> int:
     """Bytes that a search holds for each row of its scene, at most, beside what the renderer counts.
 
     Either snapshots down to nothing, each `keep` of the one before; or, when nearly all is kept, one of them and all that a
     whole result of it needs. What lies between is between.
     """
-    planes = sum(4 * field.width(sh_degree) for field in FIELD.values())
+    planes = stored_bytes(sh_degree)
     snapshot = planes + COST_BYTES + BAND_BYTES * sh_degree
     parts = PARTS * 8 * (2 + 4 * sh_degree)
     return round(max(snapshot / (1 - keep), snapshot + WORK_PLANES * planes)) + parts
