@@ -47,7 +47,7 @@ of 48 dB (nearly all rows stay) had a peak 90 MiB above its limit, with 9 one of
 
 
 DESCENTS = 3
-"""Stored planes of the scene's rows that the values of all descents take: two results at 0.1 dB, six at 1 dB (a third of the rows)."""
+"""Times the scene's stored planes that the values of all descents take: two results at 0.1 dB, six or more at 1 dB."""
 LAYERS_COST = 1.06
 """Bytes of a layered file over those of one without, at most: neighbours on the curve are farther apart (1.052 for fox in four
 layers)."""

@@ -30,11 +30,12 @@ half its opacity's), 1.40 with twice all of these."""
 LAST = 0.1
 """Rates at the end of each part as a share of those at its beginning; they fall by the same share at each step."""
 ON_GRID = 2 / 3
-"""Share of the steps after which views are drawn from values on their grids."""
+"""Share of the steps before views are drawn from values on their grids."""
+
 HELD = ("means", "log_scales", "quats")
-"""Fields that stay where they are from then on. Codes of geometry that flip back and forth move whole splats, and the last of them
-decide: the sample at 71 kB and 420 steps lost 1.07 to 1.79 dB with them free, by what views came last; 1.07 (fidelity 39.4 instead
-of 39.0 to 39.3) with them held, 1.40 without this part. Opacities held as well: 1.19."""
+"""Fields that stay where they are from then on. Codes of geometry that flip back and forth move whole splats, and
+the last of them decide: the sample at 71 kB and 420 steps lost 1.07 to 1.79 dB with them free, by what views came last; 1.07 with
+them held (fidelity 39.4, not 37.5 to 39.3), 1.40 without this part. Opacities held as well: 1.19."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +56,10 @@ class Schedule:
     rate: float = 1.0
     on_grid: float = ON_GRID
 
-    @property
-    def free_steps(self) -> int:
-        """Steps before values are put on their grids for drawing."""
-        return round(self.on_grid * self.steps)
-
-    def place(self, step: int) -> float:
-        """How far a step is in its part, from 0 on and below 1."""
-        first, last = (0, self.free_steps) if step < self.free_steps else (self.free_steps, self.steps)
-        return (step - first) / max(last - first, 1)
+    def parts(self, grid: bool) -> tuple[range, range]:
+        """Steps off the grid, and on it (none where there is none)."""
+        free = round(self.on_grid * self.steps) if grid else self.steps
+        return range(free), range(free, self.steps)
 
     def order(self, views: int) -> np.ndarray:
         """[steps] i64, which view each step looks at: all of them in a shuffled order, then in another."""
@@ -125,13 +121,13 @@ def distil(
     ordered = {name: np.ascontiguousarray(values[:, rows]) for name, values in ordered.items()}
     with Descent(renderer, ordered, degrees[rows], origin, largest) as descent:
         order = schedule.order(len(cameras))
-        for k, view in enumerate(progress.track(order, "distilling", len(order))):
-            if k == schedule.free_steps:
+        for part, held in zip(schedule.parts(steps is not None), ((), HELD), strict=True):
+            if held and len(part):
                 descent.put_on(steps)
-            now = schedule.rate * LAST ** schedule.place(k)
-            held = HELD if k >= schedule.free_steps and steps is not None else ()
-            moving = {name: 0.0 if name in held else now * rate for name, rate in rates.items()}
-            descent.step(cameras[view], targets[view], moving)
+            for k in progress.track(part, f"distilling{' on the grid' if held else ''}", len(part)):
+                now = schedule.rate * LAST ** ((k - part.start) / len(part))
+                moving = {name: 0.0 if name in held else now * rate for name, rate in rates.items()}
+                descent.step(cameras[order[k]], targets[order[k]], moving)
         moved = descent.planes()
     back = np.empty_like(rows)
     back[rows] = np.arange(len(rows))
