@@ -11,17 +11,29 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from dataclasses import replace
+from typing import Generic
 
 import numpy as np
 
 from flexgs_edge.adapt import Measurement, Target
-from flexgs_edge.adapt.line import AIM, NEAREST, next_point
+from flexgs_edge.adapt.line import AIM, next_point
 from flexgs_edge.best.choice import BitModel, choose, drop_bands
 from flexgs_edge.best.effort import Effort
 from flexgs_edge.best.kept import Kept, Mended
 from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
+from flexgs_edge.best.results import (
+    LARGEST_STRIDE,
+    SIZE_SLOPE,
+    SLOPE,
+    Product,
+    RateResult,
+    RateStep,
+    better,
+    bounds,
+    misses,
+    next_multiplier,
+)
 from flexgs_edge.best.steps import Slopes, choose_steps, holdable, probe_slopes
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
@@ -31,16 +43,10 @@ from flexgs_edge.score.removal import RemovalCosts
 
 LOG = logging.getLogger("flexgs_edge")
 
-Product = TypeVar("Product")
-"""What a step makes: a grid, or a finished file."""
 
 PRUNED_PART = 0.45
 """Part of the allowed loss that pruning alone has used up when a whole result meets the target (fox .45, the sample .55): where
 the search starts."""
-SLOPE = 0.7
-"""Slope of the log of the drop over the log of the multiplier before two points are measured (fox .55 to .77)."""
-SIZE_SLOPE = -0.45
-"""The same for the log of the size."""
 FINE_COLOUR = 2.0**-8
 """Colour steps before the refit, as a share of the final ones: only geometry shall move."""
 MOST_ROUNDS = 24
@@ -71,52 +77,8 @@ EXTRA_STEPS = 4
 """Steps beyond the effort's own while nothing holds, or what does is far below the target."""
 FAR = 0.25
 """Excess below the target that is far: a sixth of the bytes."""
-LARGEST_STRIDE = 1.2
-"""Largest change of the log of the multiplier between two steps."""
 FARTHEST = 2.0
 """The same for probes together."""
-
-
-@dataclass(frozen=True)
-class RateStep:
-    """One whole result that the search looked at.
-
-    Parameters
-    ----------
-    multiplier : float
-        Squared error that a bit is worth.
-    count, sh_count : int
-        Gaussians kept, and those with SH.
-    size : int
-        Bytes of the file.
-    measurement : Measurement
-    excess : float
-        By how much the target was missed; zero or less holds.
-    seconds : float
-    """
-
-    multiplier: float
-    count: int
-    sh_count: int
-    size: int
-    measurement: Measurement
-    excess: float
-    seconds: float
-
-    @property
-    def holds(self) -> bool:
-        """The target holds here."""
-        return self.excess <= 0.0
-
-
-@dataclass(frozen=True)
-class RateResult(Generic[Product]):
-    """The answer of a search: what to write and the way to it."""
-
-    product: Product
-    chosen: RateStep
-    reached: bool
-    steps: tuple[RateStep, ...]
 
 
 class MultiplierSearch(ABC, Generic[Product]):
@@ -187,7 +149,7 @@ class MultiplierSearch(ABC, Generic[Product]):
                 self.on_step(step)
             if best is None:
                 best = (step, product)
-            elif _better(step, best[0], target):
+            elif better(step, best[0], target):
                 self.discard(best[1])
                 best = (step, product)
             else:
@@ -196,7 +158,7 @@ class MultiplierSearch(ABC, Generic[Product]):
             enough = best[0].holds and best[0].excess > -FAR and count + 1 >= self.effort.steps
             if close or enough or step.multiplier < 1e-30:
                 break
-            multiplier = self._aim(_next_multiplier(steps, target), steps, target)
+            multiplier = self._aim(next_multiplier(steps, target), steps, target)
         assert best is not None
         chosen, product = best
         if not chosen.holds and not best_effort:
@@ -313,8 +275,8 @@ class RateSearch(MultiplierSearch[GridScene]):
                 if len(steps) > 1:
                     self._drift = DECAY * (self._drift + steps[-1].excess - self._expected)
                 # Whatever the reason that results keep missing: go farther each time.
-                offset += self._drift + FARTHER * max(_misses(steps) - 1, 0)
-        low, high = _bounds(steps, by_size)
+                offset += self._drift + FARTHER * max(misses(steps) - 1, 0)
+        low, high = bounds(steps, by_size)
         place = min(max(math.log(multiplier), low), high)
         # Curves that are flat, where nothing holds, must not send the search to the end of numbers.
         low, high = max(low, place - FARTHEST), min(high, place + FARTHEST)
@@ -437,39 +399,3 @@ class RateSearch(MultiplierSearch[GridScene]):
             )
         final = replace(grid.steps, dc=steps.dc, sh=steps.sh[: grid.sh_degree])
         return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"])
-
-
-def _better(step: RateStep, other: RateStep, target: Target) -> bool:
-    """Whether `step` is the better answer: holding before missing, then fewer bytes (a size target: less loss)."""
-    if step.holds != other.holds:
-        return step.holds
-    if not step.holds:
-        return step.excess < other.excess
-    if target.limit_bytes is not None:
-        return step.measurement.loss(target.judge) < other.measurement.loss(target.judge)
-    return step.size < other.size
-
-
-def _misses(steps: Sequence[RateStep]) -> int:
-    """How many of the last results missed the target."""
-    return next((count for count, step in enumerate(reversed(steps)) if step.holds), len(steps))
-
-
-def _bounds(steps: Sequence[RateStep], by_size: bool) -> tuple[float, float]:
-    """Logs of the multipliers between which the answer lies, away from both ends; infinite where none is known.
-
-    One end is the farthest result that holds, the other the nearest miss beyond it. Misses before it are void: refits go on
-    from each other, and had not come as far then.
-    """
-    sign = -1.0 if by_size else 1.0
-    low = max((sign * math.log(s.multiplier) for s in steps if s.holds), default=-math.inf)
-    high = min((m for s in steps if not s.holds and (m := sign * math.log(s.multiplier)) > low), default=math.inf)
-    room = NEAREST * (high - low) if math.isfinite(high - low) else 0.0
-    ends = sign * (low + room), sign * (high - room)
-    return min(ends), max(ends)
-
-
-def _next_multiplier(steps: Sequence[RateStep], target: Target) -> float:
-    """Where the excess is expected to be just below zero, in the log of the multiplier."""
-    slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
-    return math.exp(next_point([(math.log(s.multiplier), s.excess) for s in steps], slope, LARGEST_STRIDE))
