@@ -1,4 +1,4 @@
-"""Views: ms by stage and ns by tile pair, hit counting over the training views, and the first image of a process.
+"""Views: ms by stage and ns by tile pair, hits over the training views, steps of a descent, and the first image of a process.
 
 python -m benchmarks.view [--scene fox|sample] [--device SPEC] [--repeats N]
 """
@@ -10,12 +10,16 @@ import os
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Callable
 
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, backend_of, check, parse, run_module
 from flexgs_edge.cameras import Camera, read_cameras, split_views
+from flexgs_edge.refit.descent import Descent
+from flexgs_edge.refit.distil import rates_for
 from flexgs_edge.render import DeviceScene, Renderer, Statistics
+from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.ply import PlySource
 from flexgs_edge.study.timing import STAGES
 
@@ -82,6 +86,38 @@ def bench_counting(
     )
 
 
+def bench_descent(bench: Bench, renderer: Renderer, source: PlySource, cameras: list[Camera]) -> None:
+    """Gradients of all values of every Gaussian, and steps along them, against drawing the same views; by processor time."""
+    chosen = cameras[:: max(len(cameras) // VIEWS, 1)][:VIEWS]
+    planes = source.read(slice(0, source.count), list(FIELD))
+    rates = rates_for(cameras)
+    with renderer.load(source) as scene:
+        targets = [(0.9 * renderer.render_planes(scene, camera)).astype(np.float16) for camera in chosen]
+        drawn = [
+            _processor_ms(chosen, lambda k: renderer.render_planes(scene, chosen[k])) for _ in range(bench.repeats)
+        ]
+    with Descent(renderer, planes, np.full(source.count, source.sh_degree), source.origin, chosen[0]) as descent:
+        found: dict[str, list[float]] = {"gradients": [], "step": []}
+        for _ in range(bench.repeats):
+            found["gradients"].append(_processor_ms(chosen, lambda k: descent.differentiate(chosen[k], targets[k])))
+            found["step"].append(_processor_ms(chosen, lambda k: descent.step(chosen[k], targets[k], rates)))
+        check(all(np.isfinite(part).all() and part.any() for part in descent.gradients().values()), "gradients")
+    note = f"{len(chosen)} views; processor time of all cores, the view included"
+    for name, values in found.items():
+        bench.add(f"descent: {name}", values, "ms", note)
+    ratios = [a / b - 1 for a, b in zip(found["gradients"], drawn, strict=True)]
+    bench.add("descent: backward over forward", ratios, "x", "gradients without their view, over the view")
+
+
+def _processor_ms(chosen: list[Camera], run: Callable[[int], object]) -> float:
+    """Of one view, after one that does not count."""
+    run(0)
+    start = time.process_time()
+    for k in range(len(chosen)):
+        run(k)
+    return (time.process_time() - start) / len(chosen) * 1e3
+
+
 def bench_first_image(bench: Bench, scene: str, device: str | None) -> None:
     """From the start of a process to its first image, without and with the compiler's cache."""
     arguments = ["--first-image", "--scene", scene, *(["--device", device] if device else [])]
@@ -112,6 +148,7 @@ def main() -> None:
         bench = Bench(backend.name, options.repeats)
         bench_views(bench, renderer, scene, cameras)
         bench_counting(bench, renderer, scene, cameras, golden)
+    bench_descent(bench, renderer, PlySource(folder / "point_cloud.ply"), cameras)
     renderer.release()
     if not backend.is_numpy and "POCL_CACHE_DIR" not in os.environ:
         bench_first_image(bench, options.scene, options.device)

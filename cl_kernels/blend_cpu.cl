@@ -10,7 +10,7 @@
 #define RETIRE_EVERY 16          // splats between two looks for blocks whose pixels have all ended
 
 #ifndef STATS
-#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs) must be defined"
+#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs, 5: gradients) must be defined"
 #endif
 
 // Lane l of vector v is pixel (l + v W) of the block, row by row.
@@ -37,7 +37,7 @@ inline int any_alive(FW t) {
 }
 
 #if STATS
-#define SUMS (STATS == 1 ? 1 : STATS == 2 ? 2 : STATS == 3 ? 4 : 6)
+#define SUMS (STATS == 1 ? 1 : STATS == 2 ? 2 : STATS == 3 ? 4 : STATS == 4 ? 6 : 9)
 #if defined(cl_khr_int64_base_atomics) && defined(__ENDIAN_LITTLE__)
 #pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
 // The same words in one step: sums below zero take two with 32 bits.
@@ -114,9 +114,9 @@ __kernel void blend(
     ,
     __global uint *hits,                  // [N]
     __global uint *sums,                  // [N, SUMS, 2] low and high words of fixed-point sums
-    __global const float *target          // [3, padded height, padded width] 2, 4: the finished image, 3: the residual
+    __global const float *target          // [3, padded height, padded width] 2, 4, 5: the finished image, 3: the residual
 #endif
-#if STATS == 4
+#if STATS >= 4
     ,
     __global const float *rest            // [3, padded height, padded width] the residual
 #endif
@@ -148,9 +148,15 @@ __kernel void blend(
   FW target_r[BLOCKS * BLOCK_VECTORS], target_g[BLOCKS * BLOCK_VECTORS], target_b[BLOCKS * BLOCK_VECTORS];
   load_blocks(target, tiles_x, height, tile_px, tile_py, target_r, target_g, target_b);
 #endif
-#if STATS == 4
+#if STATS >= 4
   FW rest_r[BLOCKS * BLOCK_VECTORS], rest_g[BLOCKS * BLOCK_VECTORS], rest_b[BLOCKS * BLOCK_VECTORS];
   load_blocks(rest, tiles_x, height, tile_px, tile_py, rest_r, rest_g, rest_b);
+#if STATS == 5
+  // Gradients ask for one number of what lies behind a splat: its product with the residual. It goes on in the place of red.
+  if (!resume)
+    for (int k = 0; k < BLOCKS * BLOCK_VECTORS; ++k)
+      red[k] = fma(target_b[k], rest_b[k], fma(target_g[k], rest_g[k], target_r[k] * rest_r[k]));
+#endif
 #elif STATS == 3
 #define rest_r target_r
 #define rest_g target_g
@@ -188,6 +194,9 @@ __kernel void blend(
     FETCH(records + ahead * 16);
 #if STATS
     FETCH(sums + ahead * (2 * SUMS));
+#if STATS == 5
+    FETCH(sums + ahead * (2 * SUMS) + 2 * SUMS - 1);  // of a row of 72 bytes the end may lie in the next line
+#endif
 #endif
     uint mask = pair.y & live;
     if (!mask) continue;
@@ -198,6 +207,10 @@ __kernel void blend(
     IW hit_sum[BLOCK_VECTORS];
     FW weights[BLOCK_VECTORS], squares[BLOCK_VECTORS], errors[BLOCK_VECTORS];
     FW sum_r[BLOCK_VECTORS], sum_g[BLOCK_VECTORS], sum_b[BLOCK_VECTORS];
+#if STATS == 5
+    FW sum_x[BLOCK_VECTORS], sum_y[BLOCK_VECTORS], sum_xx[BLOCK_VECTORS], sum_xy[BLOCK_VECTORS], sum_yy[BLOCK_VECTORS];
+    for (int v = 0; v < BLOCK_VECTORS; ++v) sum_x[v] = sum_y[v] = sum_xx[v] = sum_xy[v] = sum_yy[v] = (FW)0.0f;
+#endif
     for (int v = 0; v < BLOCK_VECTORS; ++v) {
       hit_sum[v] = (IW)0;
       weights[v] = squares[v] = errors[v] = sum_r[v] = sum_g[v] = sum_b[v] = (FW)0.0f;
@@ -213,21 +226,40 @@ __kernel void blend(
         FW dx = X_OF(b, v) - mx, dy = y_of[(b >> 2) * BLOCK_VECTORS + v] - my;
         FW alpha = splat_alpha(dx, dy, ca, cb, cc, level);
         FW weight;
-        IW hit = blend_over(alpha, cr, cg, cbl, red + k, green + k, blue + k, trans + k, &weight);
+#if STATS == 5
+        const IW hit = pass_through(alpha, trans + k, &weight);
+#else
+        const IW hit = blend_over(alpha, cr, cg, cbl, red + k, green + k, blue + k, trans + k, &weight);
+#endif
 #if STATS
         hit_sum[v] += hit;
 #endif
-#if STATS == 1 || STATS >= 3
+#if STATS == 1 || STATS == 3 || STATS == 4
         weights[v] += weight;
 #endif
 #if STATS == 2 || STATS == 4
-        // What the pixel would change by without this splat: its own light goes, what lies behind it gets brighter.
         const FW ratio = pick(hit, alpha * reciprocal((FW)1.0f - alpha), (FW)0.0f);
+        // What the pixel would change by without this splat: its own light goes, what lies behind it gets brighter.
         const FW er = fma(weight, cr, -(ratio * (target_r[k] - red[k])));
         const FW eg = fma(weight, cg, -(ratio * (target_g[k] - green[k])));
         const FW eb = fma(weight, cbl, -(ratio * (target_b[k] - blue[k])));
         errors[v] += fma(eb, eb, fma(eg, eg, er * er));
         squares[v] = fma(weight, weight, squares[v]);
+#elif STATS == 5
+        // The same light times the residual, unless alpha is held at its cap: the exponent's gradient. Its moments about the
+        // splat's centre are the gradients of the centre and of the conic.
+        const FW own_light = weight * fma(cbl, rest_b[k], fma(cg, rest_g[k], cr * rest_r[k]));
+        red[k] -= own_light;
+        // Among so much else a division costs less than `reciprocal` (a tenth of this kernel).
+        const FW ratio = pick(hit, alpha / ((FW)1.0f - alpha), (FW)0.0f);
+        const FW light = fma(-ratio, red[k], own_light);
+        const FW slope = pick(MASK(alpha < (FW)ALPHA_MAX), light, (FW)0.0f), slope_x = slope * dx, slope_y = slope * dy;
+        errors[v] += slope;
+        sum_x[v] += slope_x;
+        sum_y[v] += slope_y;
+        sum_xx[v] = fma(slope_x, dx, sum_xx[v]);
+        sum_xy[v] = fma(slope_x, dy, sum_xy[v]);
+        sum_yy[v] = fma(slope_y, dy, sum_yy[v]);
 #endif
 #if STATS >= 3
         sum_r[v] = fma(weight, rest_r[k], sum_r[v]);
@@ -242,10 +274,10 @@ __kernel void blend(
 #if STATS == 1
       atomic_add(hits + pair.x, count);
 #endif
-#if STATS == 1 || STATS >= 3
+#if STATS == 1 || STATS == 3 || STATS == 4
       ADD_SUM(0, weights, FIXED_WEIGHT);
 #endif
-#if STATS >= 3
+#if STATS == 3 || STATS == 4
       ADD_SUM(1, sum_r, FIXED_WEIGHT);
       ADD_SUM(2, sum_g, FIXED_WEIGHT);
       ADD_SUM(3, sum_b, FIXED_WEIGHT);
@@ -256,6 +288,16 @@ __kernel void blend(
 #elif STATS == 4
       ADD_SUM(4, errors, FIXED_ERROR);
       ADD_SUM(5, squares, FIXED_ERROR);
+#elif STATS == 5
+      ADD_SUM(0, sum_r, FIXED_WEIGHT);
+      ADD_SUM(1, sum_g, FIXED_WEIGHT);
+      ADD_SUM(2, sum_b, FIXED_WEIGHT);
+      ADD_SUM(3, errors, FIXED_WEIGHT);
+      ADD_SUM(4, sum_x, FIXED_MOMENT);
+      ADD_SUM(5, sum_y, FIXED_MOMENT);
+      ADD_SUM(6, sum_xx, FIXED_MOMENT);
+      ADD_SUM(7, sum_xy, FIXED_MOMENT);
+      ADD_SUM(8, sum_yy, FIXED_MOMENT);
 #endif
     }
 #endif
@@ -270,6 +312,7 @@ __kernel void blend(
     }
     return;
   }
+#if STATS != 5
   const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
   for (int b = 0; b < BLOCKS; ++b) {
     float lanes[3][16];
@@ -284,4 +327,5 @@ __kernel void blend(
     for (int c = 0; c < 3; ++c)
       for (int row = 0; row < BLOCK; ++row) vstore4(vload4(row, lanes[c]), 0, at + c * plane + row * pitch);
   }
+#endif
 }

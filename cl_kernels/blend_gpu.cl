@@ -7,7 +7,7 @@
 #error "the GPU form is scalar: build with -DW=1"
 #endif
 #ifndef STATS
-#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs) must be defined"
+#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs, 5: gradients) must be defined"
 #endif
 
 #define BATCH 64   // splats in local memory at a time
@@ -24,6 +24,9 @@
 #elif STATS == 4
 #define SUMS 6
 #define SUM_UNIT (c < 4 ? FIXED_WEIGHT : FIXED_ERROR)
+#elif STATS == 5
+#define SUMS 9
+#define SUM_UNIT (c < 4 ? FIXED_WEIGHT : FIXED_MOMENT)
 #endif
 
 __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
@@ -47,7 +50,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
     __global uint *sums,
     __global const float *target
 #endif
-#if STATS == 4
+#if STATS >= 4
     ,
     __global const float *rest
 #endif
@@ -77,8 +80,11 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
 #if STATS > 1
   const float target_r = target[here], target_g = target[plane + here], target_b = target[2 * plane + here];
 #endif
-#if STATS == 4
+#if STATS >= 4
   const float rest_r = rest[here], rest_g = rest[plane + here], rest_b = rest[2 * plane + here];
+#if STATS == 5
+  if (!resume) red = fma(target_b, rest_b, fma(target_g, rest_g, target_r * rest_r));   // see blend_cpu.cl
+#endif
 #elif STATS == 3
   const float rest_r = target_r, rest_g = target_g, rest_b = target_b;
 #endif
@@ -107,9 +113,11 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
         const int seen = alpha >= ALPHA_MIN;
         hit = seen && next >= TRANSMITTANCE_MIN;
         weight = hit ? alpha * t : 0.0f;
+#if STATS != 5
         red = fma(weight, splats[n][6], red);
         green = fma(weight, splats[n][7], green);
         blue = fma(weight, splats[n][8], blue);
+#endif
         t = hit ? next : seen ? -fabs(t) : t;
       }
 #if STATS
@@ -120,6 +128,12 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
       const float eg = fma(weight, splats[n][7], -(ratio * (target_g - green)));
       const float eb = fma(weight, splats[n][8], -(ratio * (target_b - blue)));
       const float error = fma(eb, eb, fma(eg, eg, er * er));
+#elif STATS == 5
+      const float own_light = weight * fma(splats[n][8], rest_b, fma(splats[n][7], rest_g, splats[n][6] * rest_r));
+      red -= own_light;
+      const float ratio = hit ? alpha / (1.0f - alpha) : 0.0f;
+      const float light = fma(-ratio, red, own_light);
+      const float error = alpha < ALPHA_MAX ? light : 0.0f;   // the slope
 #endif
 #if STATS == 2
       parts[0][p] = error;
@@ -132,7 +146,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
       parts[2][p] = rest_g;
       parts[3][p] = rest_b;
 #endif
-#if STATS == 4
+#if STATS >= 4
       parts[4][p] = error;
 #endif
       barrier(CLK_LOCAL_MEM_FENCE);
@@ -142,15 +156,28 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
       for (int c = 0; c < SUMS; ++c) sum[c] = 0.0f;
       if (p < 16)
         for (int k = p; k < 256; k += 16) {
+#if STATS != 5
           sum[0] += parts[0][k];
+#endif
 #if STATS == 2
           sum[1] = fma(parts[1][k], parts[1][k], sum[1]);
-#elif STATS >= 3
+#elif STATS == 3 || STATS == 4
           for (int c = 1; c < 4; ++c) sum[c] = fma(parts[0][k], parts[c][k], sum[c]);
 #endif
 #if STATS == 4
           sum[4] += parts[4][k];
           sum[5] = fma(parts[0][k], parts[0][k], sum[5]);
+#elif STATS == 5
+          for (int c = 0; c < 3; ++c) sum[c] = fma(parts[0][k], parts[c + 1][k], sum[c]);
+          const float kx = (float)((int)(tile % tiles_x) * TILE + BLOCK * (k >> 4 & 3) + (k & 3)) - splats[n][0];
+          const float ky = (float)((int)(tile / tiles_x) * TILE + BLOCK * (k >> 6) + (k >> 2 & 3)) - splats[n][1];
+          const float slope_x = parts[4][k] * kx, slope_y = parts[4][k] * ky;
+          sum[3] += parts[4][k];
+          sum[4] += slope_x;
+          sum[5] += slope_y;
+          sum[6] = fma(slope_x, kx, sum[6]);
+          sum[7] = fma(slope_x, ky, sum[7]);
+          sum[8] = fma(slope_y, ky, sum[8]);
 #endif
         }
       barrier(CLK_LOCAL_MEM_FENCE);
@@ -175,10 +202,12 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
     }
   }
   if (finish) {
+#if STATS != 5
     __global float *at = image + here;
     at[0] = fma(fabs(t), background_r, red);
     at[plane] = fma(fabs(t), background_g, green);
     at[2 * plane] = fma(fabs(t), background_b, blue);
+#endif
   } else {
     own[0] = red;
     own[256] = green;

@@ -130,6 +130,12 @@ FIXED_WEIGHT: Final = 2.0**32
 FIXED_ERROR: Final = 2.0**40
 """Units of the 64-bit fixed-point sums over tiles and views, of weights and of squared errors: any order of adding gives the
 same bits. A pixel's weight is at most 1; errors get finer units since those of small splats decide what goes first."""
+FIXED_MOMENT: Final = 2.0**26
+"""The same for the gradient's moments about a splat's centre, in pixels and squared pixels: a splat may fill an
+image of 2000 pixels a side that lacks a tenth of its light everywhere (1.3e11) before the sum wraps."""
+GRADIENT_MIN: Final = 1e-15
+"""Gradients and their running means below this count as zero: squares of smaller ones leave the normal numbers, where devices
+differ."""
 FIXED_LARGEST: Final = 2.0**62
 """Values are clamped to this before they become integers: what a view adds, or all tiles of a view together."""
 

@@ -18,7 +18,7 @@ from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.effort import EFFORTS, LARGEST_STEP, PIXELS_A_ROW, Effort, sampled_poses
 from flexgs_edge.best.kept import Mended
 from flexgs_edge.best.path import Snapshot, take_rows
-from flexgs_edge.best.search import EXTRA_STEPS, RateResult, RateSearch, RateStep
+from flexgs_edge.best.search import DISTILLED, EXTRA_STEPS, RateResult, RateSearch, RateStep
 from flexgs_edge.best.steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps
@@ -262,6 +262,55 @@ def test_efforts_grow() -> None:
         assert getattr(fast, name) <= getattr(balanced, name) <= getattr(thorough, name)
         assert getattr(fast, name) < getattr(thorough, name)
     assert fast.close > balanced.close > thorough.close
+    assert EFFORTS["max"].passes > 0 == fast.passes == balanced.passes == thorough.passes
+
+
+@pytest.mark.parametrize("found", [0.2, 0.33, 0.5])
+def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: float) -> None:
+    """The first whole result takes all steps, the next ones a part; values go on where they were, also those of geometry."""
+    seen: list[tuple[int, float, float]] = []
+
+    def distil(renderer: Any, planes: Any, *rest: Any, **_: Any) -> Any:
+        schedule = rest[-2]
+        seen.append((schedule.steps, schedule.rate, float(planes["opacity_logits"].max())))
+        return {**planes, "opacity_logits": np.full_like(planes["opacity_logits"], 9.0)}
+
+    monkeypatch.setattr(search_module, "distil", distil)
+    monkeypatch.setattr(search_module, "refit_colours", lambda renderer, planes, *_, **__: planes)
+    world = World(lambda m: found / DISTILLED * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
+    path = FakePath()
+    path.cameras, path.between, path.progress = [], [], None  # type: ignore[attr-defined]
+    result = search(world, MaxDrop(1.0), path, refit=True, steps=100)
+    assert result.reached and len(seen) == len(result.steps)
+    tried: list[float] = []
+    for step, call in zip(result.steps, seen, strict=True):
+        # From a descent that kept as much or more; else from the beginning.
+        expected = (40, 0.5) if any(multiplier <= step.multiplier for multiplier in tried) else (100, 1.0)
+        assert call[:2] == expected and (call[2] == 9.0) == (expected[0] == 40)
+        tried.append(step.multiplier)
+    assert len(seen) > 1 and 40 in [steps for steps, *_ in seen]
+
+
+@pytest.mark.parametrize(("steps", "after"), [(100, 1), (100, 0), (0, 1)])
+def test_an_interrupted_search_with_descents_keeps_the_best(
+    monkeypatch: pytest.MonkeyPatch, steps: int, after: int
+) -> None:
+    done: list[int] = []
+
+    def whole(self: RateSearch, multiplier: float, target: Target) -> Any:
+        if len(done) == after:
+            raise KeyboardInterrupt
+        done.append(1)
+        grid = self._unmended(multiplier)
+        measurement = Measurement(0.5, 42.0, 0.5)
+        return RateStep(multiplier, 1, 0, 4000, measurement, target.excess(4000, measurement), 0.0), grid
+
+    monkeypatch.setattr(RateSearch, "_whole", whole)
+    if steps and after:
+        assert search(powers(), MaxDrop(1.0), steps=steps).chosen.size == 4000
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            search(powers(), MaxDrop(1.0), steps=steps)
 
 
 def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> None:
@@ -290,3 +339,12 @@ def test_poses_have_no_more_pixels_than_the_rows_need(count: int, step: int) -> 
         assert pixels >= PIXELS_A_ROW * count
     # Not the same lattice in every view.
     assert len({(camera.cx, camera.cy) for camera in sampled}) == min(step**2, 8)
+
+
+def test_geometry_goes_on_whatever_the_degree() -> None:
+    moved = {"sh_dc": np.ones((3, 2), np.float32), "means": np.array([[1, 2]] * 3, np.float32)}
+    last = Mended.of(np.array([7, 2]), np.array([1, 0]), moved, moved)
+    planes = {"sh_dc": np.zeros((3, 3), np.float32), "means": np.zeros((3, 3), np.float32)}
+    found = last.apply(np.array([1, 2, 7]), np.array([1, 1, 1]), planes)
+    np.testing.assert_array_equal(found["means"], [[0, 2, 1]] * 3)
+    np.testing.assert_array_equal(found["sh_dc"], [[0, 0, 1]] * 3)

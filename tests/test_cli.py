@@ -18,9 +18,10 @@ import pytest
 
 from flexgs_edge import cli
 from flexgs_edge.adapt import REFINE_STEPS
+from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.cli import words
 from flexgs_edge.errors import BudgetError, DeviceError, InputError, TargetError
-from flexgs_edge.pipeline.options import METHODS, SELECTS, CompressOptions, ViewOptions
+from flexgs_edge.pipeline.options import EFFORT_WORDS, METHODS, SELECTS, CompressOptions, ViewOptions
 from flexgs_edge.score import SCORES
 from tiny_project import COUNT, make_project
 
@@ -88,7 +89,7 @@ def test_words_of_the_options_are_those_of_the_library() -> None:
     given = {parameter.name: parameter for parameter in command.params}
     fields = set(CompressOptions.__dataclass_fields__)
     assert fields <= set(given), fields - set(given)
-    assert tuple(given["effort"].type.choices) == tuple(REFINE_STEPS)
+    assert tuple(given["effort"].type.choices) == EFFORT_WORDS == tuple(EFFORTS) and set(REFINE_STEPS) < set(EFFORTS)
     assert tuple(given["method"].type.choices) == METHODS and tuple(given["select"].type.choices) == SELECTS
     score = importlib.import_module("flexgs_edge.cli.score").command
     assert tuple({p.name: p for p in score.params}["score"].type.choices) == SCORES

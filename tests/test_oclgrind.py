@@ -22,9 +22,12 @@ from flexgs_edge.cameras import Camera
 from flexgs_edge.codec import GridSource, write_grid
 from flexgs_edge.codec.chunk_kernel import ChunkKernel
 from flexgs_edge.codec.coder import decode_chunk
+from flexgs_edge.grid import Steps
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.refit import refit_colours
+from flexgs_edge.refit.descent import Descent
+from flexgs_edge.refit.distil import FIELD_RATES
 from flexgs_edge.render import Renderer, Statistics, device_scene, view_buffers
 from flexgs_edge.render.similarity import ssims
 from flexgs_edge.scene.fields import FIELD
@@ -89,7 +92,7 @@ def results(backend: OpenCLBackend | TwinBackend) -> Iterator[np.ndarray]:
 
 
 def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
-    """Costs of removal and of dropped SH, and a round of the colour refit, over chunks that begin at an odd row.
+    """Costs of removal and of dropped SH, a round of the colour refit, a step of a descent; chunks that begin at an odd row.
 
     As many rows as their planes are padded to: a vector that reads past the last row reads past the buffer.
     """
@@ -106,6 +109,10 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
     planes = refit_colours(drawer, planes, np.full(source.count, 4), source.origin, [camera], targets, rounds=1)
     yield planes["sh_dc"]
     yield planes["sh_rest"]
+    with Descent(drawer, planes, np.full(source.count, 4), source.origin, camera) as descent:
+        descent.put_on(Steps(0.01, 0.1, 0.03, 0.2, 0.05, (0.04,) * 4))
+        descent.step(camera, targets[0], {"means": 1e-2, **FIELD_RATES})
+        yield from descent.planes().values()
 
 
 def lane(width: int, form: str) -> None:

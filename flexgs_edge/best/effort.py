@@ -40,6 +40,8 @@ class Effort:
         the bytes.
     views : int
         Most scored poses.
+    passes : float
+        Times that the descent to the first whole result looks at every scored pose; 0: colours are refitted instead.
     """
 
     keep: float
@@ -48,6 +50,7 @@ class Effort:
     steps: int
     close: float
     views: int
+    passes: float = 0.0
 
     def subsets_of(self, poses: int) -> int:
         """Steps a round for so many scored poses."""
@@ -78,4 +81,5 @@ EFFORTS = {
     "fast": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=1, close=0.08, views=48),
     "balanced": Effort(keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.05, views=96),
     "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, views=400),
+    "max": Effort(keep=0.88, refit_rounds=1, subsets=7, steps=2, close=0.05, views=96, passes=6.0),
 }

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from flexgs_edge.scratch import MEMORY, Room, blocks
 
+COLOURS = ("sh_dc", "sh_rest")
+
 
 @dataclass
 class Mended:
-    """Colours after a refit, by row of the scene (ascending): where the next refit starts."""
+    """Values after a refit (colours) or a descent (all), by row of the scene (ascending): where the next one starts."""
 
     rows: np.ndarray
     degrees: np.ndarray
@@ -25,24 +28,30 @@ class Mended:
         order: np.ndarray,
         planes: dict[str, np.ndarray],
         room: Room = MEMORY,
+        fields: Iterable[str] = COLOURS,
     ) -> Mended:
-        """Of refitted `planes`, whose columns belong to `rows[order]`; rows ascending."""
+        """Of the changed fields of `planes`, whose columns belong to `rows[order]`; rows ascending."""
         back = room.empty((len(order),), np.int64)
         back[order] = np.arange(len(order))
-        return cls(rows, degrees, {name: room.take(planes[name], back) for name in ("sh_dc", "sh_rest")})
+        return cls(rows, degrees, {name: room.take(planes[name], back) for name in fields})
 
     def apply(
         self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray], room: Room = MEMORY
     ) -> dict[str, np.ndarray]:
-        """`planes` with these colours where a row was kept with the same SH degree."""
+        """`planes` with these values: geometry wherever a row was kept, colours where it was with the same SH degree."""
         if not len(self.rows) or not len(rows):
             return planes
         changed = {name: room.copy(planes[name]) for name in self.planes}
         for part in blocks(len(rows)):
             some = rows[part]
             at = np.minimum(np.searchsorted(self.rows, some), len(self.rows) - 1)
-            same = np.flatnonzero((self.rows[at] == some) & (self.degrees[at] == degrees[part]))
+            kept = self.rows[at] == some
+            alike = kept & (self.degrees[at] == degrees[part])
             for name, values in changed.items():
+                same = np.flatnonzero(alike if name in COLOURS else kept)
+                if name not in COLOURS:
+                    values[:, part.start + same] = self.planes[name][:, at[same]]
+                    continue
                 # A grid may have lost its highest degrees: coefficients are channel by channel.
                 mended = self.planes[name].reshape(3, -1, len(self.rows))
                 values.reshape(3, -1, len(rows))[:, : mended.shape[1], part.start + same] = mended[:, :, at[same]]

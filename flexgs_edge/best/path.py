@@ -92,6 +92,9 @@ class PrunePath:
         Share of the Gaussians that no pose sees that stays, the most visible ones from elsewhere first.
     checkpoint : Checkpoint, optional
         Keeps every round; rounds that are there are taken from it.
+    between : sequence of Camera
+        Further poses that the original is drawn from (targets from `len(cameras)` on): a descent that knew the scored ones alone
+        would fit them at the cost of what lies between.
     """
 
     def __init__(
@@ -106,11 +109,12 @@ class PrunePath:
         unseen: float = 1.0,
         progress: Progress = SILENT,
         checkpoint: Checkpoint | None = None,
+        between: Sequence[Camera] = (),
     ) -> None:
         self.checkpoint = checkpoint
         self.renderer, self.origin, self.refit = renderer, origin, refit
         self.cameras, self.targets, self.progress = cameras, targets, progress
-        self.room, self.rows = renderer.room, rows
+        self.room, self.rows, self.between = renderer.room, rows, between
         count = max(min(PARTS, len(cameras) // LEAST_VIEWS), 1)
         self._views = [range(first, len(cameras), count) for first in range(count)]
         self._parts: list[CostParts] = []
@@ -127,6 +131,8 @@ class PrunePath:
         source = MemorySource(start, origin=self.origin)
         with self.renderer.load(source, sum_bytes(2) + moment_bytes(source.sh_degree)) as scene:
             self._parts = [self._measure(scene, some, keep=True) for some in self._views]
+            for view, camera in enumerate(self.between, start=len(self.cameras)):
+                self.targets.add(view, self.renderer.render_planes(scene, camera))
         costs = RemovalCosts.of(self._parts, room)
         rows = room.copy(np.arange(len(self.rows)))
         keep = np.flatnonzero(~_hidden(start, costs.weight2, unseen))
@@ -170,7 +176,9 @@ class PrunePath:
             for number, part in enumerate(self._parts):
                 arrays += [(f"part-{number}-{name}", getattr(part, name)) for name in PART_NAMES]
             if keep_views and self.refit:
-                arrays += [(f"view-{view}", self.targets[view]) for view in range(len(self.cameras))]
+                arrays += [
+                    (f"view-{view}", self.targets[view]) for view in range(len(self.cameras) + len(self.between))
+                ]
             self.checkpoint.save(len(self.snapshots) - 1, arrays)
         return snapshot
 
@@ -186,7 +194,7 @@ class PrunePath:
         ]
         self.snapshots.append(Snapshot(arrays["rows"], planes, RemovalCosts.of(self._parts, self.room)))
         if number == 0 and self.refit:
-            for view in range(len(self.cameras)):
+            for view in range(len(self.cameras) + len(self.between)):
                 self.targets.add(view, arrays[f"view-{view}"])
         return True
 

@@ -6,40 +6,49 @@ was itself measured to hold. Steps are counted, never timed: same command, same 
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from dataclasses import replace
+from typing import Generic
 
 import numpy as np
 
 from flexgs_edge.adapt import Measurement, Target
-from flexgs_edge.adapt.line import AIM, NEAREST, next_point
+from flexgs_edge.adapt.line import AIM, next_point
 from flexgs_edge.best.choice import BitModel, choose, drop_bands
 from flexgs_edge.best.effort import Effort
 from flexgs_edge.best.kept import Kept, Mended
 from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
+from flexgs_edge.best.results import (
+    LARGEST_STRIDE,
+    SIZE_SLOPE,
+    SLOPE,
+    Product,
+    RateResult,
+    RateStep,
+    better,
+    bounds,
+    misses,
+    next_multiplier,
+)
 from flexgs_edge.best.steps import Slopes, choose_steps, holdable, probe_slopes, reachable
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps, recolour, to_grid, values_of
-from flexgs_edge.refit import refit_colours
+from flexgs_edge.refit import Schedule, distil, refit_colours
 from flexgs_edge.score.removal import RemovalCosts
+
+LOG = logging.getLogger("flexgs_edge")
 
 Measure = Callable[..., Measurement]
 """Quality of planes ([width, n] f32 by field); with `estimate=True` a good guess, in a part of the time."""
-Product = TypeVar("Product")
-"""What a step makes: a grid, or a finished file."""
 
 PRUNED_PART = 0.45
 """Part of the allowed loss that pruning alone has used up when a whole result meets the target (fox .45, the sample .55): where
 the search starts."""
-SLOPE = 0.7
-"""Slope of the log of the drop over the log of the multiplier before two points are measured (fox .55 to .77)."""
-SIZE_SLOPE = -0.45
-"""The same for the log of the size."""
 FINE_COLOUR = 2.0**-8
 """Colour steps before the refit, as a share of the final ones: only geometry shall move."""
 MOST_ROUNDS = 24
@@ -49,6 +58,17 @@ FURTHER = 0.92
 """The same for each further round of the refit over the round before it (fox .92)."""
 DRIFT = -0.12
 """What a second refit, which goes on where the first one ended, adds to the excess (fox -.15, the sample -.3 to 0)."""
+DISTILLED = 0.5
+"""Loss after a descent over the loss before it, until a whole result tells; above what was seen (the sample .34, fox .38): from
+a result that holds, further descents go on with fewer Gaussians, but not with more."""
+DRIFT_DISTILLED = -0.3
+"""`DRIFT` of a further descent (the sample -.43)."""
+PRUNED_DISTILLED = 1.6
+"""`PRUNED_PART` where a descent follows: it takes more back than pruning may lose."""
+FURTHER_STEPS = 0.4
+"""Steps of a further descent, which goes on where the last one ended, as a share of those of the first."""
+FURTHER_RATE = 0.5
+"""Its rates, as a share of those that the first began with."""
 DECAY = 0.8
 """Part of that which the next refit adds again (fox .9, the sample .4). Above zero where refits fit the scored poses too well."""
 FARTHER = 0.05
@@ -59,52 +79,8 @@ EXTRA_STEPS = 4
 """Steps beyond the effort's own while nothing holds, or what does is far below the target."""
 FAR = 0.25
 """Excess below the target that is far: a sixth of the bytes."""
-LARGEST_STRIDE = 1.2
-"""Largest change of the log of the multiplier between two steps."""
 FARTHEST = 2.0
 """The same for probes together."""
-
-
-@dataclass(frozen=True)
-class RateStep:
-    """One whole result that the search looked at.
-
-    Parameters
-    ----------
-    multiplier : float
-        Squared error that a bit is worth.
-    count, sh_count : int
-        Gaussians kept, and those with SH.
-    size : int
-        Bytes of the file.
-    measurement : Measurement
-    excess : float
-        By how much the target was missed; zero or less holds.
-    seconds : float
-    """
-
-    multiplier: float
-    count: int
-    sh_count: int
-    size: int
-    measurement: Measurement
-    excess: float
-    seconds: float
-
-    @property
-    def holds(self) -> bool:
-        """The target holds here."""
-        return self.excess <= 0.0
-
-
-@dataclass(frozen=True)
-class RateResult(Generic[Product]):
-    """The answer of a search: what to write and the way to it."""
-
-    product: Product
-    chosen: RateStep
-    reached: bool
-    steps: tuple[RateStep, ...]
 
 
 class MultiplierSearch(ABC, Generic[Product]):
@@ -119,6 +95,11 @@ class MultiplierSearch(ABC, Generic[Product]):
     on_step : callable, optional
         Called after each step.
     """
+
+    pruned_part = PRUNED_PART
+    """Part of the allowed loss that the path goes down to."""
+    keeps_best = False
+    """An interrupted search answers with the best so far, where its results take long; otherwise it ends."""
 
     def __init__(
         self,
@@ -158,13 +139,19 @@ class MultiplierSearch(ABC, Generic[Product]):
         self._calibrate(multiplier)
         multiplier = self._aim(multiplier, steps, target)
         for count in range(self.effort.steps + EXTRA_STEPS):
-            step, product = self._whole(multiplier, target)
+            try:
+                step, product = self._whole(multiplier, target)
+            except KeyboardInterrupt:
+                if best is None or not self.keeps_best:
+                    raise
+                LOG.warning("interrupted: the best of %d results is taken", len(steps))
+                break
             steps.append(step)
             if self.on_step:
                 self.on_step(step)
             if best is None:
                 best = (step, product)
-            elif _better(step, best[0], target):
+            elif better(step, best[0], target):
                 self.discard(best[1])
                 best = (step, product)
             else:
@@ -173,7 +160,7 @@ class MultiplierSearch(ABC, Generic[Product]):
             enough = best[0].holds and best[0].excess > -FAR and count + 1 >= self.effort.steps
             if close or enough or step.multiplier < 1e-30:
                 break
-            multiplier = self._aim(_next_multiplier(steps, target), steps, target)
+            multiplier = self._aim(next_multiplier(steps, target), steps, target)
         assert best is not None
         chosen, product = best
         if not chosen.holds and not best_effort:
@@ -192,7 +179,7 @@ class MultiplierSearch(ABC, Generic[Product]):
                     break
             elif len(self.path.snapshots) > 1:
                 excess = target.excess(0, self.measure(last.planes, estimate=True))
-                if excess >= math.log(PRUNED_PART):
+                if excess >= math.log(self.pruned_part):
                     break
             if last.count < 16:
                 break
@@ -239,6 +226,8 @@ class RateSearch(MultiplierSearch[GridScene]):
         Exact bytes of a grid's file, and the coder's bit model.
     measure : callable
         Quality of a grid's decoded planes.
+    steps : int
+        Views that the descent to the first whole result looks at; 0: colours are refitted instead.
     """
 
     def __init__(
@@ -249,12 +238,16 @@ class RateSearch(MultiplierSearch[GridScene]):
         effort: Effort,
         refit: bool = True,
         on_step: Callable[[RateStep], None] | None = None,
+        steps: int = 0,
     ) -> None:
         super().__init__(path, measure, effort, on_step)
-        self.size_of, self.refit = size_of, refit
+        self.size_of, self.refit, self.steps = size_of, refit, steps
+        if steps:
+            self.pruned_part, self.keeps_best = PRUNED_DISTILLED, True
         self._slopes: Slopes | None = None
         self._mended: Mended | None = None
-        self._drift, self._expected = DRIFT, 0.0
+        self._descents: list[tuple[float, Mended]] = []
+        self._drift, self._expected = DRIFT_DISTILLED if steps else DRIFT, 0.0
 
     def _calibrate(self, multiplier: float) -> None:
         """Ask the coder what Gaussians cost near the answer. Once: or every step would search another function."""
@@ -275,7 +268,9 @@ class RateSearch(MultiplierSearch[GridScene]):
         """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
-        mended = math.log(MENDED) + (self.effort.refit_rounds - 1) * math.log(FURTHER)
+        mended = (
+            math.log(DISTILLED) if self.steps else math.log(MENDED) + (self.effort.refit_rounds - 1) * math.log(FURTHER)
+        )
         offset = mended if self.refit and not by_size else 0.0
         if steps:
             offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
@@ -284,8 +279,8 @@ class RateSearch(MultiplierSearch[GridScene]):
                 if len(steps) > 1:
                     self._drift = DECAY * (self._drift + steps[-1].excess - self._expected)
                 # Whatever the reason that results keep missing: go farther each time.
-                offset += self._drift + FARTHER * max(_misses(steps) - 1, 0)
-        low, high = _bounds(steps, by_size)
+                offset += self._drift + FARTHER * max(misses(steps) - 1, 0)
+        low, high = bounds(steps, by_size)
         place = min(max(math.log(multiplier), low), high)
         # Curves that are flat, where nothing holds, must not send the search to the end of numbers.
         low, high = max(low, place - FARTHEST), min(high, place + FARTHEST)
@@ -305,8 +300,9 @@ class RateSearch(MultiplierSearch[GridScene]):
     def _choice(self, multiplier: float) -> tuple[Kept, Steps]:
         """What a multiplier keeps, with the colours of the last refit, and the grid steps."""
         kept = self.kept(multiplier)
-        if self._mended is not None:
-            kept.planes = self._mended.apply(kept.rows, kept.degrees, kept.planes, self.path.room)
+        mended = self._descended(multiplier) if self.steps else self._mended
+        if mended is not None:
+            kept.planes = mended.apply(kept.rows, kept.degrees, kept.planes, self.path.room)
         snapshot = self.path.snapshots[kept.snapshot]
         if self._slopes is None:
             # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
@@ -318,13 +314,57 @@ class RateSearch(MultiplierSearch[GridScene]):
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
         started = time.perf_counter()
         kept, steps = self._choice(multiplier)
-        grid = self._finish(kept, steps)
+        grid = self._distilled(multiplier, kept, steps) if self.steps else self._finish(kept, steps)
         size, _ = self.size_of(grid)
         measurement = self.measure(values_of(grid, self.path.room))
         excess = target.excess(size, measurement)
         sh_count = int((kept.degrees > 0).sum())
         seconds = time.perf_counter() - started
         return RateStep(multiplier, len(kept.rows), sh_count, size, measurement, excess, seconds), grid
+
+    def _descended(self, multiplier: float) -> Mended | None:
+        """Values of the last descent that kept what this multiplier keeps and more.
+
+        Not of one that kept less: its values make up for what it lacked, and would be too much of it with that back (fox: .92 dB
+        at 366 kB after 1.15 at 278, where the curve would have .76).
+        """
+        before = [(at, mended) for at, mended in self._descents if at <= multiplier]
+        return max(before, key=lambda pair: pair[0])[1] if before else None
+
+    def _distilled(self, multiplier: float, kept: Kept, steps: Steps) -> GridScene:
+        """All values moved towards the original's renders with the grid in view, on the grid, and the constant refitted."""
+        path = self.path
+        first = self._descended(multiplier) is None
+        schedule = Schedule(self.steps) if first else Schedule(math.ceil(FURTHER_STEPS * self.steps), FURTHER_RATE)
+        moved = distil(
+            path.renderer,
+            kept.planes,
+            kept.degrees,
+            path.origin,
+            [*path.cameras, *path.between],
+            path.targets,
+            schedule,
+            steps,
+            progress=path.progress,
+        )
+        own = np.arange(len(kept.rows))
+        self._descents.append((multiplier, Mended.of(kept.rows, kept.degrees, own, moved, fields=tuple(moved))))
+        grid, order = to_grid(moved, kept.degrees, holdable(steps, moved), path.origin)
+        if not self.refit:
+            return grid
+        moved = refit_colours(
+            path.renderer,
+            values_of(grid),
+            kept.degrees[order],
+            path.origin,
+            path.cameras,
+            path.targets,
+            rounds=1,
+            bands=False,
+            subsets=self.effort.subsets_of(len(path.cameras)),
+            progress=path.progress,
+        )
+        return recolour(grid, moved["sh_dc"], moved["sh_rest"])
 
     def _finish(self, kept: Kept, steps: Steps) -> GridScene:
         """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
@@ -360,39 +400,3 @@ class RateSearch(MultiplierSearch[GridScene]):
             )
         final = replace(grid.steps, dc=steps.dc, sh=steps.sh[: grid.sh_degree])
         return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"], room)
-
-
-def _better(step: RateStep, other: RateStep, target: Target) -> bool:
-    """Whether `step` is the better answer: holding before missing, then fewer bytes (a size target: less loss)."""
-    if step.holds != other.holds:
-        return step.holds
-    if not step.holds:
-        return step.excess < other.excess
-    if target.limit_bytes is not None:
-        return step.measurement.loss(target.judge) < other.measurement.loss(target.judge)
-    return step.size < other.size
-
-
-def _misses(steps: Sequence[RateStep]) -> int:
-    """How many of the last results missed the target."""
-    return next((count for count, step in enumerate(reversed(steps)) if step.holds), len(steps))
-
-
-def _bounds(steps: Sequence[RateStep], by_size: bool) -> tuple[float, float]:
-    """Logs of the multipliers between which the answer lies, away from both ends; infinite where none is known.
-
-    One end is the farthest result that holds, the other the nearest miss beyond it. Misses before it are void: refits go on
-    from each other, and had not come as far then.
-    """
-    sign = -1.0 if by_size else 1.0
-    low = max((sign * math.log(s.multiplier) for s in steps if s.holds), default=-math.inf)
-    high = min((m for s in steps if not s.holds and (m := sign * math.log(s.multiplier)) > low), default=math.inf)
-    room = NEAREST * (high - low) if math.isfinite(high - low) else 0.0
-    ends = sign * (low + room), sign * (high - room)
-    return min(ends), max(ends)
-
-
-def _next_multiplier(steps: Sequence[RateStep], target: Target) -> float:
-    """Where the excess is expected to be just below zero, in the log of the multiplier."""
-    slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
-    return math.exp(next_point([(math.log(s.multiplier), s.excess) for s in steps], slope, LARGEST_STRIDE))

@@ -53,11 +53,15 @@ KERNELS: dict[str, KernelSpec] = {
     "blend_removal": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", kernel="blend", stats=2),
     "blend_residual": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", kernel="blend", stats=3),
     "blend_both": KernelSpec("blend_{form}.cl", _BLEND + "bbbb", "tile", kernel="blend", stats=4),
+    "blend_backward": KernelSpec("blend_{form}.cl", _BLEND + "bbbb", "tile", kernel="blend", stats=5),
     "residual": KernelSpec("score.cl", "ubbb", "rows"),
     "sh_costs": KernelSpec("score.cl", "uuuuuubbbbb", "rows"),
     "sh_residual": KernelSpec("score.cl", "uuuuubbbb", "rows"),
     "ssim_columns": KernelSpec("similarity.cl", "uuubbbb", "rows"),
     "ssim_rows": KernelSpec("similarity.cl", "uubbb", "rows"),
+    "project_backward": KernelSpec("backward.cl", "uuuuibbbbbbbbbbb", "rows"),
+    "adam": KernelSpec("backward.cl", "uuffbbbbbbb", "rows"),
+    "snap": KernelSpec("backward.cl", "uubbbbbbbb", "rows"),
     "dequantize": KernelSpec("dequantize.cl", "uuuuuuubbbb"),
 }
 """Every kernel by the name that `Backend.launch` and the twins share."""

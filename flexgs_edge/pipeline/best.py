@@ -16,10 +16,11 @@ from flexgs_edge.best.checkpoint import Checkpoint
 from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.layers import assign_layers
-from flexgs_edge.best.path import PrunePath, sums_room
+from flexgs_edge.best.path import PrunePath
 from flexgs_edge.best.search import Measure, MultiplierSearch, Product, RateResult, RateSearch, RateStep
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
+from flexgs_edge.cameras.between import poses_between
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.curve import near_rows
 from flexgs_edge.grid import GridScene, from_grid
@@ -29,7 +30,7 @@ from flexgs_edge.pipeline.grid_coder import GridCoder
 from flexgs_edge.pipeline.judge import Judge, measurement_of
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.poses import ScoredPoses
-from flexgs_edge.pipeline.room import SPILLED_ROW_BYTES, largest_of, least_spilled, row_bytes
+from flexgs_edge.pipeline.room import SPILLED_ROW_BYTES, distil_steps, largest_of, least_spilled, needed_bytes
 from flexgs_edge.pipeline.workspace import Stopwatch
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice
@@ -60,7 +61,12 @@ def grid_search(
         return (size if options.layers == 1 else round(LAYERS_COST * size)), bits
 
     plan = EFFORTS[options.effort]
-    return lambda path, measure, report: search(path, size_of, measure, plan, options.refit, report)
+
+    def make(path: PrunePath, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
+        steps = distil_steps(options, len(path.cameras))
+        return search(path, size_of, measure, plan, options.refit, report, steps)
+
+    return make
 
 
 def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[WrittenFile]:
@@ -171,12 +177,11 @@ def open_path(
     checkpoint : Checkpoint, optional
         Where the path keeps its rounds.
     """
-    room, largest = renderer.room, largest_of(scored)
+    room, steps = renderer.room, distil_steps(options, len(scored))
     if room.spills:
-        size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest)
+        size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest_of(scored))
     else:
-        size = source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep)
-        least = renderer.least_bytes(source, largest, sums_room(source.sh_degree))
+        size, least = needed_bytes(renderer, source, scored, options)
     budget.require("a search by measured costs", size + least)
     budget.take("the scene and its path", size)
     try:
@@ -197,6 +202,7 @@ def open_path(
                     refit=options.refit,
                     unseen=options.unseen_share,
                     progress=progress,
+                    between=poses_between(scored) if steps else (),
                     **({} if checkpoint is None else {"checkpoint": checkpoint}),
                 )
             del planes  # the path has its own

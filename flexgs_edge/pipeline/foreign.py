@@ -80,6 +80,11 @@ def foreign_format(output: str | Path | None, options: CompressOptions) -> Forma
     for name in FORMAT_BITS:
         if getattr(options, name) != CompressOptions.__dataclass_fields__[name].default:
             raise InputError(f"--{name}: {format.suffix} has precisions of its own; leave it out, or write a .fgs")
+    if options.distil or options.effort == "max":
+        word = f"--distil {options.distil}" if options.distil else "--effort max"
+        raise InputError(
+            f"{word}: distilling ends on the grid of a .fgs, {format.suffix} has its own; leave it out, or write a .fgs"
+        )
     if options.layers > 1:
         raise InputError(f"--layers {options.layers}: {format.suffix} has no layers; leave it out, or write a .fgs")
     assert output is not None

@@ -21,8 +21,12 @@ AUTO_CAMERAS = "auto"
 NO_CAMERAS = "none"
 """`--cameras none`: no views at all; only fixed rates work then."""
 METHODS = ("best", "paper")
+EFFORT_WORDS = (*REFINE_STEPS, "max")
+"""`max`, with a descent of all values, is for the best method and a `.fgs` only."""
 SELECTS = ("test", "train")
 LAYERS_MOST = 4
+DISTIL_MOST = 100_000
+"""Steps of a descent: hours on any machine, and no more is gained from a few thousand on."""
 DEFAULT_MAX_DROP = 1.0
 METHOD_ONLY: dict[str, tuple[str, object]] = {
     "prune_rate": ("paper", None),
@@ -35,6 +39,7 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "unseen": ("best", "keep"),
     "views_margin": ("best", False),
     "refit": ("best", True),
+    "distil": ("best", None),
     "layers": ("best", 1),
     "scratch": ("best", None),
     "resume": ("best", False),
@@ -141,8 +146,8 @@ class CompressOptions(ViewOptions):
         Quantization groups per channel (`paper`). Default: one for about 512 rows.
     base_psnr : float
         PSNR of the original against its photos that the modelled drop starts from, dB.
-    effort : {"fast", "balanced", "thorough"}
-        Steps of the search.
+    effort : {"fast", "balanced", "thorough", "max"}
+        Steps of the search; `max` distils as well (`best`, `.fgs`).
     best_effort : bool
         Write the closest point when the target cannot be met.
     unseen : str
@@ -151,6 +156,8 @@ class CompressOptions(ViewOptions):
         Score as many poses again, made nearer to what is seen, farther from it and in between (`best`).
     refit : bool
         Refit colours after pruning and quantizing (`best`).
+    distil : int, optional
+        Steps of the descent towards the original's renders, 0 for none (`best`, `.fgs`). Default: as the effort says.
     layers : int
         Layers that `trim` can cut the file at, 1 to 4 (`best`).
     scratch : str, optional
@@ -186,6 +193,7 @@ class CompressOptions(ViewOptions):
     unseen: str = "keep"
     views_margin: bool = False
     refit: bool = True
+    distil: int | None = None
     layers: int = 1
     scratch: str | None = None
     resume: bool = False
@@ -198,7 +206,7 @@ class CompressOptions(ViewOptions):
         for word, value, known in (
             ("--method", self.method, METHODS),
             ("--select", self.select, SELECTS),
-            ("--effort", self.effort, tuple(REFINE_STEPS)),
+            ("--effort", self.effort, EFFORT_WORDS),
         ):
             if value not in known:
                 raise InputError(f"{word} {value!r}: expected one of {', '.join(known)}")
@@ -209,6 +217,13 @@ class CompressOptions(ViewOptions):
         if self.groups is not None and self.groups < 1:
             raise InputError(f"--groups {self.groups}: expected 1 or more")
         check_method(self.method, [name for name in METHOD_ONLY if getattr(self, name) != METHOD_ONLY[name][1]])
+        if self.effort == "max" and self.method != "best":
+            raise InputError(f"--effort max distils, which --method {self.method} does not: take --effort thorough")
+        if not self.refit and (self.distil or (self.effort == "max" and self.distil is None)):
+            word = f"--distil {self.distil}" if self.distil else "--effort max"
+            raise InputError(f"--no-refit with {word}: distilling is the larger refit; give one or the other")
+        if self.distil is not None and not 0 <= self.distil <= DISTIL_MOST:
+            raise InputError(f"--distil {self.distil}: expected 0 (none) to {DISTIL_MOST} steps")
         if not 1 <= self.layers <= LAYERS_MOST:
             raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
         if self.score_cache is not None and self.score not in ("gs", "meson"):

@@ -117,6 +117,7 @@ def make_settings(
         "holdout": options.holdout if views else None,
         "views": len(views.cameras) if views else 0,
         "effort": options.effort if plan.target else None,
+        **({} if options.distil is None else {"distil": options.distil}),
         "base_psnr": options.base_psnr,
         "quality": {
             name: None if value is None else round(value, 3) for name, value in (_means(found) if found else {}).items()

@@ -12,8 +12,9 @@ from flexgs_edge.best.path import PARTS, sums_room
 from flexgs_edge.budget import MemoryBudget, format_size
 from flexgs_edge.cameras import Camera
 from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.refit import descent_bytes
 from flexgs_edge.render import Renderer, sum_bytes
-from flexgs_edge.render.device_scene import COMPACT_ROWS, MOST_SUMS
+from flexgs_edge.render.device_scene import COMPACT_ROWS, MOST_SUMS, plane_bytes
 from flexgs_edge.render.renderer import FIRST_SHARE
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
@@ -30,6 +31,8 @@ WORK_PLANES = 11
 """What a whole result holds for a moment, in planes of its rows (at degree 3, of 236 bytes): the rows without what was dropped,
 codes, values of codes twice, colours of the last refit and of this one, and sums of the refit twice. With 6, fox at a fidelity
 of 48 dB (nearly all rows stay) had a peak 90 MiB above its limit, with 9 one of 12 MiB."""
+DESCENTS = 3
+"""Times the scene's stored planes that the values of all descents take: two results at 0.1 dB, six or more at 1 dB."""
 SPILLED_ROW_BYTES = 24
 """Bytes that each row of a scene in scratch files takes of memory for a moment: choosing the cheapest rows, and lists of rows."""
 SPOOL_ROW_BYTES = 52
@@ -59,8 +62,11 @@ def choose_room(
     largest = largest_of(scored)
     rows, keep = source.count, EFFORTS[options.effort].keep
     whole = rows * row_bytes(source.sh_degree, keep)
-    if whole + renderer.least_bytes(source, largest, sums_room(source.sh_degree)) <= budget.free:
+    size, least = needed_bytes(renderer, source, scored, options)
+    if size + least <= budget.free:
         return MEMORY
+    if distil_steps(options, len(scored)):
+        budget.require("distilling (--effort max, --distil), which stays in memory as a whole,", size + least)
     budget.require(
         "a search by measured costs with all else in scratch files",
         SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest),
@@ -95,6 +101,23 @@ def open_checkpoint(
     return checkpoint
 
 
+def distil_steps(options: CompressOptions, poses: int) -> int:
+    """Steps of the descent to the first whole result; 0 for none."""
+    return round(EFFORTS[options.effort].passes * poses) if options.distil is None else options.distil
+
+
+def needed_bytes(
+    renderer: Renderer, source: SceneSource, scored: Sequence[Camera], options: CompressOptions
+) -> tuple[int, int]:
+    """Bytes that a search in memory holds, and that drawing needs beside them at the least."""
+    size, sums = source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep), sums_room(source.sh_degree)
+    if distil_steps(options, len(scored)):
+        # A descent holds what is kept, with all that it remembers, at once: as much as the whole scene at the most.
+        sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))
+        size += source.count * DESCENTS * stored_bytes(source.sh_degree)
+    return size, renderer.least_bytes(source, largest_of(scored), sums)
+
+
 def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:
     """Bytes that the first view of a search in scratch files needs; one that shows more than `FIRST_SHARE` says needs more."""
     return renderer.compact_bytes(source, largest, -(-source.count // FIRST_SHARE), sum_bytes(MOST_SUMS))
@@ -105,13 +128,18 @@ def largest_of(cameras: Sequence[Camera]) -> Camera:
     return max(cameras, key=lambda camera: camera.width * camera.height)
 
 
+def stored_bytes(sh_degree: int) -> int:
+    """Bytes of a row's stored planes."""
+    return sum(4 * field.width(sh_degree) for field in FIELD.values())
+
+
 def row_bytes(sh_degree: int, keep: float) -> int:
     """Bytes that a search holds for each row of its scene, at most, beside what the renderer counts.
 
     Either snapshots down to nothing, each `keep` of the one before; or, when nearly all is kept, one of them and all that a
     whole result of it needs. What lies between is between.
     """
-    planes = sum(4 * field.width(sh_degree) for field in FIELD.values())
+    planes = stored_bytes(sh_degree)
     snapshot = planes + COST_BYTES + BAND_BYTES * sh_degree
     parts = PARTS * 8 * (2 + 4 * sh_degree)
     return round(max(snapshot / (1 - keep), snapshot + WORK_PLANES * planes)) + parts

@@ -10,7 +10,7 @@ import numpy as np
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
-from flexgs_edge.constants import CULLED, DEFAULT_NEAR, JACOBIAN_MARGIN
+from flexgs_edge.constants import CULLED, DEFAULT_NEAR
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels import Backend
 from flexgs_edge.quantize import QuantizedScene
@@ -26,7 +26,7 @@ from flexgs_edge.render.device_scene import (
     plane_bytes,
     upload_bytes,
 )
-from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.render.records import Statistics, camera_record
 from flexgs_edge.render.view_buffers import (
     SORT_DIGIT_BITS,
     SORT_DIGITS,
@@ -42,6 +42,8 @@ from flexgs_edge.scratch import MEMORY, Room
 
 SUM_ROWS = 1 << 18
 """Rows of sums that are on the host at a time."""
+GRADIENT_SUMS = 9
+"""Planes of `Renderer.gradient_sums`."""
 EXTENTS = ("exact", "inria")
 CAPACITY_STEP = 1 << 16
 """Compact views make room for multiples of so many rows: views of about one size then share their buffers."""
@@ -49,26 +51,6 @@ FIRST_SHARE = 4
 """Part of a scene's rows (one in four) that a compact view has room for until one shows more."""
 GROWTH = 1.1
 """Room beyond what the part of a view that was seen lets expect."""
-
-
-def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray:
-    """The 32 floats that `project` reads, for a scene re-centred at `origin` ([3] f64, world).
-
-    Everything is computed in float64 and rounded once.
-    """
-    moved = camera.moved(origin)
-    x_low = -(moved.cx + 0.5) / moved.fx - JACOBIAN_MARGIN * moved.width / moved.fx
-    x_high = (moved.width - 0.5 - moved.cx) / moved.fx + JACOBIAN_MARGIN * moved.width / moved.fx
-    y_low = -(moved.cy + 0.5) / moved.fy - JACOBIAN_MARGIN * moved.height / moved.fy
-    y_high = (moved.height - 0.5 - moved.cy) / moved.fy + JACOBIAN_MARGIN * moved.height / moved.fy
-    record = np.zeros(32)
-    record[0:9] = moved.rotation.reshape(-1)
-    record[9:12] = moved.translation
-    record[12:16] = moved.fx, moved.fy, moved.cx, moved.cy
-    record[16:21] = near, x_low, x_high, y_low, y_high
-    record[21:24] = -moved.rotation.T @ moved.translation  # so near to the origin the transpose will do
-    record[24:27] = moved.width, moved.height, moved.dilation
-    return record.astype(np.float32)
 
 
 @dataclass
@@ -141,6 +123,12 @@ class Renderer:
         """The record of the view drawn last, in the backend's memory."""
         assert self._buffers is not None
         return self._buffers.camera
+
+    @property
+    def records_array(self) -> Any:
+        """The splats of the view drawn last ([N, 16]), in the backend's memory; rows that it does not show hold anything."""
+        assert self._buffers is not None
+        return self._buffers.records
 
     def load(self, source: SceneSource, sum_bytes: int = SUM_BYTES, targets: bool = False) -> DeviceScene:
         """Bring a scene to the backend (all of it, or chunk by chunk for each view when it does not fit).
@@ -249,6 +237,25 @@ class Renderer:
         hits, sums = self._sum_arrays(scene, view, 6)
         residual = self._residual(view, target)
         self._blend(view, "blend_both", (hits, sums, view.buffers.image, residual), again=True)
+        return sums
+
+    def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
+        """What the squared error of one view against `target` changes by when splats change, summed over pixels.
+
+        Of residuals r (target minus view) and the light e that alpha adds when it grows by its own size: sum(alpha T r) for
+        red, green, blue, then sum(r e), and its first and second moments about the splat's centre: x, y, xx, xy, yy.
+
+        Returns
+        -------
+        array of the backend
+            [N, 9, 2] u32, low and high words in units of 1 / `FIXED_WEIGHT`, the moments of 1 / `FIXED_MOMENT`; valid until
+            the next sums.
+        """
+        view = self._prepare(scene, camera)
+        self._blend(view, "blend")
+        hits, sums = self._sum_arrays(scene, view, GRADIENT_SUMS)
+        residual = self._residual(view, target)
+        self._blend(view, "blend_backward", (hits, sums, view.buffers.image, residual), again=True)
         return sums
 
     def _residual(self, view: _View, target: np.ndarray) -> Any:

@@ -8,7 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from flexgs_edge.kernels.twins.activate import activate
-from flexgs_edge.kernels.twins.blend import blend, blend_both, blend_removal, blend_residual, blend_stats
+from flexgs_edge.kernels.twins.backward import adam, project_backward, snap
+from flexgs_edge.kernels.twins.blend import (
+    blend,
+    blend_backward,
+    blend_both,
+    blend_removal,
+    blend_residual,
+    blend_stats,
+)
 from flexgs_edge.kernels.twins.dequantize import dequantize
 from flexgs_edge.kernels.twins.project import project
 from flexgs_edge.kernels.twins.score import residual, sh_costs, sh_residual
@@ -38,10 +46,14 @@ TWINS: dict[str, Callable[..., None]] = {
     "blend_removal": blend_removal,
     "blend_residual": blend_residual,
     "blend_both": blend_both,
+    "blend_backward": blend_backward,
     "residual": residual,
     "ssim_columns": ssim_columns,
     "ssim_rows": ssim_rows,
     "sh_costs": sh_costs,
     "sh_residual": sh_residual,
+    "project_backward": project_backward,
+    "adam": adam,
+    "snap": snap,
     "dequantize": dequantize,
 }

@@ -11,10 +11,12 @@ from functools import partial
 import numpy as np
 
 from flexgs_edge.constants import (
+    ALPHA_MAX,
     ALPHA_MIN,
     BLOCK,
     FIXED_ERROR,
     FIXED_LARGEST,
+    FIXED_MOMENT,
     FIXED_WEIGHT,
     TILE,
     TRANSMITTANCE_MIN,
@@ -47,11 +49,15 @@ def _block_lists(tile: np.ndarray, masks: np.ndarray, tiles: int) -> _Lists:
 
 @dataclass
 class _Entries:
-    """What the statistics need of every list entry and lane: hits, weights, and the squared error of removal."""
+    """What the statistics need of every list entry and lane: hits, weights, and the squared error of removal.
+
+    Gradients: `error` is that of the exponent, and `place` ([2, entries, 16]) where the pixel lies from the splat's centre.
+    """
 
     hit: np.ndarray
     weight: np.ndarray
     error: np.ndarray
+    place: np.ndarray
 
 
 def _fixed(lanes: np.ndarray, unit: float, tiles: int) -> np.ndarray:
@@ -68,8 +74,23 @@ PLANES = {
     2: ("error", "square"),
     3: ("weight", "red", "green", "blue"),
     4: ("weight", "red", "green", "blue", "error", "square"),
+    5: ("red", "green", "blue", "slope", "x", "y", "xx", "xy", "yy"),
 }
 """What the fixed-point sums of each kind of statistics hold."""
+
+
+UNITS = {"error": FIXED_ERROR, "square": FIXED_ERROR} | dict.fromkeys(PLANES[5][4:], FIXED_MOMENT)
+"""Of the planes whose unit is not 1 / FIXED_WEIGHT."""
+
+
+def _add_moments(lanes: dict[str, np.ndarray], pair: np.ndarray, slope: np.ndarray, place: np.ndarray) -> None:
+    """Gradients of the exponent times the pixel's place, in the kernel's order."""
+    dx, dy = place
+    slope_x, slope_y = slope * dx, slope * dy
+    for name, part in (("slope", slope), ("x", slope_x), ("y", slope_y)):
+        lanes[name][pair] += part
+    for name, one, other in (("xx", slope_x, dx), ("xy", slope_x, dy), ("yy", slope_y, dy)):
+        lanes[name][pair] = fma(one, other, lanes[name][pair])
 
 
 def _add_sums(
@@ -101,12 +122,14 @@ def _add_sums(
             assert rest is not None
             for c, name in enumerate(("red", "green", "blue")):
                 lanes[name][pair] = fma(weight, rest[c, owner[chosen]], lanes[name][pair])
+        if "slope" in lanes:
+            _add_moments(lanes, pair, entries.error[chosen], entries.place[:, chosen])
     count = np.bincount(lists.pair, weights=entries.hit.sum(axis=1), minlength=len(rows_of)).astype(np.uint32)
     some = count > 0
     if stats == 1:
         np.add.at(hits, rows_of, count)
     for c, name in enumerate(planes):
-        unit = FIXED_ERROR if name in ("error", "square") else FIXED_WEIGHT
+        unit = UNITS.get(name, FIXED_WEIGHT)
         np.add.at(sums.view(np.int64)[:, c, 0], rows_of[some], _fixed(lanes[name][some], unit, tiles))
 
 
@@ -153,9 +176,15 @@ def blend(
         ys, xs = py.astype(np.int64), px.astype(np.int64)
         own_target = target.reshape(image.shape)[:, ys, xs] if stats > 1 and target is not None else None
         own_rest = own_target if rest is None else rest.reshape(image.shape)[:, ys, xs]
-        entries = _blend_blocks(lists, part[:, 0], records, (px, py), colour, trans, stats, own_target)
+        if stats == 5 and not resume and own_target is not None and own_rest is not None:
+            # What lies behind a splat, times the residual, goes on in the place of red.
+            red, green, blue = (own_target[c] for c in range(3))
+            colour[0] = fma(blue, own_rest[2], fma(green, own_rest[1], red * own_rest[0]))
+        entries = _blend_blocks(lists, part[:, 0], records, (px, py), colour, trans, stats, own_target, own_rest)
         if entries is not None and hits is not None and sums is not None:
             _add_sums(stats, size[0], lists, entries, own_rest, part[:, 0], hits, sums)
+        if finish and stats == 5:
+            continue
         if finish:
             image[:, ys, xs] = fma(np.abs(trans), background[:, None, None], colour)
         else:
@@ -172,11 +201,15 @@ def _blend_blocks(
     trans: np.ndarray,
     stats: int,
     target: np.ndarray | None,
+    rest: np.ndarray | None,
 ) -> _Entries | None:
     """Blend every block's list into `colour` and `trans`; returns what the statistics need when asked for."""
     shape = (len(lists.pair) if stats else 0, 16)
     entries = _Entries(
-        np.zeros(shape, bool), np.zeros(shape, f32), np.zeros(shape if stats in (2, 4) else (0, 16), f32)
+        np.zeros(shape, bool),
+        np.zeros(shape, f32),
+        np.zeros(shape if stats in (2, 4, 5) else (0, 16), f32),
+        np.zeros((2, *shape) if stats == 5 else (2, 0, 16), f32),
     )
     by_length = np.argsort(-lists.counts, kind="stable")
     lengths = lists.counts[by_length]
@@ -194,18 +227,28 @@ def _blend_blocks(
         seen = alpha >= f32(ALPHA_MIN)
         hit = seen & (after >= f32(TRANSMITTANCE_MIN))
         weight = np.where(hit, alpha * t, f32(0))
-        for c in range(3):
+        for c in range(3 if stats != 5 else 0):
             colour[c, units] = fma(weight, r[:, 6 + c : 7 + c], colour[c, units])
         trans[units] = np.where(hit, after, np.where(seen, -np.abs(t), t))
         if not stats:
             continue
         entries.hit[entry], entries.weight[entry] = hit, weight
-        if stats in (2, 4):
+        if stats in (2, 4, 5):
             assert target is not None
-            ratio = np.where(hit, alpha * reciprocal(f32(1) - alpha), f32(0))
-            behind = (target[c, units] - colour[c, units] for c in range(3))
-            er, eg, eb = (fma(weight, r[:, 6 + c : 7 + c], -(ratio * rest)) for c, rest in enumerate(behind))
-            entries.error[entry] = fma(eb, eb, fma(eg, eg, er * er))
+            cr, cg, cb = (r[:, 6 + c : 7 + c] for c in range(3))
+            if stats == 5:
+                assert rest is not None
+                light = weight * fma(cb, rest[2, units], fma(cg, rest[1, units], cr * rest[0, units]))
+                colour[0, units] -= light
+                ratio = np.where(hit, alpha / (f32(1) - alpha), f32(0))
+                light = fma(-ratio, colour[0, units], light)
+                entries.error[entry] = np.where(alpha < f32(ALPHA_MAX), light, f32(0))
+                entries.place[0, entry], entries.place[1, entry] = dx, dy
+            else:
+                ratio = np.where(hit, alpha * reciprocal(f32(1) - alpha), f32(0))
+                behind = (target[c, units] - colour[c, units] for c in range(3))
+                er, eg, eb = (fma(weight, own, -(ratio * b)) for own, b in zip((cr, cg, cb), behind, strict=True))
+                entries.error[entry] = fma(eb, eb, fma(eg, eg, er * er))
     return entries if stats else None
 
 
@@ -213,3 +256,4 @@ blend_stats = partial(blend, stats=1)
 blend_removal = partial(blend, stats=2)
 blend_residual = partial(blend, stats=3)
 blend_both = partial(blend, stats=4)
+blend_backward = partial(blend, stats=5)
