@@ -18,7 +18,7 @@ from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.refit import Schedule, distil, refit_colours
-from flexgs_edge.refit.distil import FIELD_RATES
+from flexgs_edge.refit.distil import FIELD_RATES, HELD
 from flexgs_edge.render import Renderer
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.scene.fields import FIELD
@@ -126,6 +126,14 @@ def test_each_view_comes_once_in_each_round() -> None:
     for start in (0, 7, 14):
         assert sorted(order[start : start + 7]) == list(range(7))
     assert not same_bits(order[:7], order[7:14])
+
+
+def test_parts_of_a_descent(bench: Bench) -> None:
+    assert [len(part) for part in Schedule(8).parts(True)] == [4, 2, 2]
+    assert [len(part) for part in Schedule(8).parts(False)] == [8, 0, 0]
+    moving, held = bench.distil(9, STEPS, on_grid=0.0, holding=1 / 3), bench.distil(3, STEPS, on_grid=0.0, holding=1.0)
+    for name in moving:
+        assert same_bits(moving[name], held[name]) == (name in HELD), name
 
 
 def test_too_little_memory_is_said_and_leaves_nothing_taken(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

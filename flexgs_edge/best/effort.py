@@ -81,5 +81,5 @@ EFFORTS = {
     "fast": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=1, close=0.08, views=48),
     "balanced": Effort(keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.05, views=96),
     "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, views=400),
-    "max": Effort(keep=0.88, refit_rounds=1, subsets=7, steps=2, close=0.05, views=96, passes=6.0),
+    "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, views=96, passes=7.0),
 }

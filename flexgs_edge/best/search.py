@@ -58,8 +58,8 @@ FURTHER = 0.92
 """The same for each further round of the refit over the round before it (fox .92)."""
 DRIFT = -0.12
 """What a second refit, which goes on where the first one ended, adds to the excess (fox -.15, the sample -.3 to 0)."""
-DISTILLED = 0.5
-"""Loss after a descent over the loss before it, until a whole result tells; above what was seen (the sample .34, fox .38): from
+DISTILLED = 0.4
+"""Loss after a descent over the loss before it, until a whole result tells; above what was seen (fox and the sample .33): from
 a result that holds, further descents go on with fewer Gaussians, but not with more."""
 DRIFT_DISTILLED = -0.3
 """`DRIFT` of a further descent (the sample -.43)."""

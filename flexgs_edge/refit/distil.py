@@ -28,13 +28,13 @@ FIELD_RATES = {
 steps there and hundreds here: at 71 kB and 210 steps the sample loses 1.18 dB so, 1.42 with those of the reference program (and
 half its opacity's), 1.40 with twice all of these."""
 LAST = 0.1
-"""Rates at the end of each part as a share of those at its beginning; they fall by the same share at each step."""
-ON_GRID = 2 / 3
-"""Share of the steps before views are drawn from values on their grids."""
-
+"""Rates at the end as a share of those at the beginning, of the steps with geometry and of those without; they fall by the same
+share at each step."""
+ON_GRID, HOLDING = 0.5, 0.75
+"""Shares of the steps before views are drawn from values on their grids, and before geometry is held there."""
 HELD = ("means", "log_scales", "quats")
-"""Fields that stay where they are from then on. Codes of geometry that flip back and forth move whole splats, and
-the last of them decide: the sample at 71 kB and 420 steps lost 1.07 to 1.79 dB with them free, by what views came last; 1.07 with
+"""Fields that stay where they are from then on. Codes of geometry that flip back and forth move whole splats, and the
+last of them decide: the sample at 71 kB and 420 steps lost 1.07 to 1.79 dB with them free, by what views came last; 1.07 with
 them held (fidelity 39.4, not 37.5 to 39.3), 1.40 without this part. Opacities held as well: 1.19."""
 
 
@@ -48,18 +48,19 @@ class Schedule:
         Views looked at, one a step.
     rate : float
         Factor of all rates.
-    on_grid : float
-        Share of the steps before values are put on their grids for drawing.
+    on_grid, holding : float
+        Shares of the steps before values are put on their grids for drawing, and before geometry is held there.
     """
 
     steps: int
     rate: float = 1.0
     on_grid: float = ON_GRID
+    holding: float = HOLDING
 
-    def parts(self, grid: bool) -> tuple[range, range]:
-        """Steps off the grid, and on it (none where there is none)."""
-        free = round(self.on_grid * self.steps) if grid else self.steps
-        return range(free), range(free, self.steps)
+    def parts(self, grid: bool) -> tuple[range, range, range]:
+        """Steps off the grid, on it, and on it with geometry held (all of them off it where there is none)."""
+        free, moving = (round(share * self.steps) if grid else self.steps for share in (self.on_grid, self.holding))
+        return range(free), range(free, moving), range(moving, self.steps)
 
     def order(self, views: int) -> np.ndarray:
         """[steps] i64, which view each step looks at: all of them in a shuffled order, then in another."""
@@ -121,11 +122,15 @@ def distil(
     ordered = {name: np.ascontiguousarray(values[:, rows]) for name, values in ordered.items()}
     with Descent(renderer, ordered, degrees[rows], origin, largest) as descent:
         order = schedule.order(len(cameras))
-        for part, held in zip(schedule.parts(steps is not None), ((), HELD), strict=True):
-            if held and len(part):
+        parts = schedule.parts(steps is not None)
+        for place, part in enumerate(parts):
+            held = HELD if place == 2 else ()
+            # Rates fall while geometry moves, and again while it does not.
+            falling = part if held else range(parts[1].stop)
+            if place and len(part):
                 descent.put_on(steps)
-            for k in progress.track(part, f"distilling{' on the grid' if held else ''}", len(part)):
-                now = schedule.rate * LAST ** ((k - part.start) / len(part))
+            for k in progress.track(part, f"distilling{' on the grid' if place else ''}", len(part)):
+                now = schedule.rate * LAST ** ((k - falling.start) / len(falling))
                 moving = {name: 0.0 if name in held else now * rate for name, rate in rates.items()}
                 descent.step(cameras[order[k]], targets[order[k]], moving)
         moved = descent.planes()
