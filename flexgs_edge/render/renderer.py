@@ -479,7 +479,7 @@ class Renderer:
             self._buffers = buffers = _ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
 
     def _fill_compact(self, scene: DeviceScene, buffers: _ViewBuffers) -> tuple[np.ndarray, int]:
-        """[m] u32, rows shown, and up to which row of the scene: the last one, or where they became more than there is room for."""
+        """[m] u32, rows shown, and up to which row of the scene: where they are more than there is room for, it stops."""
         backend, (records, keys, bounds) = self.backend, buffers.chunk
         assert buffers.rows is not None
         found: list[np.ndarray] = []
