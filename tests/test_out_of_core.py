@@ -84,6 +84,11 @@ def test_compact_views_give_the_same_bits(
     form: str, compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spilled = found_by(form, Scratch(tmp_path))
+    # One chunk, so that it is the last one that shows more than there is room for.
+    monkeypatch.setattr(renderer_module, "COMPACT_ROWS", 4096)
+    monkeypatch.setattr(device_scene, "COMPACT_ROWS", 4096)
+    for name, values in found_by(form, Scratch(tmp_path)).items():
+        np.testing.assert_array_equal(values, spilled[name], err_msg=name)
     monkeypatch.undo()
     plain = found_by(form, None)
     assert plain["removal"].any() and plain["hits"].any()

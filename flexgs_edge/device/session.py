@@ -39,7 +39,7 @@ class DeviceArray:
     def release(self) -> None:
         """Free the buffer (once)."""
         if self.nbytes >= 0:
-            self._session.leave(self.buffer)
+            self.buffer.release()
             self._session.budget.give(self.nbytes)
             self.nbytes = -1
 
@@ -64,7 +64,6 @@ class Session:
         self.compile_seconds = 0.0
         self.profile: defaultdict[str, float] | None = None
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
-        self._leaving: list[cl.Buffer] = []
 
     def kernel(self, source: str, name: str, options: tuple[str, ...], signature: str) -> cl.Kernel:
         """The kernel `name` of `source`, built with `options`; `signature` has one of u i f b an argument.
@@ -104,23 +103,7 @@ class Session:
 
     def array(self, shape: tuple[int, ...], dtype: Any) -> DeviceArray:
         """An array on the device, not initialised."""
-        if self._leaving:
-            self.finish()
         return DeviceArray(self, shape, dtype)
-
-    def leave(self, buffer: cl.Buffer) -> None:
-        """Free a buffer once nothing is at work on it, and before the next one is made.
-
-        Never while a kernel may use it: the runtime's own thread would free it then, and a run of a million frees was seen to end
-        in PoCL 3.1 with a fault in that thread's `free`.
-        """
-        self._leaving.append(buffer)
-
-    def _settle(self) -> None:
-        """Free what leaves; everything enqueued is done."""
-        for buffer in self._leaving:
-            buffer.release()
-        self._leaving = []
 
     def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0) -> None:
         """Copy C-contiguous `values` to the flat element `offset` of `array`."""
@@ -129,14 +112,12 @@ class Session:
             cl.enqueue_copy(
                 self.queue, array.buffer, values, dst_offset=offset * array.dtype.itemsize, is_blocking=True
             )
-            self._settle()
 
     def read(self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
         """Copy `array` (from the flat element `offset` on, as much as `out` holds) to the host, waiting for the queue."""
         out = np.empty(array.shape, array.dtype) if out is None else out
         if out.size:
             cl.enqueue_copy(self.queue, out, array.buffer, src_offset=offset * array.dtype.itemsize, is_blocking=True)
-            self._settle()
         return out
 
     def fill(self, array: DeviceArray, value: int) -> None:
@@ -148,4 +129,3 @@ class Session:
     def finish(self) -> None:
         """Wait for everything enqueued."""
         self.queue.finish()
-        self._settle()

@@ -325,7 +325,7 @@ class Renderer:
             self.backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
             rows, seen = self._fill_compact(scene, buffers)
             assert buffers.rows is not None
-            if seen == scene.count:
+            if len(rows) <= buffers.rows:
                 return buffers, rows
             expected = int(GROWTH * max(len(rows) * scene.count / max(seen, 1), buffers.rows))
             scene.shown = min(-(-expected // CAPACITY_STEP) * CAPACITY_STEP, scene.count)
@@ -334,7 +334,7 @@ class Renderer:
             self._buffers = buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
 
     def _fill_compact(self, scene: DeviceScene, buffers: ViewBuffers) -> tuple[np.ndarray, int]:
-        """[m] u32, rows shown; and up to which row of the scene they are complete."""
+        """[m] u32, rows shown, and up to which row of the scene: where they are more than there is room for, it stops."""
         backend, (records, keys, bounds) = self.backend, buffers.chunk
         assert buffers.rows is not None
         found: list[np.ndarray] = []
@@ -370,7 +370,8 @@ class Renderer:
         if self._buffers is None or self._buffers.key != view_key(scene, camera):
             self.release()
             if scene.shown is None and self._may_be_compact(scene) and not self._fits(scene, camera):
-                scene.be_compact(min(-(-scene.count // FIRST_SHARE // CAPACITY_STEP + 1) * CAPACITY_STEP, scene.count))
+                first = (scene.count // FIRST_SHARE // CAPACITY_STEP + 1) * CAPACITY_STEP
+                scene.be_compact(min(first, scene.count))
             try:
                 self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
             except BudgetError:
