@@ -145,7 +145,7 @@ def test_forms_give_the_same_gradients(form: str) -> None:
 @pytest.mark.parametrize("form", FORMS)
 def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every launch compared: in batches, in two chunks, off and on a grid, rows of every degree, one that is not seen."""
-    monkeypatch.setattr("flexgs_edge.render.renderer.DEFAULT_PAIRS", 64)
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 64)
     monkeypatch.setattr("flexgs_edge.render.device_scene.CHUNK_ROWS", 40)
     monkeypatch.setattr("flexgs_edge.render.device_scene.MIN_CHUNK_ROWS", 16)
     paired = PairedBackend(open_form(form), 2)

@@ -343,7 +343,7 @@ def test_poses_have_no_more_pixels_than_the_rows_need(count: int, step: int) -> 
 
 def test_geometry_goes_on_whatever_the_degree() -> None:
     moved = {"sh_dc": np.ones((3, 2), np.float32), "means": np.array([[1, 2]] * 3, np.float32)}
-    last = Mended.of(np.array([7, 2]), np.array([1, 0]), moved, moved)
+    last = Mended.of(np.array([2, 7]), np.array([0, 1]), np.array([1, 0]), moved, fields=tuple(moved))
     planes = {"sh_dc": np.zeros((3, 3), np.float32), "means": np.zeros((3, 3), np.float32)}
     found = last.apply(np.array([1, 2, 7]), np.array([1, 1, 1]), planes)
     np.testing.assert_array_equal(found["means"], [[0, 2, 1]] * 3)
