@@ -208,7 +208,7 @@ def command(input: str, output: str | None, json_path: str | None, quiet: bool, 
       flexgs-edge compress point_cloud.ply -o scene.fgs --effort fast
           half the seconds, some more bytes
       flexgs-edge compress point_cloud.ply -o scene.fgs --effort max
-          a third fewer bytes, for two to three times the seconds
+          a third fewer bytes, in more time
       flexgs-edge compress point_cloud.ply -o a.fgs --method paper --score-cache s.npz
       flexgs-edge compress point_cloud.ply -o b.fgs --method paper --score-cache s.npz --max-drop 2
           the paper's method: score once, then try another target
