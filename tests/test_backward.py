@@ -106,7 +106,7 @@ def differences(
 
 
 def assert_close(found: Planes, expected: Planes, rows: list[int]) -> None:
-    """Within 3e-5 of a field's largest gradient of the row, and 3e-6 of the scene's (worst of 50 scenes: a third of that)."""
+    """Within 3e-5 of a field's largest gradient of the row, and 3e-6 of the scene's."""
     for name, wanted in expected.items():
         if wanted.size:
             largest = abs(wanted).max(axis=0)
