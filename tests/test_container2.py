@@ -129,22 +129,25 @@ def test_a_scene_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert decoded == ["chunk 0", "chunk 1", "chunk 2"]
 
 
-@pytest.mark.parametrize(("step", "valid"), [(2.0**38, True), (2.0**70, False)])
-def test_the_largest_codes_are_valid_values(tmp_path: Path, step: float, valid: bool) -> None:
+@pytest.mark.parametrize(
+    ("rotation", "colour", "fault"),
+    [(2.0**38, 2.0**20, None), (2.0**70, 2.0**20, "quats of norm zero"), (2.0**38, 2.0**30, "beyond .* in sh_dc")],
+)
+def test_the_largest_codes_are_valid_values(tmp_path: Path, rotation: float, colour: float, fault: str | None) -> None:
     """A grid is taken unchecked only where every code gives a value that the check would pass."""
     path = tmp_path / "a.fgs"
-    steps = Steps(*[2.0**80] * 5, (2.0**80,) * 4, 2.0**16)
+    steps = Steps(*[2.0**80] * 4, colour, (colour,) * 4, 2.0**4)
     grid = make_grid(20, 1)
     for plane in (grid.position, grid.scale, grid.rotation, grid.opacity, grid.dc, *grid.sh):
         plane[:] = 2**24
-    write_grid(path, replace(grid, steps=replace(steps, rotation=step, sh=steps.sh[:1])), {})
+    write_grid(path, replace(grid, steps=replace(steps, rotation=rotation, sh=steps.sh[:1])), {})
     source = GridSource(path)
-    assert source.valid == valid
+    assert source.valid == (fault is None)
     source.valid = False
-    if valid:
+    if fault is None:
         assert check_scene(source) is source
     else:
-        with pytest.raises(InputError, match="quats of norm zero"), np.errstate(over="ignore"):
+        with pytest.raises(InputError, match=fault), np.errstate(over="ignore"):
             check_scene(source)
 
 

@@ -203,7 +203,7 @@ def test_moved_scenes_are_compressed_alike_and_half_positions_are_not(study: Stu
         most = 1.0 if method == "best" else 0.3
         assert number(rows["turned", method]["same"]) >= 0.99 and abs(number(rows["turned", method]["change"])) < most
     # 6e-5 of a unit are lost in the file already; nothing of it is the method's.
-    assert number(rows["moved 1e3, float32", "best"]["given"]) < 90
+    assert number(rows["moved 1e3, float32", "best"]["given"]) < 100
     assert rows["moved 1e5, float64", "float16 positions"]["broke"] == LOST
 
 

@@ -19,6 +19,7 @@ from flexgs_edge.codec.threads import in_order, thread_count
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds
 from flexgs_edge.grid import CODE_LIMIT, GridScene, from_grid
 from flexgs_edge.regrid import grid_comment
+from flexgs_edge.scene.check import SH_LARGEST
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
 _ROTATION_STEP_MOST = 2.0**38
@@ -51,9 +52,11 @@ class GridSource(SceneSource):
         self.count, self.sh_degree = header.count, header.sh_degree
         self.sh_count = self.count if self.sh_degree else 0
         self.origin = np.array(header.origin, np.float64)
-        # Codes times steps are finite; only the squares of absurdly large rotations could leave float32. Checking the
-        # values would decode the file twice more.
-        self.valid = header.grid_steps.rotation <= _ROTATION_STEP_MOST
+        # Codes times steps are finite; only the squares of absurdly large rotations and colours could leave float32. Checking
+        # the values would decode the file twice more.
+        steps = header.grid_steps
+        colour = CODE_LIMIT * max(steps.dc, *steps.sh, 0.0) * (1 + steps.chroma)
+        self.valid = steps.rotation <= _ROTATION_STEP_MOST and colour <= SH_LARGEST
         self.settings: dict[str, Any] = header.settings
         self.comments = (grid_comment(header.grid_steps),)
         self._model = self.container.read_model()
