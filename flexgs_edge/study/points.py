@@ -163,7 +163,11 @@ def best_points(
     """
     workspace, source = bench.workspace, bench.scene.source
     options = replace(bench.options, effort=effort, refit=variant.refit, best_effort=True)
-    poses = scored_poses(bench.views.of(bench.views.train), options, workspace.renderer, source)
+    # All sizes share one path, and so its poses: those of the largest.
+    largest = replace(
+        options, max_drop=None, min_fidelity=None, max_size=None, min_ratio=min(ratios), max_worst_drop=None
+    )
+    poses = scored_poses(bench.views.of(bench.views.train), largest, workspace.renderer, source)
     found = NOTHING
     started = time.perf_counter()
     with open_path(
