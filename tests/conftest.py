@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from flexgs_edge.best.effort import EFFORTS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -42,6 +45,14 @@ def fox_dir(scenes_dir: Path) -> Path:
     if not (folder / "point_cloud.ply").is_file():
         pytest.skip(f"no fox scene at {folder}: set FLEXGS_SCENES to a folder that has it")
     return folder
+
+
+@pytest.fixture(scope="module")
+def short_searches() -> Iterator[None]:
+    """The first whole result that holds is the answer: on tiny scenes one takes a second, nearly all of it the coder's tables."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(EFFORTS, "fast", replace(EFFORTS["fast"], steps=1, close=1.0))
+        yield
 
 
 @pytest.hookimpl(wrapper=True)

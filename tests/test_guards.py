@@ -12,17 +12,19 @@ import pytest
 from flexgs_edge.adapt import MaxDrop, Measurement, MinFidelity, Scored, WorstToo, adapt
 from flexgs_edge.budget import current_rss
 from flexgs_edge.cameras import Camera, read_cameras
+from flexgs_edge.cameras.made import at_distance, between
 from flexgs_edge.codec import open_fgs
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.doubts import FIT_GAP, FIT_STEP, FIT_VIEWS, NEEDED_VIEWS, doubts, training_fidelity
 from flexgs_edge.pipeline.inputs import Views
 from flexgs_edge.pipeline.judge import measurement_of
-from flexgs_edge.pipeline.margin import FARTHER, NEARER, at_distance, between, middle_of, visible_depths, with_margin
+from flexgs_edge.pipeline.margin import FARTHER, NEARER, with_margin
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.poses import is_fine
 from flexgs_edge.prune import Choice
 from flexgs_edge.render import Renderer
+from flexgs_edge.render.depths import middle_of, visible_depths
 from flexgs_edge.render.quality import Quality, ViewQuality, psnr
 from flexgs_edge.report.result import CompressResult
 from flexgs_edge.report.summary import compress_text

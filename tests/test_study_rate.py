@@ -18,7 +18,6 @@ import pytest
 from flexgs_edge import cli
 from flexgs_edge.adapt import min_ratio
 from flexgs_edge.best.choice import BitModel, choose
-from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.path import PrunePath
 from flexgs_edge.cli.study.rate import RATIOS, command
 from flexgs_edge.errors import InputError
@@ -41,20 +40,14 @@ from flexgs_edge.study.trade import CODERS
 from synthetic import random_scene
 from tiny_project import COUNT, make_project
 
+pytestmark = pytest.mark.usefixtures("short_searches")
+
 OPTIONS = CompressOptions(method="best", holdout=4, effort="fast")
 RATIO = 3.0
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _short_searches() -> Iterator[None]:
-    """The first whole result that holds is the answer: a result takes a second here, nearly all of it the coder's tables."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(EFFORTS, "fast", replace(EFFORTS["fast"], steps=1, close=1.0))
-        yield
-
-
 @pytest.fixture(scope="module")
-def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def project(short_searches: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_project(tmp_path_factory.mktemp("rate") / "cloud")
 
 

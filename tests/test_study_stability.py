@@ -19,12 +19,12 @@ import pytest
 
 from flexgs_edge import cli
 from flexgs_edge.adapt import MaxDrop, MaxSize
-from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.cli.study.stability import command
 from flexgs_edge.errors import InputError
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.progress import SILENT
-from flexgs_edge.render import Renderer, Statistics
+from flexgs_edge.render import Renderer
+from flexgs_edge.render.depths import visible_depths
 from flexgs_edge.render.quality import mse
 from flexgs_edge.scene import MemorySource
 from flexgs_edge.scene.fields import FIELD
@@ -40,6 +40,8 @@ from flexgs_edge.study.stability import StabilityStudy, study_stability
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, make_splats, random_scene
 from tiny_project import make_project
+
+pytestmark = pytest.mark.usefixtures("short_searches")
 
 OPTIONS = CompressOptions(holdout=3, max_drop=1.0)
 AMOUNTS = replace(
@@ -61,16 +63,8 @@ KEYS = [
 Study = tuple[StabilityStudy, Path]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _short_searches() -> Iterator[None]:
-    """The first whole result that holds is the answer: a result takes a second here, nearly all of it the coder's tables."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(EFFORTS, "fast", replace(EFFORTS["fast"], steps=1, close=1.0))
-        yield
-
-
 @pytest.fixture(scope="module")
-def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def project(short_searches: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_project(tmp_path_factory.mktemp("stability") / "cloud")
 
 
@@ -199,7 +193,7 @@ def test_moved_scenes_are_compressed_alike_and_half_positions_are_not(study: Stu
             assert abs(number(row["change"])) < 0.3, row
     assert rows["moved 1e5, float64", "paper"]["within"] and rows["scaled 1e3", "paper"]["within"]
     for method in ("best", "paper"):
-        # Steps are measured at a part of few pixels: on 400 Gaussians they differ by more than on a scene.
+        # One Gaussian of 226 is another, and everything is rounded otherwise.
         most = 1.0 if method == "best" else 0.3
         assert number(rows["turned", method]["same"]) >= 0.99 and abs(number(rows["turned", method]["change"])) < most
     # 6e-5 of a unit are lost in the file already; nothing of it is the method's.
@@ -283,31 +277,19 @@ def test_other_poses_look_at_the_same_point() -> None:
     def seen(pose: object) -> np.ndarray:
         return pose.rotation @ point + pose.translation  # type: ignore[attr-defined]
 
-    for factor in (0.25, 1.0, 4.0):
-        np.testing.assert_allclose(seen(poses.at_distance(camera, depth, factor)), [0, 0, factor * depth], atol=1e-12)
     turned = poses.above(camera, depth, 30.0)
     np.testing.assert_allclose(seen(turned), [0, 0, depth], atol=1e-12)
     assert math.degrees(math.acos(turned.rotation[2] @ camera.rotation[2])) == pytest.approx(30.0)
     # Above: the image's down component of the way there is negative.
     assert (camera.rotation @ (turned.center - camera.center))[1] < 0
-    other = make_camera(90, 70, rotation=look_from(3)[0], translation=look_from(3)[1])
-    middle = poses.between(camera, other)
-    np.testing.assert_allclose(middle.center, (camera.center + other.center) / 2, atol=1e-12)
-    np.testing.assert_allclose(middle.rotation @ middle.rotation.T, np.eye(3), atol=1e-12)
-    apart = [math.acos(min(middle.rotation[2] @ c.rotation[2], 1.0)) for c in (camera, other)]
-    assert apart[0] == pytest.approx(apart[1], abs=1e-6) and np.linalg.det(middle.rotation) > 0
 
 
 def test_depth_of_what_is_seen_and_not_of_what_it_hides() -> None:
     means = np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 9.0], [1.4, 0.0, 5.0]])
     source = make_splats(means, np.full((3, 3), 0.4), opacity=0.99)
-    camera, renderer = make_camera(40, 30), Renderer(open_form("w8"), large_budget())
-    statistics = Statistics.zeros(3)
-    with renderer.load(source) as scene:
-        renderer.add_statistics(scene, camera, statistics)
-    renderer.release()
-    assert poses.visible_depth(source, statistics, camera) == pytest.approx(3.0)
-    assert poses.visible_depth(source, Statistics.zeros(3), camera) == 1.0
+    assert visible_depths(Renderer(open_form("w8"), large_budget()), source, [make_camera(40, 30)]) == [
+        pytest.approx(3.0)
+    ]
 
 
 def test_the_worst_tile() -> None:

@@ -12,7 +12,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Generic
+from typing import Generic, Protocol
 
 import numpy as np
 
@@ -43,8 +43,12 @@ from flexgs_edge.score.removal import RemovalCosts
 
 LOG = logging.getLogger("flexgs_edge")
 
-Measure = Callable[..., Measurement]
-"""Quality of planes ([width, n] f32 by field); with `estimate=True` a good guess, in a part of the time."""
+
+class Measure(Protocol):
+    """Quality of planes ([width, n] f32 by field); with `estimate` a good guess, in a part of the time."""
+
+    def __call__(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement: ...
+
 
 PRUNED_PART = 0.45
 """Part of the allowed loss that pruning alone has used up when a whole result meets the target (fox .45, the sample .55): where

@@ -20,7 +20,7 @@ from flexgs_edge.best.path import PrunePath
 from flexgs_edge.best.search import Measure, MultiplierSearch, Product, RateResult, RateSearch, RateStep
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
-from flexgs_edge.cameras.between import poses_between
+from flexgs_edge.cameras.made import poses_between
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.curve import near_rows
 from flexgs_edge.grid import GridScene, from_grid
@@ -223,8 +223,8 @@ def search_path(
 ) -> tuple[Product, SearchResult]:
     """`search_best` along a path that is there."""
 
-    def measure(kept: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
-        with renderer.load(MemorySource(kept, origin=source.origin)) as kept_scene:
+    def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
+        with renderer.load(MemorySource(planes, origin=source.origin)) as kept_scene:
             return measurement_of(judge.estimate(kept_scene) if estimate else judge.compare(kept_scene))
 
     def report(step: RateStep) -> None:

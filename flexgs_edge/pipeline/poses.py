@@ -16,8 +16,8 @@ from flexgs_edge.scene.source import SceneSource
 
 FINE_DROP, FINE_FIDELITY, FINE_RATIO = 0.3, 42.0, 30.0
 """Targets beyond these (dB, dB, times) keep most SH of most Gaussians: as many values as a part of the pixels has, and colours
-refitted to these fit nothing else. fox at 0.1 dB takes 1.93 MB from every second pixel, 1.71 MB from all; at 0.5 dB 0.85 MB from
-either."""
+refitted to these fit nothing else. fox at 0.1 dB takes 1.93 MB from every second pixel, 1.72 MB from all; at 0.5 dB 0.85 MB from
+either, and between them 32x loses 0.28 dB at a fidelity of 42.3 dB."""
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,10 @@ import math
 import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flexgs_edge._version import __version__
 from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.errors import InputError
 from flexgs_edge.pipeline.options import CompressOptions
@@ -24,7 +23,7 @@ from flexgs_edge.study.experiment import Experiment
 from flexgs_edge.study.folder import atomic_folder, check_folder
 from flexgs_edge.study.page import study_page
 from flexgs_edge.study.points import best_points, paper_points, peer_points
-from flexgs_edge.study.results import SceneStudy, write_scene
+from flexgs_edge.study.results import SceneStudy, WrittenStudy, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -33,25 +32,10 @@ ABLATED = (16.0, 64.0)
 ABLATION_EFFORT = "fast"
 
 
-@dataclass(frozen=True)
-class RateStudy:
+class RateStudy(WrittenStudy):
     """What `study rate` found and wrote."""
 
-    output: str
-    scene: SceneStudy
-
-    def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "study rate",
-            "output": self.output,
-            **self.scene.to_json(),
-        }
-
-    def to_text(self) -> str:
-        """The findings, for people."""
-        return "\n".join([*self.scene.to_lines(), f"wrote {os.path.join(self.output, 'index.html')}"]) + "\n"
+    command = "study rate"
 
 
 def study_rate(

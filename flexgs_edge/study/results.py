@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+from flexgs_edge._version import __version__
 from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.report.result import RunInfo, SceneInfo, ViewsInfo
 from flexgs_edge.report.summary import device_words
@@ -58,6 +60,36 @@ class SceneStudy:
             lines += [f"    {words}" for words in experiment.findings]
             lines += [f"    {b.what}: {b.here}; paper: {b.paper}" for b in experiment.beside]
         return lines
+
+
+@dataclass(frozen=True)
+class WrittenStudy:
+    """What a study of one scene found and wrote.
+
+    Parameters
+    ----------
+    output : str
+        The folder.
+    scene : SceneStudy
+    """
+
+    output: str
+    scene: SceneStudy
+
+    command: ClassVar[str]
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {
+            "program": f"flexgs-edge {__version__}",
+            "command": self.command,
+            "output": self.output,
+            **self.scene.to_json(),
+        }
+
+    def to_text(self) -> str:
+        """The findings, for people."""
+        return "\n".join([*self.scene.to_lines(), f"wrote {os.path.join(self.output, 'index.html')}"]) + "\n"
 
 
 def write_scene(place: Path, scene: SceneStudy) -> Section:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flexgs_edge._version import __version__
 from flexgs_edge.errors import InputError
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.progress import SILENT, Progress
@@ -20,7 +19,7 @@ from flexgs_edge.study.experiment import Experiment
 from flexgs_edge.study.folder import atomic_folder, check_folder
 from flexgs_edge.study.page import study_page
 from flexgs_edge.study.presets import presets
-from flexgs_edge.study.results import SceneStudy, write_scene
+from flexgs_edge.study.results import SceneStudy, WrittenStudy, write_scene
 from flexgs_edge.study.sampling import sampling
 from flexgs_edge.study.scaling import scaling
 from flexgs_edge.study.scoring import scoring
@@ -32,25 +31,10 @@ REPEATS = 5
 TRIALS = 200
 
 
-@dataclass(frozen=True)
-class SpeedStudy:
+class SpeedStudy(WrittenStudy):
     """What `study speed` found and wrote."""
 
-    output: str
-    scene: SceneStudy
-
-    def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "study speed",
-            "output": self.output,
-            **self.scene.to_json(),
-        }
-
-    def to_text(self) -> str:
-        """The findings, for people."""
-        return "\n".join([*self.scene.to_lines(), f"wrote {os.path.join(self.output, 'index.html')}"]) + "\n"
+    command = "study speed"
 
 
 def study_speed(

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flexgs_edge._version import __version__
 from flexgs_edge.best.path import PrunePath
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.progress import SILENT, Progress
@@ -31,7 +30,7 @@ from flexgs_edge.study.cliffs.strays import strays
 from flexgs_edge.study.experiment import Experiment
 from flexgs_edge.study.folder import atomic_folder, check_folder
 from flexgs_edge.study.page import study_page
-from flexgs_edge.study.results import SceneStudy, write_scene
+from flexgs_edge.study.results import SceneStudy, WrittenStudy, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -44,26 +43,16 @@ COPIES = 6
 
 
 @dataclass(frozen=True)
-class StabilityStudy:
+class StabilityStudy(WrittenStudy):
     """What `study stability` found and wrote."""
 
-    output: str
     quick: bool
-    scene: SceneStudy
+
+    command = "study stability"
 
     def to_json(self) -> dict[str, Any]:
         """The record for machines."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "study stability",
-            "output": self.output,
-            "quick": self.quick,
-            **self.scene.to_json(),
-        }
-
-    def to_text(self) -> str:
-        """The findings, for people."""
-        return "\n".join([*self.scene.to_lines(), f"wrote {os.path.join(self.output, 'index.html')}"]) + "\n"
+        return {**super().to_json(), "quick": self.quick}
 
 
 def study_stability(
@@ -111,7 +100,7 @@ def study_stability(
         page = study_page("Stability", _INTRO, [write_scene(folder, found)])
         (folder / "index.html").write_text(page, encoding="utf-8")
     LOG.info("wrote %s", Path(output) / "index.html")
-    return StabilityStudy(os.fspath(output), quick, found)
+    return StabilityStudy(os.fspath(output), found, quick)
 
 
 _INTRO = (

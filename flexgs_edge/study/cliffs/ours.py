@@ -102,8 +102,8 @@ def whole_at(bench: Bench, path: PrunePath, judge: Judge, multiplier: float) -> 
 
 
 def _search(bench: Bench, path: PrunePath, judge: Judge, renderer: Renderer) -> FixedSearch:
-    def measure(kept: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
-        with renderer.load(MemorySource(kept, origin=path.origin)) as scene:
+    def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
+        with renderer.load(MemorySource(planes, origin=path.origin)) as scene:
             return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))
 
     options = replace(bench.options, refit=True)

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flexgs_edge.cameras import Camera
-from flexgs_edge.render import Statistics
+from flexgs_edge.cameras.made import at_distance, between
+from flexgs_edge.render.depths import visible_depths
 from flexgs_edge.render.quality import mean_psnr, mse, psnr
-from flexgs_edge.scene import SceneSource
 from flexgs_edge.study.bench import Bench
 from flexgs_edge.study.charts import BarChart, LineChart
 from flexgs_edge.study.cliffs.amounts import Amounts
@@ -26,8 +26,6 @@ TURNS = (15.0, 30.0)
 ZOOMS = (0.5, 2.0, 4.0)
 SIZES = (0.5, 2.0)
 TRAINING, HELD_OUT, DISTANCE = "training", "held out", "distance"
-MIDDLE = 1 / 3
-"""Part of the frame whose Gaussians tell what a pose looks at."""
 HEADS = {
     "method": "method",
     "poses": "poses",
@@ -56,37 +54,6 @@ def evenly(cameras: Sequence[Camera], count: int) -> list[Camera]:
     return [cameras[i * len(cameras) // count] for i in range(count)]
 
 
-def visible_depth(source: SceneSource, statistics: Statistics, camera: Camera) -> float:
-    """Depth of what a camera looks at: the median of the Gaussians in the middle of its frame, by how much of each is seen.
-
-    Parameters
-    ----------
-    statistics : Statistics
-        Of this view alone.
-    """
-    moved = camera.moved(source.origin)
-    means = source.read(slice(0, source.count), ["means"])["means"].astype(np.float64)
-    x, y, z = moved.rotation @ means + moved.translation[:, None]
-    weights = statistics.weight_sums.copy()
-    with np.errstate(divide="ignore", invalid="ignore"):
-        across = np.abs(moved.fx * x / z + moved.cx - moved.width / 2) < MIDDLE * moved.width / 2
-        down = np.abs(moved.fy * y / z + moved.cy - moved.height / 2) < MIDDLE * moved.height / 2
-    seen = (weights > 0) & (z > 0)
-    inside = seen & across & down
-    rows = np.flatnonzero(inside if inside.any() else seen)
-    if not len(rows):
-        return 1.0
-    order = rows[np.argsort(z[rows], kind="stable")]
-    sums = np.cumsum(weights[order])
-    return float(z[order[np.searchsorted(sums, sums[-1] / 2)]])
-
-
-def at_distance(camera: Camera, depth: float, factor: float) -> Camera:
-    """The pose moved along its axis: `factor` times as far from what lies at `depth`."""
-    # Along the camera's own axis only the third part of the translation changes.
-    return replace(camera, translation=camera.translation + np.array([0.0, 0.0, (factor - 1) * depth]))
-
-
 def above(camera: Camera, depth: float, degrees: float) -> Camera:
     """The pose turned up about what lies at `depth` on its axis, still looking there."""
     angle = math.radians(degrees)
@@ -97,18 +64,11 @@ def above(camera: Camera, depth: float, degrees: float) -> Camera:
     return replace(camera, rotation=turn @ camera.rotation, translation=turn @ (camera.translation - pivot) + pivot)
 
 
-def between(first: Camera, second: Camera) -> Camera:
-    """The pose half way between two: the middle of the places, the nearest rotation to the mean."""
-    left, _, right = np.linalg.svd(first.rotation + second.rotation)
-    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return replace(first, rotation=rotation, translation=-rotation @ (first.center + second.center) / 2)
-
-
 def make_poses(bench: Bench, amounts: Amounts) -> list[Poses]:
     """All sets, the training poses first."""
     train = bench.views.of(bench.views.train)
     base = evenly(bench.judge.cameras, amounts.poses)
-    depths = _depths(bench, base)
+    depths = visible_depths(bench.workspace.renderer, bench.scene.source, base)
     near = [min(train, key=lambda other: float(np.linalg.norm(other.center - camera.center))) for camera in base]
     made = [Poses(TRAINING, None, evenly(train, amounts.poses)), Poses(HELD_OUT, None, base)]
     made += [
@@ -125,18 +85,6 @@ def make_poses(bench: Bench, amounts: Amounts) -> list[Poses]:
 
 def _sized(camera: Camera, factor: float) -> Camera:
     return camera.scaled(max(round(factor * camera.width), 1), max(round(factor * camera.height), 1))
-
-
-def _depths(bench: Bench, cameras: Sequence[Camera]) -> list[float]:
-    renderer, source = bench.workspace.renderer, bench.scene.source
-    depths = []
-    with renderer.load(source) as scene:
-        for camera in cameras:
-            statistics = Statistics.zeros(scene.count)
-            renderer.add_statistics(scene, camera, statistics)
-            depths.append(visible_depth(source, statistics, camera))
-    renderer.release()
-    return depths
 
 
 def worst_tile(image: np.ndarray, reference: np.ndarray, side: int = TILE_SIDE) -> float:
