@@ -88,7 +88,9 @@ def open_checkpoint(
     renderer: Renderer, source: SceneSource, scored: Sequence[Camera], options: CompressOptions, folder: Path
 ) -> Checkpoint:
     """Where the path of a search keeps its rounds: a folder named by all that they depend on."""
-    words = f"path {EFFORTS[options.effort].keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r}"
+    # A path that leads to a descent keeps views from between the poses as well.
+    distils = distil_steps(options, len(scored)) > 0
+    words = f"path {EFFORTS[options.effort].keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r} {distils}"
     assert options.near is not None and options.extent is not None
     key = fingerprint(source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
     checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")
