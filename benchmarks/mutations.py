@@ -4,7 +4,8 @@
     python -m benchmarks.mutations --only conic -v    # those whose name holds a word; writes nothing
 
 The twins stay as they are, so that the comparison with them sees every fault by construction. What counts is the first
-column: tests against the float64 reference, which knows neither kernels nor twins.
+column: tests against the float64 reference, which knows neither kernels nor twins. (A coder has no values of its own to be wrong
+in: what its kernels are held against is the coder in NumPy, in the second column.)
 """
 
 from __future__ import annotations
@@ -24,10 +25,31 @@ from pathlib import Path
 from benchmarks.harness import ROOT, SCENES
 
 TABLE = ROOT / "docs" / "mutations.md"
-REFERENCE = ("tests/test_render_reference.py", "tests/test_score.py", "tests/test_kernels_dequantize.py")
-TWINS = ("tests/test_kernels_twins.py", "tests/test_kernels_arithmetic.py")
-GOLDEN = ("tests/test_golden_fox.py",)
 SURVIVED = "survived"
+
+
+@dataclass(frozen=True)
+class Tests:
+    """Files and keywords of the tests that must see a kind of fault; `{form}` is the form's name."""
+
+    reference: tuple[str, ...]
+    reference_words: str
+    twins: tuple[str, ...]
+    twin_words: str
+    golden: bool = False
+
+
+RENDER = Tests(
+    ("tests/test_render_reference.py", "tests/test_score.py", "tests/test_kernels_dequantize.py"),
+    "{form}",
+    ("tests/test_kernels_twins.py", "tests/test_kernels_arithmetic.py"),
+    "{form}",
+    golden=True,
+)
+BACKWARD = Tests(("tests/test_backward.py",), "float64", ("tests/test_backward.py",), "descents and {form}")
+SIMILARITY = Tests(("tests/test_ssim.py",), "scikit", ("tests/test_ssim.py",), "scikit")
+CODER = Tests((), "", ("tests/test_codec_kernel.py",), "same and {form}")
+GOLDEN = ("tests/test_golden_fox.py",)
 
 
 @dataclass(frozen=True)
@@ -46,6 +68,8 @@ class Mutation:
         Which form of the kernels the tests run on: `w16` or `gpu`.
     reference : bool
         Whether the reference can see it (some faults only break the equality of bits between forms).
+    tests : Tests
+        Which tests must see it.
     """
 
     name: str
@@ -54,6 +78,19 @@ class Mutation:
     new: str
     form: str = "w16"
     reference: bool = True
+    tests: Tests = RENDER
+
+
+def backward(
+    name: str, old: str, new: str, file: str = "backward.cl", form: str = "w16", reference: bool = True
+) -> Mutation:
+    """A fault in gradients or in the descent along them."""
+    return Mutation(name, file, old, new, form, reference, BACKWARD)
+
+
+def coder(name: str, old: str, new: str) -> Mutation:
+    """A fault in the entropy coder."""
+    return Mutation(name, "decode_chunks.cl", old, new, reference=False, tests=CODER)
 
 
 def constant(name: str, literal: str, words: str) -> Mutation:
@@ -164,6 +201,33 @@ MUTATIONS = (
     ),
     Mutation("GPU form: ended pixels go on", "blend_gpu.cl", "seen ? -fabs(t) : t", "t", "gpu"),
     Mutation("GPU form: no background", "blend_gpu.cl", "fma(fabs(t), background_r, red)", "red", "gpu"),
+    backward("gradient beyond the Jacobian's clamp", "pick(MASK(uc == u), j00 * e02, (FW)0.0f)", "j00 * e02"),
+    backward("colours below 0 have a gradient", "pick(MASK(RECORD(6 + c) > (FW)0.0f), SUM(c), (FW)0.0f)", "SUM(c)"),
+    backward("gradient: sign of the turn about z", "h11 * v10) - fma(h00", "h11 * v10) + fma(h00"),
+    backward("gradient of the opacity, not of its logit", "slope * ((FW)1.0f - opacity)", "slope"),
+    backward("gradient along the direction of SH", "tx = fma(-along, dx, tx) * norm", "tx = tx * norm"),
+    backward("gradient: opacity's factor held", "if (antialiased) {\n    // log", "if (antialiased > 1) {\n    // log"),
+    backward("gradient: what is behind stays as it was", "red[k] -= own_light;", "", "blend_cpu.cl"),
+    backward(
+        "gradient at the cap of alpha", "pick(MASK(alpha < (FW)ALPHA_MAX), light, (FW)0.0f)", "light", "blend_cpu.cl"
+    ),
+    backward(
+        "descent without Adam's correction",
+        "whole_first = (FW)1.0f / ((FW)1.0f - power_first)",
+        "whole_first = (FW)1.0f",
+        reference=False,
+    ),
+    backward(
+        "descent: opposite quaternions on the grid", "inv = pick(MASK(w < (FW)0.0f), -inv, inv);", "", reference=False
+    ),
+    Mutation("SSIM: variance not about the mean", "similarity.cl", "(m[2] - aa)", "m[2]", tests=SIMILARITY),
+    Mutation(
+        "SSIM: windows one pixel short", "similarity.cl", "k < SSIM_WINDOW", "k < SSIM_WINDOW - 1", tests=SIMILARITY
+    ),
+    coder("coder: states are not filled up", "return (state / RANS_FLOOR - 1) >> 31", "return 0"),
+    coder("coder: predictions rounded down", "mean * (DW)(1.0 / 65536.0) + (DW)0.5", "mean * (DW)(1.0 / 65536.0)"),
+    coder("coder: places of far values", "long code = start + (rounded[j] & keep) + more", "long code = start + more"),
+    coder("coder: raw bits in one place", "(uchar)(offset >> (8 * piece)", "(uchar)(offset >> piece"),
 )
 
 
@@ -196,19 +260,23 @@ def run_tests(place: Path, files: tuple[str, ...], keywords: str) -> str | None:
     there = [file for file in files if (ROOT / file).is_file()]
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--no-cov", "-k", keywords, *there]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    failed = re.search(r"^(?:FAILED|ERROR) tests/(\S+)", done.stdout, re.MULTILINE)
+    failed = re.search(r"^(?:FAILED|ERROR) tests/(.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
     if done.returncode not in (0, 1) or (done.returncode == 1 and not failed):
         raise RuntimeError(f"pytest ended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
     return failed.group(1) if failed else None
 
 
-def judge(place: Path, mutation: Mutation | None, verbose: bool = False) -> tuple[str | None, ...]:
+def judge(place: Path, mutation: Mutation | None, tests: Tests, verbose: bool = False) -> tuple[str | None, ...]:
     """First red test against the reference, the twins and the golden renders."""
     kernel_folder(place, mutation)
-    form = mutation.form if mutation else "w16 or gpu"
+    form = mutation.form if mutation else "(w16 or gpu)"
     found = tuple(
-        run_tests(place, files, keywords)
-        for files, keywords in ((REFERENCE, form), (TWINS, form), (GOLDEN, "images or statistics"))
+        run_tests(place, files, words.format(form=form)) if files else None
+        for files, words in (
+            (tests.reference, tests.reference_words),
+            (tests.twins, tests.twin_words),
+            (GOLDEN if tests.golden else (), "images or statistics"),
+        )
     )
     if verbose:
         print(f"{mutation.name if mutation else 'no fault'}: {found}", flush=True)
@@ -231,7 +299,7 @@ def table(rows: list[tuple[Mutation, tuple[str | None, ...]]]) -> str:
     for mutation, (reference, twins, golden) in rows:
         first = f"`{reference}`" if reference else "not a matter of value" if not mutation.reference else SURVIVED
         second = f"`{twins}`" if twins else SURVIVED
-        used = mutation.form != "gpu" and mutation.file != "dequantize.cl"
+        used = mutation.form != "gpu" and mutation.file != "dequantize.cl" and mutation.tests.golden
         third = "red" if golden else "within limits" if used else "not used there"
         lines.append(f"| {mutation.name} | {first} | {second} | {third} |")
     return "\n".join(lines) + "\n"
@@ -249,11 +317,12 @@ def main() -> int:
         )
     chosen = [mutation for mutation in MUTATIONS if not options.only or options.only in mutation.name]
     with workplace() as place:
-        healthy = judge(place, None)
-        if any(healthy):
-            print(f"the tests fail on the kernels as they are: {healthy}", file=sys.stderr)
-            return 2
-        rows = [(mutation, judge(place, mutation, options.verbose)) for mutation in chosen]
+        for tests in dict.fromkeys(mutation.tests for mutation in chosen):
+            healthy = judge(place, None, tests)
+            if any(healthy):
+                print(f"the tests fail on the kernels as they are: {healthy}", file=sys.stderr)
+                return 2
+        rows = [(mutation, judge(place, mutation, mutation.tests, options.verbose)) for mutation in chosen]
     page = table(rows)
     if options.only:
         print(page)

@@ -97,7 +97,7 @@ def test_forms_give_the_same_gradients(form: str) -> None:
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("form", FORMS)
 def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every launch compared: in batches, in two chunks, off and on a grid, rows of every degree, one that is not seen."""
+    """Every launch compared: in batches, two chunks, off and on a grid, rows of all degrees, one unseen, one beyond the clamp."""
     monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 64)
     monkeypatch.setattr("flexgs_edge.render.device_scene.CHUNK_ROWS", 40)
     monkeypatch.setattr("flexgs_edge.render.device_scene.MIN_CHUNK_ROWS", 16)
@@ -105,6 +105,9 @@ def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: 
     cameras = [view(2, 33, 20), make_camera(33, 20)]
     planes = planes_of(65, 18, 4, -1.8)
     planes["means"][2, 50] = -3
+    planes["means"][:, 3], planes["log_scales"][:, 3] = (2.2, 0.3, 2.5), (0.9, 0.5, -0.5)
+    planes["opacity_logits"][0, 3] = 3
+    planes["opacity_logits"][0, 5:20] = 9  # alpha at its cap
     degrees = np.repeat([4, 1, 2, 3, 0], 13)
     planes["sh_rest"][:, degrees == 0] = 0
     renderer = Renderer(paired, large_budget(), background=BACKGROUND, antialiased=antialiased)
