@@ -88,7 +88,7 @@ def _chart(table: Table, title: str, figure: str, effort: str) -> LineChart:
                 name,
                 [float(row["size"] or 0) / 1e6 for row in rows],
                 [None if row[figure] is None else float(row[figure] or 0.0) for row in rows],
-                notes=[_note(row) for row in rows] if rows[0]["wanted_ratio"] is not None else [name] * len(rows),
+                notes=[_note(row) for row in rows] if rows[0]["method"] in ("best", "paper") else [name] * len(rows),
             )
             for name, rows in series.items()
         ),
