@@ -23,7 +23,7 @@ from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, values_of
 from flexgs_edge.pipeline.best import grid_search, kept_as_it_is, layered, search_best, search_files
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
-from flexgs_edge.pipeline.doubts import doubts, training_fidelity
+from flexgs_edge.pipeline.doubts import TrainingPoses, doubts
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
 from flexgs_edge.pipeline.grid_coder import GridCoder
@@ -382,14 +382,19 @@ class _Job:
     def _compare(self, load: Callable[[], DeviceScene], report: Judge) -> Quality:
         """Quality of what `load` brings to the device, over the views that report and (fidelity only) some training poses."""
         assert self.workspace is not None and self.views is not None
-        with self.clock.stage("measure"):
+        views, renderer = self.views, self.workspace.renderer
+        with self.clock.stage("measure"), ExitStack() as held:
+            trained = None
+            if views.train and self.plan.report == views.held_out:
+                # Before the result is there: it is brought to the device, and decoded, only once.
+                trained = TrainingPoses(renderer, self.source, views.of(views.train), self.progress)
+                held.callback(trained.close)
             with load() as scene:
                 quality = report.compare(scene, with_ssim=True, progress=self.progress)
                 if self.reporter is not None:
                     self.reporter.look(report, scene, quality, self.clock, self.progress)
-            if self.views.train and self.plan.report == self.views.held_out:
-                train, renderer = self.views.of(self.views.train), self.workspace.renderer
-                self.trained = training_fidelity(renderer, self.source, load, train, self.progress)
+                if trained is not None:
+                    self.trained = trained.fidelity(scene)
         return quality
 
     def _result(
