@@ -220,6 +220,21 @@ def _inria_mask(splats: _Splats, k: int, width: int, height: int) -> np.ndarray:
     return mask[1][:, None] & mask[0]
 
 
+def alphas(splats: _Splats, k: int, xs: np.ndarray, ys: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[H, W] alpha of a splat, the bound on its error, and where it is held at its cap."""
+    dx, dy = xs - splats.mean[k, 0], ys - splats.mean[k, 1]
+    (ca, cb, cc), (ea, eb, ec) = splats.conic[k], splats.conic_error[k]
+    q = np.maximum(ca * dx * dx + 2 * cb * dx * dy + cc * dy * dy, 0)
+    parts = ca * dx * dx + 2 * abs(cb * dx * dy) + cc * dy * dy
+    exponent_error = (ea * dx * dx + 2 * eb * abs(dx * dy) + ec * dy * dy) / 2 + 5 * EPS * parts
+    exponent_error += abs(ca * dx + cb * dy) * splats.mean_error[k, 0]
+    exponent_error += abs(cb * dx + cc * dy) * splats.mean_error[k, 1]
+    exponent_error += splats.exponent_error[k] + 2 * EPS * q
+    full = splats.opacity[k] * np.exp(-q / 2)
+    error = np.where(full * (1 - exponent_error) > ALPHA_MAX, EPS, full * exponent_error)
+    return np.minimum(ALPHA_MAX, full), error, full >= ALPHA_MAX
+
+
 def render(
     source: SceneSource,
     camera: Camera,
@@ -249,17 +264,7 @@ def render(
             continue
         if not (alive | fragile).any():
             break
-        dx, dy = xs - splats.mean[k, 0], ys - splats.mean[k, 1]
-        (ca, cb, cc), (ea, eb, ec) = splats.conic[k], splats.conic_error[k]
-        q = np.maximum(ca * dx * dx + 2 * cb * dx * dy + cc * dy * dy, 0)
-        parts = ca * dx * dx + 2 * abs(cb * dx * dy) + cc * dy * dy
-        exponent_error = (ea * dx * dx + 2 * eb * abs(dx * dy) + ec * dy * dy) / 2 + 5 * EPS * parts
-        exponent_error += abs(ca * dx + cb * dy) * splats.mean_error[k, 0]
-        exponent_error += abs(cb * dx + cc * dy) * splats.mean_error[k, 1]
-        exponent_error += splats.exponent_error[k] + 2 * EPS * q
-        full = splats.opacity[k] * np.exp(-q / 2)
-        alpha = np.minimum(ALPHA_MAX, full)
-        alpha_error = np.where(full * (1 - exponent_error) > ALPHA_MAX, EPS, full * exponent_error)
+        alpha, alpha_error, _ = alphas(splats, k, xs, ys)
 
         reached = everywhere if extent == "exact" else _inria_mask(splats, k, width, height)
         candidate = alive & reached

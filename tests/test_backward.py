@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-import reference_renderer
 from flexgs_edge.cameras import Camera
 from flexgs_edge.grid import Steps, from_grid, to_grid
-from flexgs_edge.refit.descent import ORDER, Descent, widths
+from flexgs_edge.refit.descent import ORDER, Descent
 from flexgs_edge.refit.distil import FIELD_RATES
 from flexgs_edge.render import Renderer
 from flexgs_edge.scene.fields import FIELD
 from kernel_fixtures import ALL_FORMS, FORMS, PairedBackend, large_budget, open_form, same_bits
+from reference_gradients import DIFFERENCES, View, allowed_errors, expected_gradients
 from synthetic import look_from, make_camera, random_scene
 from test_kernels_twins import padded_target
 
@@ -35,41 +35,6 @@ def planes_of(count: int, seed: int, degree: int, size: float = -1.3, opacity: f
     return random_scene(count, seed, degree, size, opacity).read(slice(0, count), list(FIELD))
 
 
-@dataclass
-class Frozen:
-    """Which splats each pixel blends, and where alpha is held at its cap: gradients are those between thresholds."""
-
-    order: list[int]
-    hits: dict[int, np.ndarray]
-    capped: dict[int, np.ndarray]
-
-
-def image_in_float64(
-    arrays: Planes, degree: int, camera: Camera, antialiased: bool, frozen: Frozen | None = None
-) -> tuple[np.ndarray, Frozen]:
-    """[H, W, 3] f64 from float64 values by the formulas alone, with decisions frozen if they are given."""
-    splats = reference_renderer._project(arrays, degree, camera, 0.2, antialiased)
-    shape = camera.height, camera.width
-    xs, ys = np.arange(camera.width)[None, :], np.arange(camera.height)[:, None]
-    alive, trans, image = np.ones(shape, bool), np.ones(shape), np.zeros((*shape, 3))
-    made = Frozen([int(k) for k in np.argsort(splats.depth, kind="stable") if splats.shown[k]], {}, {})
-    for k in (frozen or made).order:
-        dx, dy = xs - splats.mean[k, 0], ys - splats.mean[k, 1]
-        a, b, c = splats.conic[k]
-        full = splats.opacity[k] * np.exp(-(a * dx * dx + 2 * b * dx * dy + c * dy * dy) / 2)
-        if frozen is None:
-            capped = full >= reference_renderer.ALPHA_MAX
-            alpha = np.where(capped, reference_renderer.ALPHA_MAX, full)
-            seen = alive & (alpha >= reference_renderer.ALPHA_MIN)
-            made.hits[k], made.capped[k] = seen & (trans * (1 - alpha) >= reference_renderer.STOP), capped
-            alive &= ~(seen & ~made.hits[k])
-        held = frozen or made
-        alpha = np.where(held.capped[k], reference_renderer.ALPHA_MAX, full) * held.hits[k]
-        image += (alpha * trans)[..., None] * splats.colour[k]
-        trans = trans * (1 - alpha)
-    return image + trans[..., None] * np.array(BACKGROUND), made
-
-
 def measured(form: str, planes: Planes, camera: Camera, target: np.ndarray, antialiased: bool) -> Planes:
     count, degree = planes["means"].shape[1], {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}[len(planes["sh_rest"])]
     renderer = Renderer(open_form(form), large_budget(), background=BACKGROUND, antialiased=antialiased)
@@ -80,56 +45,44 @@ def measured(form: str, planes: Planes, camera: Camera, target: np.ndarray, anti
     return gradients
 
 
-def differences(
-    planes: Planes, degree: int, camera: Camera, target: np.ndarray, antialiased: bool, rows: list[int]
-) -> Planes:
-    """[width, rows] by central differences of the float64 image's squared error."""
-    arrays = {name: values.astype(np.float64) for name, values in planes.items()}
-    wanted = target.astype(np.float64)[:, : camera.height, : camera.width].transpose(1, 2, 0)
-    _, frozen = image_in_float64(arrays, degree, camera, antialiased)
-
-    def error(name: str, plane: int, row: int, change: float) -> float:
-        moved = arrays[name].copy()
-        moved[plane, row] += change
-        image, _ = image_in_float64({**arrays, name: moved}, degree, camera, antialiased, frozen)
-        return float(np.square(image - wanted).sum())
-
-    return {
-        name: np.array(
-            [
-                [(error(name, plane, row, CHANGE) - error(name, plane, row, -CHANGE)) / (2 * CHANGE) for row in rows]
-                for plane in range(width)
-            ]
-        ).reshape(width, len(rows))
-        for name, width in widths(degree).items()
-    }
+SCENES = 50
+SEEN_SHARE = 0.03
+"""Of the bound: it adds up the worst case, and roundings behave like noise (1.4 % of it is the most that was seen)."""
 
 
-def assert_close(found: Planes, expected: Planes, rows: list[int]) -> None:
-    """Within 3e-5 of a field's largest gradient of the row, and 3e-6 of the scene's."""
-    for name, wanted in expected.items():
-        if wanted.size:
-            largest = abs(wanted).max(axis=0)
-            allowed = 3e-5 * largest + 3e-6 * largest.max() + 1e-7
-            wrong = abs(found[name][:, rows] - wanted).max(axis=0)
-            assert (wrong <= allowed).all(), (name, wrong / allowed)
-            assert largest.max() > 0, name
+def scene_of(number: int, attempt: int) -> tuple[Planes, int, View]:
+    """A small scene, its SH degree and a view of it.
 
-
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("degree", range(5))
-def test_gradients_are_those_of_float64(degree: int, antialiased: bool) -> None:
-    """One splat lies beyond the Jacobian's clamp, one is held at the cap of alpha, one has a colour cut off at zero."""
-    planes = planes_of(12, 40 + degree, degree, opacity=1.0)
+    One splat lies beyond the Jacobian's clamp, one is held at the cap of alpha, one has a colour cut off at zero.
+    """
+    degree = number % 5
+    planes = planes_of(9, 400 + number + SCENES * attempt, degree, opacity=1.0)
     planes["means"][:, 0], planes["log_scales"][:, 0] = (4.0, 0.3, 2.5), (0.6, 0.2, -0.5)
     planes["opacity_logits"][0, :2] = 2, 9
     planes["sh_dc"][0, 2] = -9
-    camera = view(degree)
-    target = padded_target(camera, degree)
-    found = measured("w16", planes, camera, target, antialiased)
-    rows = [0, 1, 2, 5, 9]
-    assert_close(found, differences(planes, degree, camera, target, antialiased, rows), rows)
-    assert found["means"][:, 0].any() and found["sh_dc"][0, 2] == 0
+    camera = view(number, 21, 18)
+    return planes, degree, View(camera, padded_target(camera, number), BACKGROUND, number // 5 % 2 == 1)
+
+
+@pytest.mark.parametrize("number", range(SCENES))
+def test_gradients_are_those_of_float64(number: int) -> None:
+    """Every value of every row, at every width, within what the roundings of the written forms add up to."""
+    for attempt in range(8):
+        planes, degree, seen = scene_of(number, attempt)
+        allowed = allowed_errors(planes, degree, seen)
+        # In one scene of six a decision lies within rounding of its threshold and may fall either way; in one of four nothing is
+        # seen of the first splat.
+        if allowed is not None and (expected := expected_gradients(planes, degree, seen))["means"][:, 0].any():
+            break
+    assert allowed is not None
+    for form in ("w16", "w8", "w4", "w1"):
+        found = measured(form, planes, seen.camera, seen.target, seen.antialiased)
+        for name, wanted in expected.items():
+            largest = abs(wanted).max(initial=0.0)
+            most = SEEN_SHARE * allowed[name] + DIFFERENCES * largest
+            assert (abs(found[name] - wanted) <= most).all(), (name, form, (abs(found[name] - wanted) / most).max())
+            assert not wanted.size or (largest > 0 and np.median(allowed[name]) < 0.15 * largest), name
+        assert found["sh_dc"][0, 2] == 0
 
 
 @pytest.mark.parametrize("form", ALL_FORMS)

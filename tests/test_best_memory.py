@@ -25,11 +25,13 @@ PAGES = 40 << 20
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("COV")}
 
 
-def compress(folder: Path, name: str, limit: str | None, cap: int | None = None) -> subprocess.CompletedProcess[str]:
+def compress(
+    folder: Path, name: str, limit: str | None, cap: int | None = None, more: tuple[str, ...] = ()
+) -> subprocess.CompletedProcess[str]:
     """A run of its own, within a memory control group of `cap` bytes where one can be had."""
     command = [sys.executable, "-m", "flexgs_edge", "compress", str(folder / "point_cloud.ply"), "-f"]
     command += ["-o", str(folder / f"{name}.fgs"), "--json", str(folder / f"{name}.json"), "--effort", "fast"]
-    command += ["--min-fidelity", "38", "--best-effort", *(() if limit is None else ("--memory-limit", limit))]
+    command += ["--min-fidelity", "38", "--best-effort", *(() if limit is None else ("--memory-limit", limit)), *more]
     environment = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     if cap is not None:
         done = subprocess.run(
@@ -75,6 +77,27 @@ def test_the_peak_stays_below_the_limit_that_the_error_names(tmp_path: Path) -> 
     assert record["count"] > ROWS / 2
     assert record["run"]["peak_memory"] <= parse_size(limit)
     assert (tmp_path / "memory.fgs").read_bytes() == (tmp_path / "free.fgs").read_bytes()
+
+
+def test_distilling_is_refused_or_stays_below_its_limit(tmp_path: Path) -> None:
+    """It keeps all in memory: no scratch files."""
+    write_ply(tmp_path / "point_cloud.ply", random_scene(ROWS, 8, 3, size=-4.0))
+    write_cameras(tmp_path / "cameras.json")
+    more = ("--distil", "12")
+    assert compress(tmp_path, "free", None, more=more).returncode == 0
+    limit, said = "185MiB", ""
+    for _ in range(4):  # each stage names what it lacks
+        done = compress(tmp_path, "yes", limit, more=more)
+        if done.returncode == 0:
+            break
+        named = re.search(r"use --memory-limit (\d+MiB) or more", done.stderr)
+        assert done.returncode == 5 and named, done.stderr
+        limit, said = named.group(1), said + done.stderr
+    assert done.returncode == 0 and "distilling" in said, said + done.stderr
+    record = json.loads((tmp_path / "yes.json").read_text())
+    assert record["count"] > ROWS / 2 and record["run"]["scratch"] is None
+    assert 0 < record["run"]["peak_memory"] <= parse_size(limit)
+    assert (tmp_path / "yes.fgs").read_bytes() == (tmp_path / "free.fgs").read_bytes()
 
 
 def test_more_snapshots_take_more() -> None:

@@ -65,7 +65,13 @@ def study(project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Rate
         patch.setattr("flexgs_edge.study.points.FORMATS", {".spz": FORMATS[".spz"]})
         patch.setattr("flexgs_edge.study.rate.parts_of", lambda *words: ablations.parts_of(*words)[::2])
         found = study_rate(
-            project / "point_cloud.ply", out, OPTIONS, ratios=[RATIO], ablations=[RATIO], ablation_effort="fast"
+            project / "point_cloud.ply",
+            out,
+            OPTIONS,
+            ratios=[RATIO],
+            ablations=[RATIO],
+            ablation_effort="fast",
+            distilled=[RATIO],
         )
     return found, out
 
@@ -80,7 +86,7 @@ def test_points_are_those_of_compress(study: tuple[RateStudy, Path], project: Pa
     for method, variant in (("best", "whole"), ("paper", "nothing pruned")):
         words = {"min_ratio": RATIO} if method == "best" else {"prune_rate": 0.0, "sh_rate": 0.0}
         made = compress(project / "point_cloud.ply", None, replace(OPTIONS, method=method, **words), dry_run=True)
-        (row,) = (r for r in rows if (r["method"], r["variant"]) == (method, variant))
+        (row,) = (r for r in rows if (r["method"], r["variant"]) == (method, variant) and r["effort"] != "max")
         assert (row["size"], row["kept"]) == (made.size, made.count)
         assert made.quality is not None
         assert row["drop"] == pytest.approx(made.quality.drop, abs=1e-4)
@@ -99,7 +105,8 @@ def test_paper_searches_every_ratio_that_its_bits_alone_miss(bench: Bench) -> No
 
 def test_every_variant_is_there_and_keeps_to_the_ratio(study: tuple[RateStudy, Path], bench: Bench) -> None:
     rows = [row for row in rows_of(study, "rate") if row["method"] == "best"]
-    assert [row["variant"] for row in rows] == ["whole", *CODERS, "gs ranks", "no refit", "full SH"]
+    assert [row["variant"] for row in rows] == ["whole", *CODERS, "whole", "gs ranks", "no refit", "full SH"]
+    assert [row["effort"] for row in rows if row["variant"] == "whole"] == ["fast", "max"]
     for row in rows:
         if row["variant"] not in CODERS:
             assert float(str(row["ratio"])) >= RATIO
@@ -111,7 +118,7 @@ def test_every_variant_is_there_and_keeps_to_the_ratio(study: tuple[RateStudy, P
 
 def test_a_coder_changes_the_size_alone(study: tuple[RateStudy, Path]) -> None:
     rows = rows_of(study, "rate")
-    (whole,) = (row for row in rows if row["variant"] == "whole" and row["method"] == "best")
+    whole, _ = (row for row in rows if row["variant"] == "whole" and row["method"] == "best")
     recoded = [row for row in rows if row["variant"] in CODERS]
     assert {row["wanted_ratio"] for row in recoded} == {RATIO}
     same = ("kept", "psnr", "ssim", "drop", "fidelity")
@@ -155,7 +162,9 @@ def test_csv_page_and_charts_hold_the_same(study: tuple[RateStudy, Path]) -> Non
     drawn = {series.label: [round(1e6 * x) for x in series.x] for series in chart.series}
     rows = rows_of(study, "rate")
     # Only what is whole is drawn: points without a part have a chart of their own.
-    assert drawn["best"] == [row["size"] for row in rows if row["method"] == "best" and row["variant"] == "whole"]
+    assert drawn["best"] + drawn["best, distilled"] == [
+        row["size"] for row in rows if row["method"] == "best" and row["variant"] == "whole"
+    ]
     assert drawn["paper"] == [row["size"] for row in rows if row["method"] == "paper"]
     assert "Left out or not reached" not in result.to_text()
 
@@ -165,7 +174,12 @@ def test_without_photos_and_without_the_converter(
 ) -> None:
     monkeypatch.setattr("flexgs_edge.formats.CONVERTER", "a_package_that_is_not_there")
     found = study_rate(
-        project / "point_cloud.ply", tmp_path / "out", replace(OPTIONS, images="none"), ratios=[RATIO], ablations=[]
+        project / "point_cloud.ply",
+        tmp_path / "out",
+        replace(OPTIONS, images="none"),
+        ratios=[RATIO],
+        ablations=[],
+        distilled=[],
     )
     (experiment,) = found.scene.experiments
     assert isinstance(experiment.chart, LineChart) and "fidelity" in experiment.chart.y_label
@@ -286,6 +300,7 @@ def test_a_chart_over_megabytes_has_a_log_axis_and_need_not_start_at_zero() -> N
         ({"ratios": [0.5]}, "--ratios 0.5: expected ratios of 1 or more"),
         ({"ratios": []}, "--ratios: expected one ratio or more"),
         ({"ablations": [math.nan]}, "--ablations nan"),
+        ({"distilled": [0.1]}, "--distilled 0.1: expected ratios of 1 or more"),
         ({"ablation_effort": "lazy"}, "--ablation-effort 'lazy': expected one of fast"),
     ],
 )
@@ -311,6 +326,7 @@ def test_the_command_line_hands_on_what_it_is_told(
     assert left.value.code == 0
     assert told == {
         "ratios": (10.0, 20.0), "ablations": (), "ablation_effort": "fast", "effort": "balanced", "scene": "a.ply",
+        "distilled": (32.0, 64.0, 128.0),
     }  # fmt: skip
     out = capsys.readouterr()
     assert json.loads(out.out)["command"] == "study rate" and "Each part earns its place" in out.err
@@ -330,4 +346,5 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
     defaults = {option.name: option.default for option in options}
     assert RATIOS.convert(defaults["ratios"], None, None) == rate.RATIOS
     assert RATIOS.convert(defaults["ablations"], None, None) == rate.ABLATED
+    assert RATIOS.convert(defaults["distilled"], None, None) == rate.DISTILLED
     assert defaults["ablation_effort"] == rate.ABLATION_EFFORT

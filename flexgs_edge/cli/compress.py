@@ -85,8 +85,8 @@ from flexgs_edge.cli import words
     "Views",
     "--views-margin",
     is_flag=True,
-    help="Score as many poses again, made (best only): nearer to what is seen, farther from it and in between, so that what "
-    "only such views show stays.",
+    help="Make three poses of every two given ones and score them too (best only): nearer to what is seen, farther from it and "
+    "in between, so that what only such views show stays.",
 )
 @words.option(
     "Method", "--refit/--no-refit", default=True, help="Refit colours to what was pruned and quantized (best only)."

@@ -153,7 +153,8 @@ class CompressOptions(ViewOptions):
     unseen : str
         What becomes of Gaussians that no training pose sees (`best`): `keep`, `drop`, or the share that stays, such as `20%`.
     views_margin : bool
-        Score as many poses again, made nearer to what is seen, farther from it and in between (`best`).
+        Make three poses of every two given ones, nearer to what is seen, farther from it and in between, and score them too
+        (`best`).
     refit : bool
         Refit colours after pruning and quantizing (`best`).
     distil : int, optional

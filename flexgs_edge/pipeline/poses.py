@@ -19,7 +19,7 @@ from flexgs_edge.scene.source import SceneSource
 FINE_DROP, FINE_FIDELITY, FINE_RATIO = 0.3, 42.0, 30.0
 """Targets beyond these (dB, dB, times) keep most SH of most Gaussians: as many values as a part of the pixels has, and colours
 refitted to these fit nothing else. They get all pixels of as many poses as the effort takes. fox at 0.1 dB takes 1.93 MB from
-every second pixel, 1.72 MB from all; at 0.5 dB 0.85 MB from either, and between them 32x loses 0.28 dB at a fidelity of 42.3 dB."""
+every second pixel, 1.72 MB from all; at 0.5 dB 0.85 MB from either, and there 32x loses 0.28 dB at a fidelity of 42.3 dB."""
 SAMPLE_ROWS = 4096
 """Gaussians whose positions tell which poses see what."""
 
@@ -45,7 +45,7 @@ def scored_poses(
 ) -> ScoredPoses:
     """As many poses as the effort scores, each next one with the most to add to what those before it see.
 
-    With `views_margin` there are as many made ones beside them (see `with_margin`). Costs measured from 16 such poses are worth
+    With `views_margin` made ones come on top (see `with_margin`). Costs measured from 16 such poses are worth
     as much as those from all 43 of fox or all 70 of the sample (docs/performance.md).
     """
     plan = EFFORTS[options.effort]

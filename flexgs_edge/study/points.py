@@ -31,6 +31,9 @@ from flexgs_edge.study.tables import Cell, Column, columns
 
 LOG = logging.getLogger("flexgs_edge")
 
+MAX = "max"
+"""The effort that distils: a curve of its own."""
+
 
 @dataclass(frozen=True)
 class RatePoint:

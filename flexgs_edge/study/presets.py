@@ -17,7 +17,7 @@ from flexgs_edge.study.tables import Cell, Table, columns
 
 LOG = logging.getLogger("flexgs_edge")
 
-PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"), ("best", "thorough"))
+PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"), ("best", "thorough"), ("best", "max"))
 """Method and effort."""
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flexgs_edge.best.effort import EFFORTS
-from flexgs_edge.errors import InputError
+from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.study import trade
@@ -22,7 +22,7 @@ from flexgs_edge.study.charts import require_matplotlib
 from flexgs_edge.study.experiment import Experiment
 from flexgs_edge.study.folder import atomic_folder, check_folder
 from flexgs_edge.study.page import study_page
-from flexgs_edge.study.points import best_points, paper_points, peer_points
+from flexgs_edge.study.points import MAX, Found, best_points, paper_points, peer_points
 from flexgs_edge.study.results import SceneStudy, WrittenStudy, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
@@ -30,6 +30,8 @@ LOG = logging.getLogger("flexgs_edge")
 RATIOS = (8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 ABLATED = (16.0, 64.0)
 ABLATION_EFFORT = "fast"
+DISTILLED = (32.0, 64.0, 128.0)
+"""Below 30x every pixel is looked at, and each point takes twice as long."""
 
 
 class RateStudy(WrittenStudy):
@@ -46,6 +48,7 @@ def study_rate(
     ratios: Sequence[float] = RATIOS,
     ablations: Sequence[float] = ABLATED,
     ablation_effort: str = ABLATION_EFFORT,
+    distilled: Sequence[float] = DISTILLED,
     **words: Any,
 ) -> RateStudy:
     """Measure bytes and quality of every method on a scene and write them to a folder.
@@ -67,6 +70,8 @@ def study_rate(
         The same for the points without a part; none leaves them out.
     ablation_effort : str
         Of these points, and of the curve that they are held against.
+    distilled : sequence of float
+        PLY bytes to file bytes of the points at the effort `max`; none leaves them out.
     **words
         Single options by the names of `CompressOptions`.
 
@@ -76,14 +81,15 @@ def study_rate(
         `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "best"})
-    _check(ratios, ablations, ablation_effort)
+    _check(ratios, ablations, ablation_effort, distilled)
     # Loaded before the memory is planned, so that its bytes count as taken.
     require_matplotlib()
     check_folder(output, options.force)
     with atomic_folder(output, options.force) as folder:
         (name,) = scene_names([scene])
         with open_bench(scene, name, options, progress) as bench:
-            made = _experiments(bench, folder, sorted({*ratios, *ablations}), sorted(set(ablations)), ablation_effort)
+            every, without = sorted({*ratios, *ablations}), sorted(set(ablations))
+            made = _experiments(bench, folder, every, without, ablation_effort, sorted(set(distilled)))
             found = SceneStudy.of(bench, made)
         page = study_page("Bytes and quality", _INTRO, [write_scene(folder, found)])
         (folder / "index.html").write_text(page, encoding="utf-8")
@@ -98,8 +104,8 @@ _INTRO = (
 )
 
 
-def _check(ratios: Sequence[float], ablations: Sequence[float], effort: str) -> None:
-    for word, values in (("--ratios", ratios), ("--ablations", ablations)):
+def _check(ratios: Sequence[float], ablations: Sequence[float], effort: str, distilled: Sequence[float]) -> None:
+    for word, values in (("--ratios", ratios), ("--ablations", ablations), ("--distilled", distilled)):
         bad = [value for value in values if not (math.isfinite(value) and value >= 1.0)]
         if bad:
             raise InputError(f"{word} {bad[0]:g}: expected ratios of 1 or more, such as 8,16,32")
@@ -110,11 +116,21 @@ def _check(ratios: Sequence[float], ablations: Sequence[float], effort: str) -> 
 
 
 def _experiments(
-    bench: Bench, folder: Path, ratios: Sequence[float], ablations: Sequence[float], ablation_effort: str
+    bench: Bench,
+    folder: Path,
+    ratios: Sequence[float],
+    ablations: Sequence[float],
+    ablation_effort: str,
+    distilled: Sequence[float],
 ) -> list[Experiment]:
     effort = bench.options.effort
     recode = ablations if ablation_effort == effort else ()
     found = best_points(bench, WHOLE, effort, ratios, recode) + paper_points(bench, ratios)
+    if distilled:
+        try:
+            found += best_points(bench, WHOLE, MAX, distilled)
+        except BudgetError as error:  # a descent stays in memory as a whole
+            found += Found((), (f"best ({MAX}: {error})",))
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder) as place:
         found += peer_points(bench, Path(place))
     variants = parts_of(bench.orders["gs"], bench.scene.source.sh_degree) if ablations else ()

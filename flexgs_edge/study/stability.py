@@ -23,7 +23,7 @@ from flexgs_edge.study.cliffs.contenders import Contenders
 from flexgs_edge.study.cliffs.generations import generations
 from flexgs_edge.study.cliffs.heldout import held_out
 from flexgs_edge.study.cliffs.moves import moves
-from flexgs_edge.study.cliffs.ours import search, walked
+from flexgs_edge.study.cliffs.ours import Whole, search, walked
 from flexgs_edge.study.cliffs.poses import poses
 from flexgs_edge.study.cliffs.searches import searches
 from flexgs_edge.study.cliffs.strays import strays
@@ -117,11 +117,15 @@ def _experiments(bench: Bench, amounts: Amounts, folder: Path) -> list[Experimen
         "copies of the scene", COPIES * source.count * sum(4 * source.width(name) for name in FIELD)
     )
     temporary = tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder)
-    with temporary as place, walked(bench, source, train) as path:
-        return _along_the_path(bench, path, amounts, Path(place))
+    with temporary as place:
+        # First: two paths at once would take twice the memory.
+        with walked(bench, source, train, margin=True) as path:
+            guarded = search(bench, path, bench.target)
+        with walked(bench, source, train) as path:
+            return _along_the_path(bench, path, guarded, amounts, Path(place))
 
 
-def _along_the_path(bench: Bench, path: PrunePath, amounts: Amounts, place: Path) -> list[Experiment]:
+def _along_the_path(bench: Bench, path: PrunePath, guarded: Whole, amounts: Amounts, place: Path) -> list[Experiment]:
     made: list[Experiment] = []
 
     @contextmanager
@@ -132,7 +136,7 @@ def _along_the_path(bench: Bench, path: PrunePath, amounts: Amounts, place: Path
 
     with part("results at the target"):
         ours = search(bench, path, bench.target)
-        contenders = Contenders(bench, ours)
+        contenders = Contenders(bench, ours, guarded)
     with part("bits"):
         made += [bits.rounding(bench, ours, amounts), bits.groups(bench, ours, amounts), strays(bench, ours, amounts)]
     with part("views"):

@@ -9,7 +9,7 @@ from flexgs_edge.study.bench import FIGURES, Bench
 from flexgs_edge.study.charts import BarChart, LineChart, Series
 from flexgs_edge.study.curves import Curve
 from flexgs_edge.study.experiment import Experiment
-from flexgs_edge.study.points import RatePoint, loss_of, point_columns, point_row
+from flexgs_edge.study.points import MAX, RatePoint, loss_of, point_columns, point_row
 from flexgs_edge.study.tables import Cell, Table, columns, mean
 
 CODERS = {
@@ -32,8 +32,8 @@ def rate(bench: Bench, points: Sequence[RatePoint], missing: Sequence[str], effo
     return Experiment(
         "rate",
         "Bytes and quality",
-        f"Every method at the sizes asked for: best at the effort {effort}, paper likewise with its rates to choose, and the "
-        "whole scene in the formats of other programs as this one writes them. "
+        f"Every method at the sizes asked for: best at the effort {effort} and distilled (the effort {MAX}), paper with "
+        "its rates to choose, and the whole scene in the formats of other programs as this one writes them. "
         f"{'PSNR and SSIM are against the photos' if with_photos else 'SSIM is against the original: there are no photos'}; "
         f"{FIDELITY_WORDS}. The rows hold all points of this study, those without a part of the method among them. The first "
         "seconds of a curve include most of the path of prune and rescore, which its other points go on from.",
@@ -58,14 +58,18 @@ def fidelity(bench: Bench, points: Sequence[RatePoint], effort: str) -> Experime
         _chart(table, "Bytes and fidelity", "fidelity", effort),
         (
             "Fidelity of best: "
-            + ", ".join(f"{row['fidelity']:.1f} dB at {row['ratio']:.0f}x" for row in rows if row["method"] == "best")
+            + ", ".join(
+                f"{row['fidelity']:.1f} dB at {row['ratio']:.0f}x{' distilled' if row['effort'] == MAX else ''}"
+                for row in rows
+                if row["method"] == "best"
+            )
             + ".",
         ),
     )
 
 
 def _on_curve(method: str, variant: str, effort: str | None, wanted: str) -> bool:
-    return method != "best" or (variant, effort) == (WHOLE.name, wanted)
+    return method != "best" or (variant == WHOLE.name and effort in (wanted, MAX))
 
 
 def _chart(table: Table, title: str, figure: str, effort: str) -> LineChart:
@@ -73,7 +77,7 @@ def _chart(table: Table, title: str, figure: str, effort: str) -> LineChart:
     for row in table.rows:
         method = str(row["method"])
         if _on_curve(method, str(row["variant"]), None if row["effort"] is None else str(row["effort"]), effort):
-            series.setdefault(method, []).append(dict(row))
+            series.setdefault(f"{method}, distilled" if row["effort"] == MAX else method, []).append(dict(row))
     floating = figure == "fidelity"
     return LineChart(
         title,
@@ -84,7 +88,7 @@ def _chart(table: Table, title: str, figure: str, effort: str) -> LineChart:
                 name,
                 [float(row["size"] or 0) / 1e6 for row in rows],
                 [None if row[figure] is None else float(row[figure] or 0.0) for row in rows],
-                notes=[_note(row) for row in rows] if name in ("best", "paper") else [name] * len(rows),
+                notes=[_note(row) for row in rows] if rows[0]["wanted_ratio"] is not None else [name] * len(rows),
             )
             for name, rows in series.items()
         ),

@@ -14,9 +14,11 @@ from flexgs_edge.study.cliffs.ours import Whole
 from flexgs_edge.study.pruning import nearest
 
 BEST, PAPER, RTN, ROWS, SH = "best", "paper", "RTN, 8 bits", "rows only", "SH only"
+MARGIN = "best, --views-margin"
 WORDS = (
-    f"best and paper: the results at the study's target. {RTN}: one range a channel, nothing removed. {ROWS}, {SH}: "
-    "the paper's bits, and Gaussians or SH alone removed by gs, to paper's bytes or as near as they come."
+    f"best and paper: the results at the study's target; {MARGIN}: with poses that nobody took among those scored. {RTN}: one "
+    f"range a channel, nothing removed. {ROWS}, {SH}: the paper's bits, and Gaussians or SH alone removed by gs, to "
+    "paper's bytes or as near as they come."
 )
 
 
@@ -26,12 +28,12 @@ class Contenders:
     Parameters
     ----------
     bench : Bench
-    ours : Whole
-        The result of best.
+    ours, guarded : Whole
+        The results of best, of given poses and of made ones as well.
     """
 
-    def __init__(self, bench: Bench, ours: Whole) -> None:
-        self.bench, self.ours = bench, ours
+    def __init__(self, bench: Bench, ours: Whole, guarded: Whole) -> None:
+        self.bench, self.wholes = bench, {BEST: ours, MARGIN: guarded}
         paper = Setting(bench.search.chosen.choice)
         size = bench.size(paper)
         self.settings = {
@@ -40,17 +42,17 @@ class Contenders:
             ROWS: Setting(_of_size(bench, size, lambda rate: Choice(min(rate, 980), 0))),
             SH: Setting(_of_size(bench, size, lambda rate: Choice(0, rate))),
         }
-        self.names = (BEST, *self.settings)
+        self.names = (*self.wholes, *self.settings)
 
     def size(self, name: str) -> int:
         """Bytes of the file."""
-        return self.ours.size if name == BEST else self.bench.size(self.settings[name])
+        return self.wholes[name].size if name in self.wholes else self.bench.size(self.settings[name])
 
     @contextmanager
     def loaded(self, name: str) -> Iterator[DeviceScene]:
         """What its file decodes to, to draw."""
-        if name == BEST:
-            with self.bench.workspace.renderer.load(self.ours.source) as scene:
+        if name in self.wholes:
+            with self.bench.workspace.renderer.load(self.wholes[name].source) as scene:
                 yield scene
         else:
             setting = self.settings[name]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flexgs_edge.adapt import MaxDrop, WorstToo
 from flexgs_edge.best.path import PrunePath
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.render.quality import Quality, ViewQuality, mean_psnr, mse, psnr
@@ -13,7 +14,7 @@ from flexgs_edge.study.bench import Bench
 from flexgs_edge.study.charts import BarChart
 from flexgs_edge.study.cliffs.amounts import Amounts
 from flexgs_edge.study.cliffs.breaks import BREAK, LOST, mean_loss, number, view_loss
-from flexgs_edge.study.cliffs.contenders import BEST, WORDS, Contenders
+from flexgs_edge.study.cliffs.contenders import BEST, MARGIN, WORDS, Contenders
 from flexgs_edge.study.cliffs.ours import Whole, search
 from flexgs_edge.study.cliffs.poses import TILE_SIDE, evenly, worst_tile
 from flexgs_edge.study.experiment import Experiment
@@ -21,7 +22,7 @@ from flexgs_edge.study.tables import Cell, Row, Table, columns
 
 WORST_TIMES, WORST_MORE = 1.5, 0.2
 """The worst view may lose this many times the mean, and so many dB more."""
-EVEN = "best, decided on even views"
+EVEN, HELD = "best, decided on even views", "best, --max-worst-drop"
 HEADS = {
     "method": "method",
     "size": "bytes",
@@ -41,11 +42,14 @@ HEADS = {
 
 
 def held_out(bench: Bench, path: PrunePath, contenders: Contenders, amounts: Amounts) -> Experiment:
-    """Every contender, and best when only the even held-out views decide, view by view."""
+    """Every contender, best when only the even held-out views decide, and with its worst view held, view by view."""
     cameras = bench.judge.cameras
     whole: dict[str, Whole] = {}
     if amounts.even and len(cameras) > 1:
         whole[EVEN] = _decided_on_even(bench, path)
+        if isinstance(bench.target, MaxDrop):
+            limit = WORST_TIMES * bench.target.limit
+            whole[HELD] = search(bench, path, WorstToo(bench.target, limit, bench.target.judge))
     rows = []
     train = evenly(bench.views.of(bench.views.train), len(cameras))
     renderer = bench.workspace.renderer
@@ -68,7 +72,7 @@ def held_out(bench: Bench, path: PrunePath, contenders: Contenders, amounts: Amo
         f"The {len(cameras)} held-out views one by one, against {views}. A worst view within {WORST_TIMES:g} times "
         f"the mean and {WORST_MORE:g} dB more counts as within. {EVEN}: the search stops by the first, third, ... of "
         "them; the "
-        f"others decided nothing. " + WORDS,
+        f"others decided nothing. {HELD}: no view loses more than {WORST_TIMES:g} times the target. " + WORDS,
         table,
         BarChart(
             "Mean and worst held-out view",
@@ -83,8 +87,8 @@ def held_out(bench: Bench, path: PrunePath, contenders: Contenders, amounts: Amo
             limit=BREAK,
         ),
         (
-            *(_words(row) for row in rows if row["method"] in (BEST, EVEN)),
-            *(_baseline(row) for row in rows[1 : len(contenders.names)]),
+            *(_words(row) for row in rows if row["method"] in (BEST, MARGIN, EVEN, HELD)),
+            *(_baseline(row) for row in rows if row["method"] in contenders.settings),
         ),
     )
 

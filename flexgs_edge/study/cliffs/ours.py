@@ -66,16 +66,20 @@ class FixedSearch(RateSearch):
 
 @contextmanager
 def walked(
-    bench: Bench, source: SceneSource, cameras: Sequence[Camera], renderer: Renderer | None = None
+    bench: Bench,
+    source: SceneSource,
+    cameras: Sequence[Camera],
+    renderer: Renderer | None = None,
+    margin: bool = False,
 ) -> Iterator[PrunePath]:
-    """The path of prune and rescore over some poses, for as many searches as wanted."""
-    workspace = bench.workspace
+    """The path of prune and rescore over some poses (`margin`: and made ones), for as many searches as wanted."""
+    workspace, options = bench.workspace, replace(bench.options, views_margin=margin)
     renderer = renderer or workspace.renderer
     with open_path(
         renderer,
         source,
-        scored_poses(cameras, bench.options, renderer, source).cameras,
-        bench.options,
+        scored_poses(cameras, options, renderer, source).cameras,
+        options,
         workspace.budget,
         workspace.clock,
         bench.progress,
