@@ -321,9 +321,10 @@ class Renderer:
 
         When a view shows more than there is room for, the buffers are made anew for what its first part lets expect.
         """
+        record = camera_record(camera, scene.origin, self.near)
         while True:
-            self.backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
-            rows, seen = self._fill_compact(scene, buffers)
+            self.backend.write(buffers.camera, record)
+            rows, seen = self._fill_compact(scene, record, buffers)
             assert buffers.rows is not None
             if len(rows) <= buffers.rows:
                 return buffers, rows
@@ -333,13 +334,13 @@ class Renderer:
             self.release()
             self._buffers = buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
 
-    def _fill_compact(self, scene: DeviceScene, buffers: ViewBuffers) -> tuple[np.ndarray, int]:
+    def _fill_compact(self, scene: DeviceScene, record: np.ndarray, buffers: ViewBuffers) -> tuple[np.ndarray, int]:
         """[m] u32, rows shown, and up to which row of the scene: where they are more than there is room for, it stops."""
         backend, (records, keys, bounds) = self.backend, buffers.chunk
         assert buffers.rows is not None
         found: list[np.ndarray] = []
         at = 0
-        for chunk in scene.chunks():
+        for chunk in scene.chunks(lambda bounds: bounds.seen(record, bool(self.inria_extent))):
             self._project_chunk(scene, chunk, 0, buffers, buffers.chunk)
             depth = backend.read(keys, np.empty(chunk.count, np.uint32))
             shown = np.flatnonzero(depth != CULLED)
