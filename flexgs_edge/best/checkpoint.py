@@ -71,7 +71,7 @@ class Checkpoint:
                         file, {"descr": values.dtype.str, "fortran_order": False, "shape": values.shape}
                     )
                     for plane in values.reshape(-1, values.shape[-1]) if values.size else ():
-                        for rows in blocks(values.shape[-1], 1 << 20):
+                        for rows in blocks(values.shape[-1], 1 << 20, plane):
                             file.write(np.ascontiguousarray(plane[rows]).data)
                     file.flush()
                     os.fsync(file.fileno())

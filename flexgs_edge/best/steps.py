@@ -20,7 +20,7 @@ from flexgs_edge.render import Renderer
 from flexgs_edge.render.targets import to_half
 from flexgs_edge.rotations import tilted, turned
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.scratch import blocks
+from flexgs_edge.scratch import BLOCK_ROWS, blocks
 
 GEOMETRY = ("position", "scale", "rotation", "opacity")
 VALUES = {"position": 3, "scale": 3, "rotation": 3, "opacity": 1}
@@ -58,7 +58,9 @@ def probe_slopes(
     views = [cameras[i * len(cameras) // min(PROBE_VIEWS, len(cameras))] for i in range(min(PROBE_VIEWS, len(cameras)))]
     with renderer.load(MemorySource(planes, origin=origin)) as scene:
         reference = [to_half(renderer.render(scene, camera)) for camera in views]
-    smallest = np.concatenate([planes["log_scales"][:, rows].min(axis=0) for rows in blocks(count)])
+    smallest = np.concatenate(
+        [planes["log_scales"][:, rows].min(axis=0) for rows in blocks(count, BLOCK_ROWS, planes["log_scales"])]
+    )
     size = float(np.exp(np.median(smallest.astype(np.float64))))
     # Small enough that squared errors grow with squared steps, large enough to stand clear of half precision references.
     trial = {"position": size / 4, "scale": 0.1, "rotation": 0.03, "opacity": 0.2}
@@ -66,7 +68,7 @@ def probe_slopes(
     for kind in GEOMETRY:
         field = CHANGES[kind]
         moved = {**planes, field: renderer.room.empty(planes[field].shape, np.float32)}
-        for rows in blocks(count):
+        for rows in blocks(count, BLOCK_ROWS, *(planes[name] for name in set(CHANGES.values()))):
             some = {name: values[:, rows] for name, values in planes.items()}
             moved[field][:, rows] = _on_trial_grid(some, kind, np.float32(trial[kind]))
         with renderer.load(MemorySource(moved, origin=origin)) as scene:
