@@ -63,7 +63,7 @@ def test_what_is_fetched_is_what_is_read(tmp_path: Path, monkeypatch: pytest.Mon
     scratch.fetch(np.zeros((3, 4)), slice(0, 4))
     scratch.fetch(values[:, :0], slice(0, 4))
     assert not asked
-    assert [part for part in scratch.blocks(9_000, 4_000, values)][-1] == slice(8_000, 9_000) and len(asked) == 36
+    assert list(scratch.blocks(9_000, 4_000, values))[-1] == slice(8_000, 9_000) and len(asked) == 36
 
 
 def test_files_are_gone_with_their_arrays(tmp_path: Path) -> None:

@@ -102,7 +102,7 @@ def compress(
         if reporter is not None and views is not None:
             reporter.see_cameras(views, scene)
     with ExitStack() as stack:
-        workspace = stack.enter_context(Workspace(options, budget, clock)) if views is not None else None
+        workspace = None if views is None else stack.enter_context(Workspace(options, budget, clock, options.cluster))
         if reporter is not None and views is not None:
             reporter.reserve(budget, views, plan.report)
         job = _Job(options, scene, views, plan, budget, clock, workspace, progress, reporter, format)

@@ -218,6 +218,11 @@ class DeviceScene:
         self._least_rows = min(MIN_CHUNK_ROWS, max(self.count, 1))
 
     @property
+    def source(self) -> SceneSource | None:
+        """Where its values come from; None where that is codes on the backend."""
+        return self._planes.source if isinstance(self._planes, SourcePlanes) else None
+
+    @property
     def least_bytes(self) -> int:
         """Bytes that drawing must leave to the scene: none once it is loaded, else its smallest chunk."""
         return 0 if self._resident else self.least_chunk_bytes
@@ -297,6 +302,8 @@ class DeviceScene:
     @property
     def starts(self) -> np.ndarray:
         """[chunks + 1] i64: first row of every chunk, and the number of rows."""
+        if not self._rows:
+            self._decide()
         return np.array([*(start for start, _, _ in self._spans()), self.count], np.int64)
 
     def _load(self, start: int, stop: int, degree: int) -> Chunk:
