@@ -38,6 +38,11 @@ class Checkpoint:
         return (self._place(number) / DONE).is_file()
 
     @property
+    def key(self) -> str:
+        """What the folder's name says of the path."""
+        return self.folder.name.rpartition("-")[2]
+
+    @property
     def rounds(self) -> int:
         """Finished rounds."""
         number = 0

@@ -85,9 +85,12 @@ class Kept:
     degrees: np.ndarray
     weight2: np.ndarray
 
-    def take(self, keep: np.ndarray) -> Kept:
+    def take(self, keep: np.ndarray, room: Room = MEMORY) -> Kept:
         """Some of the rows: [n] bool."""
         if keep.all():
             return self
-        planes = {name: np.ascontiguousarray(values[:, keep]) for name, values in self.planes.items()}
-        return Kept(self.snapshot, self.rows[keep], planes, self.degrees[keep], self.weight2[keep])
+        rows = np.flatnonzero(keep)
+        planes = {name: room.take(values, rows) for name, values in self.planes.items()}
+        return Kept(
+            self.snapshot, room.take(self.rows, rows), planes, self.degrees[rows], room.take(self.weight2, rows)
+        )

@@ -247,7 +247,7 @@ class _Job:
                 self._measure_source(MemorySource(values_of(grid, room), origin=grid.origin), report),
             )
         else:
-            with temporary_name(output, options.force) as place:
+            with temporary_name(output, options.force, None if kept is None else kept.key) as place:
                 with self.clock.stage("write"):
                     size = coder.write(place, grid, settings)
                 if search.reached and plan.target.limit_bytes is not None and size > plan.target.limit_bytes:
