@@ -309,7 +309,7 @@ class RateSearch(MultiplierSearch[GridScene]):
             # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
             self._slopes = probe_slopes(self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras)
         steps = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
-        kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0))
+        kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0), self.path.room)
         return kept, holdable(steps, kept.planes)
 
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:

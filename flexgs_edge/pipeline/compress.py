@@ -102,7 +102,7 @@ def compress(
         if reporter is not None and views is not None:
             reporter.see_cameras(views, scene)
     with ExitStack() as stack:
-        workspace = stack.enter_context(Workspace(options, budget, clock)) if views is not None else None
+        workspace = None if views is None else stack.enter_context(Workspace(options, budget, clock, options.cluster))
         if reporter is not None and views is not None:
             reporter.reserve(budget, views, plan.report)
         job = _Job(options, scene, views, plan, budget, clock, workspace, progress, reporter, format)
@@ -247,7 +247,7 @@ class _Job:
                 self._measure_source(MemorySource(values_of(grid, room), origin=grid.origin), report),
             )
         else:
-            with temporary_name(output, options.force) as place:
+            with temporary_name(output, options.force, None if kept is None else kept.key) as place:
                 with self.clock.stage("write"):
                     size = coder.write(place, grid, settings)
                 if search.reached and plan.target.limit_bytes is not None and size > plan.target.limit_bytes:

@@ -82,9 +82,10 @@ class Judge:
     def prepare(self, scene: DeviceScene, progress: Progress = SILENT) -> None:
         """Draw the references from `scene` (the original, loaded), and measure them against the photos."""
         self._original_error, self._coarse_error = [], {}
-        for i, camera in enumerate(progress.track(self.cameras, "drawing the original", len(self.cameras))):
+        images = self.renderer.images(scene, self.cameras)
+        for i, drawn in enumerate(progress.track(images, "drawing the original", len(self.cameras))):
             # Clamped once, and contiguous by channel as renders are: comparing is then four times as fast.
-            image = _planes(self.renderer.render(scene, camera))
+            image = _planes(drawn)
             self._keep(("original", i), image)
             if self.photos is not None:
                 photo = _planes(self.photos.load(self.indices[i]))
@@ -122,12 +123,12 @@ class Judge:
     ) -> Quality:
         """Quality of `scene` over the views (LPIPS takes about 3 s a megapixel and pair)."""
         found: list[ViewQuality] = []
-        for i, camera in enumerate(progress.track(self.cameras, "comparing views", len(self.cameras))):
-            image = self.renderer.render(scene, camera)
+        images = self.renderer.images(scene, self.cameras)
+        for i, image in enumerate(progress.track(images, "comparing views", len(self.cameras))):
             error = self._original_error[i] if self.photos is not None else None
             references = self.original(i), self._photo(i)
             ssims = self._ssims if with_ssim else None
-            found.append(compare_view(camera.name, image, *references, error, ssims, lpips))
+            found.append(compare_view(self.cameras[i].name, image, *references, error, ssims, lpips))
         return Quality(tuple(found), self.base_psnr)
 
     def estimate(self, scene: DeviceScene) -> Quality:
