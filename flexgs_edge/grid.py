@@ -18,7 +18,7 @@ from flexgs_edge.curve import morton
 from flexgs_edge.errors import InputError
 from flexgs_edge.rotations import canonical_axes
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
-from flexgs_edge.scratch import MEMORY, Room, blocks, stable_order
+from flexgs_edge.scratch import BLOCK_ROWS, MEMORY, Room, blocks, fetch, fetched, stable_order
 
 POSITION_BITS = 21
 """Cells along an axis of a scene as a power of two: three of them fill a 63-bit curve index."""
@@ -248,7 +248,7 @@ def _along_curve(means: np.ndarray, step: float, layer: np.ndarray | None, room:
     count = means.shape[1]
     codes = room.empty((3, count), np.int32)
     low, high = np.full((3, 1), CODE_LIMIT), np.full((3, 1), -CODE_LIMIT)
-    for part in blocks(count):
+    for part in blocks(count, BLOCK_ROWS, means):
         codes[:, part] = some = _codes("means", means[:, part], step, np.arange(part.start, part.stop))
         low, high = (
             np.minimum(low, some.min(axis=1, keepdims=True)),
@@ -260,7 +260,7 @@ def _along_curve(means: np.ndarray, step: float, layer: np.ndarray | None, room:
             f"2^{POSITION_BITS}: take a larger step or remove far outliers"
         )
     keys = room.empty((count,), np.uint64)
-    for part in blocks(count):
+    for part in blocks(count, BLOCK_ROWS, codes):
         keys[part] = morton(codes[:, part] - low)
     layers = None if layer is None else _bytes("layer", layer, count, 255)
     order = stable_order(keys, room) if layers is None else np.lexsort((keys, layers)).astype(np.int64)
@@ -272,13 +272,14 @@ def values_of(grid: GridScene, room: Room = MEMORY) -> dict[str, np.ndarray]:
     planes = {name: room.empty((field.width(grid.sh_degree), grid.count), np.float32) for name, field in FIELD.items()}
     names = [name for name in FIELD if name != "sh_rest"]
     first = np.zeros(grid.sh_degree, np.int64)
-    for part in blocks(grid.count):
+    of_all = (grid.position, grid.scale, grid.rotation, grid.opacity, grid.dc)
+    for part in blocks(grid.count, BLOCK_ROWS, *of_all):
         for name, values in from_grid(grid, part, names).items():
             planes[name][:, part] = values
         # As `from_grid` finds them, but counted once.
         degrees = grid.sh_degrees[part]
         last = first + np.array([np.count_nonzero(degrees > level) for level in range(grid.sh_degree)], np.int64)
-        bands = [band[:, a:b] for band, a, b in zip(grid.sh, first.tolist(), last.tolist(), strict=True)]
+        bands = [fetched(band, slice(a, b)) for band, a, b in zip(grid.sh, first.tolist(), last.tolist(), strict=True)]
         planes["sh_rest"][:, part] = _spread_bands(grid, degrees, bands)
         first = last
     return planes
@@ -343,7 +344,7 @@ def _spread_bands(grid: GridScene, degrees: np.ndarray, bands: Sequence[np.ndarr
 def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray, room: Room = MEMORY) -> GridScene:
     """The same rows with other colours ([3, n] and [3 * K, n] f32, in the grid's row order) put on the same steps."""
     dc = room.empty((3, grid.count), np.int32)
-    for part in blocks(grid.count):
+    for part in blocks(grid.count, BLOCK_ROWS, sh_dc):
         rows = np.arange(part.start, part.stop)
         dc[:, part] = _colour_codes("sh_dc", sh_dc[:, None, part], grid.steps.colour(grid.steps.dc), rows)[:, 0]
     degrees = range(1, grid.sh_degree + 1)
@@ -400,13 +401,16 @@ class _Ordered:
     def of(self, field: str, rows: slice) -> np.ndarray:
         """[width, m] of some rows."""
         values = self._planes[field]
-        return values.reshape(-1, values.shape[-1])[:, rows if self._order is None else self._order[rows]]
+        values = values.reshape(-1, values.shape[-1])
+        return fetched(values, rows) if self._order is None else values[:, self._order[rows]]
 
     def band(self, degree: int, rows: np.ndarray) -> np.ndarray:
         """[3, 2l + 1, m] coefficients of one SH degree of some rows."""
         values = self._planes["sh_rest"]
         band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
         rgb = values.reshape(3, len(values) // 3, values.shape[1])[:, band]
+        if self._order is None and len(rows):
+            fetch(rgb, slice(int(rows[0]), int(rows[-1]) + 1))
         return rgb[:, :, rows if self._order is None else self._order[rows]]
 
 

@@ -15,7 +15,7 @@ from flexgs_edge.adapt import MaxDrop, Measurement, MinFidelity, Target
 from flexgs_edge.adapt.targets import MaxSize
 from flexgs_edge.best import search as search_module
 from flexgs_edge.best.choice import BitModel
-from flexgs_edge.best.effort import EFFORTS, LARGEST_STEP, PIXELS_A_ROW, Effort, sampled_poses
+from flexgs_edge.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses
 from flexgs_edge.best.kept import Mended
 from flexgs_edge.best.path import Snapshot, take_rows
 from flexgs_edge.best.search import DISTILLED, EXTRA_STEPS, RateResult, RateSearch, RateStep
@@ -29,7 +29,7 @@ from synthetic import make_camera, random_scene
 
 SLOPES = Slopes(dict.fromkeys(GEOMETRY, 100.0))
 UNIT = choose_steps(SLOPES, np.ones(1), np.zeros(1), 0, 1.0).opacity
-EFFORT = Effort(keep=0.8, refit_rounds=1, subsets=2, steps=4, close=0.03, views=8)
+EFFORT = Effort(keep=0.8, refit_rounds=1, subsets=2, steps=4, close=0.03, few=8, views=8, pixels=24)
 AT = 1e-4
 BYTES = 4000
 """The multiplier at which the worlds lose 1 dB, and the bytes that they take there (53 bits for each of 600 Gaussians)."""
@@ -332,13 +332,20 @@ def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> Non
 @pytest.mark.parametrize(("count", "step"), [(10, LARGEST_STEP), (100, 3), (240, 2), (260, 1), (10**6, 1)])
 def test_poses_have_no_more_pixels_than_the_rows_need(count: int, step: int) -> None:
     cameras = [make_camera(64, 48) for _ in range(8)]
-    sampled = sampled_poses(cameras, count)
+    sampled = sampled_poses(cameras, 24 * count)
     assert {camera.width for camera in sampled} == {-(-64 // step)} | ({64 // step} if 64 % step else set())
     if 1 < step < LARGEST_STEP:
         pixels = sum(camera.width * camera.height for camera in sampled)
-        assert pixels >= PIXELS_A_ROW * count
+        assert pixels >= 24 * count
     # Not the same lattice in every view.
     assert len({(camera.cx, camera.cy) for camera in sampled}) == min(step**2, 8)
+
+
+def test_large_scenes_are_scored_from_more_poses() -> None:
+    effort = replace(EFFORT, few=3, views=6, pixels=10)
+    pixels = [100] * 9
+    assert [effort.poses_of(pixels, count) for count in (1, 30, 31, 40, 41, 60, 1000)] == [3, 3, 4, 4, 5, 6, 6]
+    assert effort.poses_of(pixels[:2], 1) == effort.poses_of(pixels[:2], 1000) == 2
 
 
 def test_geometry_goes_on_whatever_the_degree() -> None:

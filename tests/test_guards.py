@@ -16,7 +16,7 @@ from flexgs_edge.cameras.made import at_distance, between
 from flexgs_edge.codec import open_fgs
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.pipeline.compress import compress
-from flexgs_edge.pipeline.doubts import FIT_GAP, FIT_STEP, FIT_VIEWS, NEEDED_VIEWS, doubts, training_fidelity
+from flexgs_edge.pipeline.doubts import FIT_GAP, FIT_STEP, FIT_VIEWS, NEEDED_VIEWS, TrainingPoses, doubts
 from flexgs_edge.pipeline.inputs import Views
 from flexgs_edge.pipeline.judge import measurement_of
 from flexgs_edge.pipeline.margin import FARTHER, NEARER, with_margin
@@ -274,7 +274,10 @@ def test_fidelity_on_training_poses(project: Path, plain: CompressResult) -> Non
     cameras = [c for i, c in enumerate(read_cameras(project.parent / "cameras.json")) if i % 4]
     assert len(cameras) <= FIT_VIEWS
     renderer = Renderer(open_form("w16"), large_budget())
-    found = training_fidelity(renderer, source, lambda: renderer.load(coded), cameras)
+    poses = TrainingPoses(renderer, source, cameras)
+    with renderer.load(coded) as scene:
+        found = poses.fidelity(scene)
+    poses.close()
     assert found == pytest.approx(plain.training_fidelity, abs=1e-6)
     exact = [
         psnr(

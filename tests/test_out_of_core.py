@@ -14,15 +14,20 @@ import numpy as np
 import pytest
 
 from flexgs_edge.cameras import Camera
+from flexgs_edge.constants import CULLED
+from flexgs_edge.curve import near_rows
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.pipeline import compress as compress_module
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.refit import refit_colours
 from flexgs_edge.render import Renderer, Statistics, device_scene
 from flexgs_edge.render import renderer as renderer_module
+from flexgs_edge.render.chunk_bounds import ChunkBounds
+from flexgs_edge.render.records import camera_record
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.scene import write_ply
 from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.score.removal import measure_costs
 from flexgs_edge.scratch import Scratch
 from kernel_fixtures import FORMS, large_budget, open_form
@@ -94,6 +99,86 @@ def test_compact_views_give_the_same_bits(
     assert plain["removal"].any() and plain["hits"].any()
     for name, values in plain.items():
         np.testing.assert_array_equal(spilled[name], values, err_msg=name)
+
+
+def wide_scene() -> MemorySource:
+    """Small splats along a curve, far wider than a view, a few large ones among them."""
+    wide = joined(random_scene(2900, 7, 1, size=-3.0, spread=15.0), random_scene(12, 8, 1, size=0.0, spread=15.0))
+    planes = wide.read(slice(0, wide.count), list(FIELD))
+    order = near_rows(planes["means"])
+    return MemorySource({name: values[:, order] for name, values in planes.items()})
+
+
+@pytest.mark.parametrize(
+    ("form", "extent", "antialiased"),
+    [("w8", "exact", False), ("w8", "inria", False), ("w8", "exact", True), ("numpy", "inria", True)],
+)
+def test_views_read_the_chunks_that_they_see(
+    form: str, extent: str, antialiased: bool, compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, views = wide_scene(), cameras()
+    read: list[slice] = []
+
+    def drawn(room: Scratch | None) -> list[np.ndarray]:
+        drawer = Renderer(open_form(form), large_budget(), extent=extent, antialiased=antialiased)
+        if room is not None:
+            drawer.room = room
+        found = []
+        with drawer.load(source) as scene:
+            for camera in views:
+                read.clear()
+                found.append(drawer.render(scene, camera))
+                counts.append(len(read))
+                statistics = Statistics.zeros(source.count)
+                drawer.add_statistics(scene, camera, statistics)
+                found += [statistics.hits, statistics.weights]
+        drawer.release()
+        return found
+
+    def note(self: MemorySource, rows: slice, *words: Any) -> Any:
+        read.append(rows)
+        return plain_read(self, rows, *words)
+
+    plain_read, counts = MemorySource.read, []
+    monkeypatch.setattr(MemorySource, "read", note)
+    spilled = drawn(Scratch(tmp_path))
+    chunks = -(-source.count // 64)
+    # The first view of the scene looks at every chunk, and the one that sees nothing at none.
+    assert counts[0] >= chunks and counts[-1] == 0
+    assert 0 < counts[1] < chunks and 0 < counts[2] < chunks, counts
+    monkeypatch.undo()
+    for values, expected in zip(spilled, drawn(None), strict=True):
+        np.testing.assert_array_equal(values, expected)
+
+
+def test_chunks_are_seen_where_any_of_their_splats_is() -> None:
+    """Single rows, so that every bound is as tight as it can be; and what is left out is most of what shows nothing."""
+    source = wide_scene()
+    planes = source.read(slice(0, source.count), list(FIELD))
+    bounds = [ChunkBounds.of(planes["means"][:, [i]], planes["log_scales"][:, [i]]) for i in range(source.count)]
+    for inria in (False, True):
+        drawer = Renderer(open_form("numpy"), large_budget(), extent="inria" if inria else "exact")
+        with drawer.load(source) as scene:
+            for camera in cameras():
+                drawer.render(scene, camera)
+                assert drawer._buffers is not None
+                shown = np.asarray(drawer.backend.read(drawer._buffers.keys))[: source.count] != CULLED
+                record = camera_record(camera, source.origin, drawer.near)
+                seen = np.array([some.seen(record, inria) for some in bounds])
+                assert not (shown & ~seen).any()
+                assert (~seen).sum() > 0.7 * (~shown).sum()
+        drawer.release()
+
+
+def test_numbers_beyond_all_bounds_are_seen() -> None:
+    record = camera_record(cameras()[-1], np.zeros(3), 0.2)  # the one that sees nothing
+    means, scales = np.zeros((3, 2), np.float32), np.zeros((3, 2), np.float32)
+    assert not ChunkBounds.of(means, scales).seen(record, False)
+    scales[1, 1] = 1e4
+    assert ChunkBounds.of(means, scales).extent == np.inf
+    for inria in (False, True):
+        assert not ChunkBounds.of(means, scales).seen(record, inria), "behind the camera, whatever the size"
+    assert ChunkBounds.of(np.full((3, 2), np.nan, np.float32), scales).seen(record, False)
 
 
 @pytest.fixture(scope="module")

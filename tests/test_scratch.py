@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import mmap
 import os
 import subprocess
 import sys
@@ -36,6 +37,33 @@ def test_take_and_copy(room: Room) -> None:
         assert copied.flags.c_contiguous and copied.flags.writeable
     assert room.take(np.zeros((0, COUNT)), rows).shape == (0, len(rows))
     assert room.empty((3, 0), np.float32).shape == (3, 0)
+
+
+def test_what_is_fetched_is_what_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    advise = scratch._Map.madvise
+
+    def note(self: scratch._Map, *words: int) -> None:
+        asked.append(words)
+        advise(self, *words)
+
+    values = Scratch(tmp_path).empty((3, 4, 10_000), np.float32)
+    numbers = values.reshape(-1)
+    numbers[:] = np.arange(numbers.size)
+    monkeypatch.setattr(scratch._Map, "madvise", note)
+    for view in (values, values[1:, ::2, 5:], values.reshape(12, -1)[3:5], numbers):
+        asked.clear()
+        part = scratch.fetched(view, slice(2_100, 5_000))
+        np.testing.assert_array_equal(part, view[..., 2_100:5_000])
+        pieces = [numbers[start // 4 : (start + length) // 4] for _, start, length in asked]
+        got = set(np.concatenate(pieces).astype(int).tolist())
+        assert got >= set(part.reshape(-1).astype(int).tolist())
+        assert len(got) <= part.size + len(pieces) * mmap.PAGESIZE // 4
+    asked.clear()
+    scratch.fetch(np.zeros((3, 4)), slice(0, 4))
+    scratch.fetch(values[:, :0], slice(0, 4))
+    assert not asked
+    assert list(scratch.blocks(9_000, 4_000, values))[-1] == slice(8_000, 9_000) and len(asked) == 36
 
 
 def test_files_are_gone_with_their_arrays(tmp_path: Path) -> None:

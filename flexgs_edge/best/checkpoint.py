@@ -38,6 +38,11 @@ class Checkpoint:
         return (self._place(number) / DONE).is_file()
 
     @property
+    def key(self) -> str:
+        """What the folder's name says of the path."""
+        return self.folder.name.rpartition("-")[2]
+
+    @property
     def rounds(self) -> int:
         """Finished rounds."""
         number = 0
@@ -71,7 +76,7 @@ class Checkpoint:
                         file, {"descr": values.dtype.str, "fortran_order": False, "shape": values.shape}
                     )
                     for plane in values.reshape(-1, values.shape[-1]) if values.size else ():
-                        for rows in blocks(values.shape[-1], 1 << 20):
+                        for rows in blocks(values.shape[-1], 1 << 20, plane):
                             file.write(np.ascontiguousarray(plane[rows]).data)
                     file.flush()
                     os.fsync(file.fileno())

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.score.removal import RemovalCosts
-from flexgs_edge.scratch import MEMORY, Room, blocks
+from flexgs_edge.scratch import BLOCK_ROWS, MEMORY, Room, blocks
 
 SH_FACTOR = 2.0
 """Costs of dropped SH count this much. They are measured one Gaussian at a time, but neighbours on a surface lose the same
@@ -57,7 +57,7 @@ def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.n
     """
     top, count = len(costs.sh), len(costs.removal)
     keep, degrees = np.empty(count, bool), np.empty(count, np.uint8)
-    for rows in blocks(count):
+    for rows in blocks(count, BLOCK_ROWS, costs.removal, costs.sh, costs.weight2):
         removal, sh = costs.removal[rows], costs.sh[:, rows]
         lagrangian = [SH_FACTOR * sh[level] + multiplier * bits.of_degree(level) for level in range(top)]
         lagrangian.append(np.full(len(removal), multiplier * bits.of_degree(top)))
@@ -90,7 +90,7 @@ def drop_bands(
     if top == 0:
         return planes
     dc, rest = (room.empty(planes[name].shape, np.float32) for name in ("sh_dc", "sh_rest"))
-    for rows in blocks(len(degrees)):
+    for rows in blocks(len(degrees), BLOCK_ROWS, sh_mean, planes["sh_dc"], planes["sh_rest"]):
         some = degrees[rows]
         lower = np.minimum(some, top - 1).astype(np.int64)
         mean = np.take_along_axis(sh_mean[:, :, rows], lower[None, None], axis=0)[0]

@@ -13,10 +13,6 @@ LEAST_VIEWS = 6
 """Poses a step of the refit at the least: steps after 3 poses each fitted fox's 24 scored ones ever better and all others ever
 worse."""
 
-PIXELS_A_ROW = 24
-"""Pixels of all scored poses for each Gaussian at the least. Bytes at 1 dB and processor seconds (balanced): fox at every pixel
-(131 pixels a row) 557 kB, 123 s; at every second of both directions (33) 546 kB, 75 s; every third (15) 8 % more bytes. The
-sample at every second (92) and third (41): 121 and 119 kB."""
 LARGEST_STEP = 4
 """Most pixels from one to the next: splats of one or two pixels must not fall between them in every view."""
 
@@ -38,8 +34,19 @@ class Effort:
     close : float
         Excess (log of loss over limit) that ends the search when it is no farther below the target: 0.03 are about 1.5 % of
         the bytes.
+    few : int
+        Scored poses at the least, where there are as many. Bytes at 1 dB (balanced), from results nearby: fox from all 43
+        poses 541 kB, from 32 534 kB; the sample from all 70 111 kB, from 32 114 kB.
     views : int
-        Most scored poses.
+        Scored poses at the most: more than `few` where these have too few pixels.
+    pixels : int
+        Pixels of all scored poses for each Gaussian at the least: only every k-th one in both directions is looked at while
+        there are as many. Bytes at 1 dB and processor seconds (balanced): fox at every pixel (131 for each Gaussian) 557 kB,
+        123 s; at every second (33) 546 kB, 75 s; every third (15) 8 % more bytes. The sample at every second (92) and third
+        (41): 121 and 119 kB.
+    mended : float
+        Loss after the first round of the colour refit over the loss before it, until a whole result tells (fox .61 to .75, the
+        sample .8 to .9): the fewer pixels are fitted, the less of it holds elsewhere.
     passes : float
         Times that the descent to the first whole result looks at every scored pose; 0: colours are refitted instead.
     """
@@ -49,22 +56,30 @@ class Effort:
     subsets: int
     steps: int
     close: float
+    few: int
     views: int
+    pixels: int
+    mended: float = 0.66
     passes: float = 0.0
+
+    def poses_of(self, pixels: Sequence[int], count: int) -> int:
+        """How many poses to score of those that have so many pixels, for `count` Gaussians."""
+        enough = int(np.searchsorted(np.cumsum(pixels), self.pixels * count)) + 1
+        return min(max(self.few, enough), self.views, len(pixels))
 
     def subsets_of(self, poses: int) -> int:
         """Steps a round for so many scored poses."""
         return max(min(self.subsets, poses // LEAST_VIEWS), 1)
 
 
-def sampled_poses(cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """The views at every pixel, or at a part of them where that is enough to measure `count` Gaussians.
+def sampled_poses(cameras: Sequence[Camera], pixels: int) -> list[Camera]:
+    """The views at every pixel, or at as large a part of them as leaves `pixels` of all.
 
     The part is the same lattice in every view, begun at another pixel from view to view in the order of their names: ties among
     poses, which rounding of a scene that was moved may break, decide no pixel.
     """
     step = 1
-    while step < LARGEST_STEP and sum(_lattice(camera, step + 1) for camera in cameras) >= PIXELS_A_ROW * count:
+    while step < LARGEST_STEP and sum(_lattice(camera, step + 1) for camera in cameras) >= pixels:
         step += 1
     places = np.argsort(np.argsort([camera.name for camera in cameras], kind="stable"), kind="stable")
     return [
@@ -78,8 +93,10 @@ def _lattice(camera: Camera, step: int) -> int:
 
 
 EFFORTS = {
-    "fast": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=1, close=0.08, views=48),
-    "balanced": Effort(keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.05, views=96),
-    "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, views=400),
-    "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, views=96, passes=7.0),
+    "fast": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=1, close=0.08, few=20, views=48, pixels=12, mended=0.84),
+    "balanced": Effort(
+        keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.05, few=32, views=96, pixels=24, mended=0.7
+    ),
+    "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, few=400, views=400, pixels=24),
+    "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=96, views=96, pixels=24, passes=7.0),
 }

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexgs_edge.scratch import MEMORY, Room, blocks
+from flexgs_edge.scratch import MEMORY, Room, blocks, fetched
 
 COLOURS = ("sh_dc", "sh_rest")
 
@@ -47,14 +47,17 @@ class Mended:
             at = np.minimum(np.searchsorted(self.rows, some), len(self.rows) - 1)
             kept = self.rows[at] == some
             alike = kept & (self.degrees[at] == degrees[part])
+            span = slice(int(at[0]), int(at[-1]) + 1)
             for name, values in changed.items():
                 same = np.flatnonzero(alike if name in COLOURS else kept)
-                if name not in COLOURS:
-                    values[:, part.start + same] = self.planes[name][:, at[same]]
-                    continue
-                # A grid may have lost its highest degrees: coefficients are channel by channel.
-                mended = self.planes[name].reshape(3, -1, len(self.rows))
-                values.reshape(3, -1, len(rows))[:, : mended.shape[1], part.start + same] = mended[:, :, at[same]]
+                mended = fetched(self.planes[name], span)
+                to, places = fetched(values, part), at[same] - span.start
+                # Of colours a grid may have lost its highest degrees: coefficients are channel by channel.
+                channels = 3 if name in COLOURS else 1
+                for held, new in zip(*(v.reshape(channels, -1, v.shape[-1]) for v in (to, mended)), strict=True):
+                    # Plane by plane, as scratch files have them.
+                    for plane, moved in zip(held, new, strict=False):
+                        plane[same] = moved[places]
         return {**planes, **changed}
 
 
@@ -82,9 +85,12 @@ class Kept:
     degrees: np.ndarray
     weight2: np.ndarray
 
-    def take(self, keep: np.ndarray) -> Kept:
+    def take(self, keep: np.ndarray, room: Room = MEMORY) -> Kept:
         """Some of the rows: [n] bool."""
         if keep.all():
             return self
-        planes = {name: np.ascontiguousarray(values[:, keep]) for name, values in self.planes.items()}
-        return Kept(self.snapshot, self.rows[keep], planes, self.degrees[keep], self.weight2[keep])
+        rows = np.flatnonzero(keep)
+        planes = {name: room.take(values, rows) for name, values in self.planes.items()}
+        return Kept(
+            self.snapshot, room.take(self.rows, rows), planes, self.degrees[rows], room.take(self.weight2, rows)
+        )

@@ -201,10 +201,11 @@ class PrunePath:
     def _measure(self, scene: DeviceScene, views: Sequence[int], keep: bool = False) -> CostParts:
         costs = ViewSums(self.renderer, scene, [cost_sums(self.renderer, scene.sh_degree)])
         try:
-            for view in self.progress.track(views, "measuring costs", len(views)):
-                costs.add_view(self.renderer.removal_sums(scene, self.cameras[view]), self.cameras[view])
-                if keep and self.refit:
-                    self.targets.add(view, self.renderer.drawn_planes())
+            keep = keep and self.refit
+            drawn = costs.draw("removal_sums", [self.cameras[view] for view in views], pictures=keep)
+            for view, picture in zip(self.progress.track(views, "measuring costs", len(views)), drawn, strict=True):
+                if keep:
+                    self.targets.add(view, picture())
             found = cost_parts(scene.sh_degree, scene.count, self.room)
             for rows, (sums,) in costs.parts():
                 put_costs(found, rows, sums)
@@ -218,9 +219,10 @@ class PrunePath:
         # Nothing has lost its SH on the path yet.
         degrees = np.full(scene.count, 4, np.uint8)
         try:
-            for view in self.progress.track(views, "measuring costs", len(views)):
-                camera = self.cameras[view]
-                both.add_view(self.renderer.residual_and_removal_sums(scene, camera, self.targets[view]), camera)
+            cameras = [self.cameras[view] for view in views]
+            drawn = both.draw("residual_and_removal_sums", cameras, lambda place: self.targets[views[place]])
+            for _ in self.progress.track(drawn, "measuring costs", len(views)):
+                pass
             found = cost_parts(scene.sh_degree, scene.count, self.room)
             for rows, (costs, normal) in both.parts():
                 put_costs(found, rows, costs)

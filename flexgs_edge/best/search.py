@@ -56,10 +56,8 @@ the search starts."""
 FINE_COLOUR = 2.0**-8
 """Colour steps before the refit, as a share of the final ones: only geometry shall move."""
 MOST_ROUNDS = 24
-MENDED = 0.66
-"""Loss after the colour refit over the loss before it, until a whole result tells (fox .61 to .75, the sample .8 to .9)."""
 FURTHER = 0.92
-"""The same for each further round of the refit over the round before it (fox .92)."""
+"""Loss after each further round of the colour refit over the round before it (fox .92); the first: `Effort.mended`."""
 DRIFT = -0.12
 """What a second refit, which goes on where the first one ended, adds to the excess (fox -.15, the sample -.3 to 0)."""
 DISTILLED = 0.4
@@ -272,9 +270,8 @@ class RateSearch(MultiplierSearch[GridScene]):
         """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
-        mended = (
-            math.log(DISTILLED) if self.steps else math.log(MENDED) + (self.effort.refit_rounds - 1) * math.log(FURTHER)
-        )
+        rounds = self.effort.refit_rounds - 1
+        mended = math.log(DISTILLED if self.steps else self.effort.mended * FURTHER**rounds)
         offset = mended if self.refit and not by_size else 0.0
         if steps:
             offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
@@ -312,7 +309,7 @@ class RateSearch(MultiplierSearch[GridScene]):
             # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
             self._slopes = probe_slopes(self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras)
         steps = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
-        kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0))
+        kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0), self.path.room)
         return kept, holdable(steps, kept.planes)
 
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:

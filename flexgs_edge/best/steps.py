@@ -20,7 +20,7 @@ from flexgs_edge.render import Renderer
 from flexgs_edge.render.targets import to_half
 from flexgs_edge.rotations import tilted, turned
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.scratch import blocks
+from flexgs_edge.scratch import BLOCK_ROWS, blocks
 
 GEOMETRY = ("position", "scale", "rotation", "opacity")
 VALUES = {"position": 3, "scale": 3, "rotation": 3, "opacity": 1}
@@ -58,7 +58,9 @@ def probe_slopes(
     views = [cameras[i * len(cameras) // min(PROBE_VIEWS, len(cameras))] for i in range(min(PROBE_VIEWS, len(cameras)))]
     with renderer.load(MemorySource(planes, origin=origin)) as scene:
         reference = [to_half(renderer.render(scene, camera)) for camera in views]
-    smallest = np.concatenate([planes["log_scales"][:, rows].min(axis=0) for rows in blocks(count)])
+    smallest = np.concatenate(
+        [planes["log_scales"][:, rows].min(axis=0) for rows in blocks(count, BLOCK_ROWS, planes["log_scales"])]
+    )
     size = float(np.exp(np.median(smallest.astype(np.float64))))
     # Small enough that squared errors grow with squared steps, large enough to stand clear of half precision references.
     trial = {"position": size / 4, "scale": 0.1, "rotation": 0.03, "opacity": 0.2}
@@ -66,7 +68,7 @@ def probe_slopes(
     for kind in GEOMETRY:
         field = CHANGES[kind]
         moved = {**planes, field: renderer.room.empty(planes[field].shape, np.float32)}
-        for rows in blocks(count):
+        for rows in blocks(count, BLOCK_ROWS, *(planes[name] for name in set(CHANGES.values()))):
             some = {name: values[:, rows] for name, values in planes.items()}
             moved[field][:, rows] = _on_trial_grid(some, kind, np.float32(trial[kind]))
         with renderer.load(MemorySource(moved, origin=origin)) as scene:
@@ -123,11 +125,14 @@ def choose_steps(slopes: Slopes, weight2: np.ndarray, degrees: np.ndarray, sh_de
 
 def holdable(steps: Steps, planes: dict[str, np.ndarray]) -> Steps:
     """`steps`, made coarser where the grid could not hold the planes' values: far outliers, or a multiplier near zero."""
+    count = planes["means"].shape[1]
 
     def finest(name: str, codes: int = CODE_LIMIT - 2) -> float:
-        return max((float(np.abs(row).max(initial=0.0)) for row in planes[name]), default=0.0) / codes
+        values = planes[name]
+        parts = (values[:, rows] for rows in blocks(count, BLOCK_ROWS, values))
+        return max((float(np.abs(part).max(initial=0.0)) for part in parts), default=0.0) / codes
 
-    width = float(np.ptp(planes["means"], axis=1).max(initial=0.0)) if planes["means"].size else 0.0
+    width = float(np.ptp(planes["means"], axis=1).max(initial=0.0)) if count else 0.0
     least = 2.0**-70
     colours = CODE_LIMIT // 4  # Co reaches twice the coefficients, and refits move them
     return Steps(
@@ -156,15 +161,24 @@ def reachable(steps: Steps, planes: dict[str, np.ndarray], seen: np.ndarray) -> 
     """
     if not seen.any():
         return np.ones(len(seen), bool)
-    means = planes["means"].astype(np.float64)
-    low, high = means[:, seen].min(axis=1), means[:, seen].max(axis=1)
+    means, count = planes["means"], len(seen)
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for rows in blocks(count, BLOCK_ROWS, means):
+        some = means[:, rows][:, seen[rows]].astype(np.float64)
+        low, high = (
+            np.minimum(low, some.min(axis=1, initial=np.inf)),
+            np.maximum(high, some.max(axis=1, initial=-np.inf)),
+        )
     room = max((2**POSITION_BITS - 2) * steps.position, float((high - low).max()))
-    inside = np.abs(means - (low + high)[:, None] / 2).max(axis=0) <= room / 2
-    for name, step, codes in (
-        ("log_scales", steps.scale, CODE_LIMIT - 2),
-        ("opacity_logits", steps.opacity, CODE_LIMIT - 2),
-        ("sh_dc", steps.dc, CODE_LIMIT // 4),
-    ):
-        inside &= np.abs(planes[name]).max(axis=0) <= codes * step
-    every: np.ndarray = seen | inside
+    limits = {
+        "log_scales": (CODE_LIMIT - 2) * steps.scale,
+        "opacity_logits": (CODE_LIMIT - 2) * steps.opacity,
+        "sh_dc": CODE_LIMIT // 4 * steps.dc,
+    }
+    every = seen.copy()
+    for rows in blocks(count, BLOCK_ROWS, means, *(planes[name] for name in limits)):
+        inside = np.abs(means[:, rows].astype(np.float64) - (low + high)[:, None] / 2).max(axis=0) <= room / 2
+        for name, most in limits.items():
+            inside &= np.abs(planes[name][:, rows]).max(axis=0) <= most
+        every[rows] |= inside
     return every

@@ -1,4 +1,4 @@
-"""Poses in an order in which every beginning covers the whole: each next one is the farthest from those before it."""
+"""Poses in an order in which every beginning covers the whole: by what they see, or by where they are."""
 
 from __future__ import annotations
 
@@ -10,6 +10,50 @@ from flexgs_edge.cameras.camera import Camera
 
 DIGITS = 6
 """Decimals that squares of distances are told apart by: rounding of a scene that was moved must not break the ties of a rig."""
+SAME_VIEW = 0.2
+"""Cosines of two directions that a point is seen from differ by less where these say something of each other: up to 37 degrees.
+The paper's file of fox from measured costs of 8 poses has a fidelity of 38.1 dB with 0.1 and 0.2, 37.2 dB with a blur of 0.5."""
+
+
+def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, count: int) -> list[int]:
+    """Indices of `count` cameras at most, each next one with the most to add to what those before it see.
+
+    A point adds 1 to a camera that has it in its picture (nothing is hidden by anything), and less for every camera chosen
+    before that has it from a near direction: 1 / (1 + sum of max(0, 1 - (1 - cosine) / `SAME_VIEW`)). Ties go to the lower index.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+    points : np.ndarray
+        [3, n] f64, some of the scene's positions, in the cameras' world.
+    near : float
+        Near plane.
+    count : int
+        Cameras wanted.
+    """
+    if not cameras:
+        return []
+    seen = np.array([_in_picture(camera, points, near) for camera in cameras])
+    away = points[None] - np.array([camera.center for camera in cameras])[:, :, None]
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    known = np.zeros(seen.shape)
+    order: list[int] = []
+    while len(order) < min(count, len(cameras)):
+        gain = np.where(seen, 1.0 / (1.0 + known), 0.0).sum(axis=1).round(DIGITS)
+        gain[order] = -1.0
+        order.append(int(np.argmax(gain)))
+        cosine = np.einsum("can,an->cn", away, away[order[-1]])
+        known += seen[order[-1]] * np.maximum(1.0 - (1.0 - cosine) / SAME_VIEW, 0.0)
+    return order
+
+
+def _in_picture(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
+    """[n] bool: points ([3, n] f64) that project into the picture of a camera."""
+    x, y, z = camera.rotation @ points + camera.translation[:, None]
+    with np.errstate(all="ignore"):
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside: np.ndarray = (z > near) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    return inside
 
 
 def farthest_order(cameras: Sequence[Camera]) -> list[int]:

@@ -114,6 +114,13 @@ from flexgs_edge.cli import words
     "scene, poses and options that was cut short (best only): the bytes are those of one run.",
 )
 @words.option(
+    "Run",
+    "--cluster",
+    metavar="ADDRESS|local:N",
+    help="Draw the scored poses and the views that are compared on a Dask cluster, such as tcp://HOST:8786, or in N processes "
+    "here (best only; needs pip install 'flexgs-edge[cluster]'). The bytes are those of one machine.",
+)
+@words.option(
     "Method",
     "--score",
     metavar="gs|meson|FILE",

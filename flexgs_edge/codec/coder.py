@@ -19,7 +19,7 @@ from flexgs_edge.codec.walk import ChunkCodes, base_kinds, walk_chunk, walk_posi
 from flexgs_edge.curve import morton
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import POSITION_BITS, GridScene
-from flexgs_edge.scratch import MEMORY, Room, blocks
+from flexgs_edge.scratch import BLOCK_ROWS, MEMORY, Room, blocks, fetched
 
 CHUNK_ROWS = 65536
 SAMPLE_CHUNKS = 2
@@ -56,7 +56,7 @@ def cells_of(grid: GridScene, room: Room = MEMORY) -> tuple[np.ndarray, np.ndarr
     if depth > POSITION_BITS:
         raise InputError(f"position: the scene is 2^{depth} cells wide, expected at most 2^{POSITION_BITS}")
     index = room.empty((grid.count,), np.uint64)
-    for rows in blocks(grid.count):
+    for rows in blocks(grid.count, BLOCK_ROWS, grid.position):
         index[rows] = morton(grid.position[:, rows] - low[:, None])
     sorted_ = True
     for rows in blocks(grid.count):
@@ -71,12 +71,13 @@ def cells_of(grid: GridScene, room: Room = MEMORY) -> tuple[np.ndarray, np.ndarr
 def chunk_codes(grid: GridScene, cells: np.ndarray, chunk: Chunk) -> ChunkCodes:
     """The codes of one chunk (views)."""
     rows = slice(chunk.start, chunk.stop)
-    planes = [*grid.scale, grid.opacity, *grid.dc, grid.sh_degrees, *grid.rotation]
-    base = {kind.name: plane[rows] for kind, plane in zip(base_kinds(), planes, strict=True)}
+    scale, dc, rotation = (fetched(values, rows) for values in (grid.scale, grid.dc, grid.rotation))
+    planes = [*scale, grid.opacity[rows], *dc, grid.sh_degrees[rows], *rotation]
+    base = {kind.name: plane for kind, plane in zip(base_kinds(), planes, strict=True)}
     sh = []
     for degree, band in enumerate(grid.sh, start=1):
         start = int(np.count_nonzero(grid.sh_degrees[: chunk.start] >= degree))
-        sh.append(band[:, start : start + int(np.count_nonzero(base["sh degree"] >= degree))])
+        sh.append(fetched(band, slice(start, start + int(np.count_nonzero(base["sh degree"] >= degree)))))
     return ChunkCodes(cells[rows], base, tuple(sh))
 
 

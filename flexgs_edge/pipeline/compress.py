@@ -23,7 +23,7 @@ from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, values_of
 from flexgs_edge.pipeline.best import grid_search, kept_as_it_is, layered, search_best, search_files
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
-from flexgs_edge.pipeline.doubts import doubts, training_fidelity
+from flexgs_edge.pipeline.doubts import TrainingPoses, doubts
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
 from flexgs_edge.pipeline.grid_coder import GridCoder
@@ -102,7 +102,7 @@ def compress(
         if reporter is not None and views is not None:
             reporter.see_cameras(views, scene)
     with ExitStack() as stack:
-        workspace = stack.enter_context(Workspace(options, budget, clock)) if views is not None else None
+        workspace = None if views is None else stack.enter_context(Workspace(options, budget, clock, options.cluster))
         if reporter is not None and views is not None:
             reporter.reserve(budget, views, plan.report)
         job = _Job(options, scene, views, plan, budget, clock, workspace, progress, reporter, format)
@@ -247,7 +247,7 @@ class _Job:
                 self._measure_source(MemorySource(values_of(grid, room), origin=grid.origin), report),
             )
         else:
-            with temporary_name(output, options.force) as place:
+            with temporary_name(output, options.force, None if kept is None else kept.key) as place:
                 with self.clock.stage("write"):
                     size = coder.write(place, grid, settings)
                 if search.reached and plan.target.limit_bytes is not None and size > plan.target.limit_bytes:
@@ -382,14 +382,19 @@ class _Job:
     def _compare(self, load: Callable[[], DeviceScene], report: Judge) -> Quality:
         """Quality of what `load` brings to the device, over the views that report and (fidelity only) some training poses."""
         assert self.workspace is not None and self.views is not None
-        with self.clock.stage("measure"):
+        views, renderer = self.views, self.workspace.renderer
+        with self.clock.stage("measure"), ExitStack() as held:
+            trained = None
+            if views.train and self.plan.report == views.held_out:
+                # Before the result is there: it is brought to the device, and decoded, only once.
+                trained = TrainingPoses(renderer, self.source, views.of(views.train), self.progress)
+                held.callback(trained.close)
             with load() as scene:
                 quality = report.compare(scene, with_ssim=True, progress=self.progress)
                 if self.reporter is not None:
                     self.reporter.look(report, scene, quality, self.clock, self.progress)
-            if self.views.train and self.plan.report == self.views.held_out:
-                train, renderer = self.views.of(self.views.train), self.workspace.renderer
-                self.trained = training_fidelity(renderer, self.source, load, train, self.progress)
+                if trained is not None:
+                    self.trained = trained.fidelity(scene)
         return quality
 
     def _result(

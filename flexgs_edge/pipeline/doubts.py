@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from flexgs_edge.adapt import Scored
 from flexgs_edge.cameras import Camera
@@ -27,25 +27,40 @@ UNSEEN_SHARE = 0.01
 """Share of the Gaussians in none of the automatic views that is worth a word."""
 
 
-def training_fidelity(
-    renderer: Renderer,
-    source: SceneSource,
-    load: Callable[[], DeviceScene],
-    cameras: Sequence[Camera],
-    progress: Progress = SILENT,
-) -> float | None:
-    """Fidelity of what `load` brings to the device, mean over some training poses; `None` when all are identical."""
-    count = min(FIT_VIEWS, len(cameras))
-    few = [cameras[i * len(cameras) // count].every(FIT_STEP) for i in range(count)]
-    with renderer.load(source) as scene:
-        targets = TargetViews.of(renderer, scene, few, progress=progress)
-    found = []
-    with targets, load() as scene:
-        for view, camera in enumerate(few):
+class TrainingPoses:
+    """Some training poses that a finished file is compared on, beside the views that report.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        Draws the original from them at once.
+    source : SceneSource
+        The original.
+    cameras : sequence of Camera
+        All training poses.
+    """
+
+    def __init__(
+        self, renderer: Renderer, source: SceneSource, cameras: Sequence[Camera], progress: Progress = SILENT
+    ) -> None:
+        count = min(FIT_VIEWS, len(cameras))
+        self._renderer = renderer
+        self._cameras = [cameras[i * len(cameras) // count].every(FIT_STEP) for i in range(count)]
+        with renderer.load(source) as scene:
+            self._targets = TargetViews.of(renderer, scene, self._cameras, progress=progress)
+
+    def fidelity(self, scene: DeviceScene) -> float | None:
+        """Fidelity of `scene`, mean over the poses; `None` when all are identical."""
+        found = []
+        for view, camera in enumerate(self._cameras):
             inside = (slice(None), slice(camera.height), slice(camera.width))
-            found.append(psnr(mse(renderer.render_planes(scene, camera)[inside], targets[view][inside])))
-    renderer.release()
-    return mean_psnr(found)
+            planes = self._renderer.render_planes(scene, camera)
+            found.append(psnr(mse(planes[inside], self._targets[view][inside])))
+        return mean_psnr(found)
+
+    def close(self) -> None:
+        """Remove what the original looked like."""
+        self._targets.close()
 
 
 def doubts(

@@ -8,6 +8,7 @@ import numpy as np
 
 from flexgs_edge.adapt import Measurement
 from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.pipeline.inputs import Views
 from flexgs_edge.progress import SILENT, Progress
@@ -66,9 +67,11 @@ class Judge:
         self._budget = budget
         self._kept: dict[tuple[str, int], np.ndarray] = {}
         self._original_error: list[float] = []
+        self._coarse_error: dict[int, float] = {}
         # Taken now and not when images come: scenes that are loaded later must not count on it.
         pixels = [camera.width * camera.height for camera in self.cameras]
-        wanted = sum(pixels) * 12 * (1 if self.photos is None else 2)
+        images = 1 if self.photos is None else 2
+        wanted = sum(camera.width * camera.height + _coarse_pixels(camera) for camera in self.cameras) * 12 * images
         self._work = LIBRARY_BYTES + WORK_BYTES * max(pixels)
         budget.take("comparing views", self._work)
         self._room = min(wanted, budget.free // SHARE)
@@ -78,10 +81,11 @@ class Judge:
 
     def prepare(self, scene: DeviceScene, progress: Progress = SILENT) -> None:
         """Draw the references from `scene` (the original, loaded), and measure them against the photos."""
-        self._original_error = []
-        for i, camera in enumerate(progress.track(self.cameras, "drawing the original", len(self.cameras))):
+        self._original_error, self._coarse_error = [], {}
+        images = self.renderer.images(scene, self.cameras)
+        for i, drawn in enumerate(progress.track(images, "drawing the original", len(self.cameras))):
             # Clamped once, and contiguous by channel as renders are: comparing is then four times as fast.
-            image = _planes(self.renderer.render(scene, camera))
+            image = _planes(drawn)
             self._keep(("original", i), image)
             if self.photos is not None:
                 photo = _planes(self.photos.load(self.indices[i]))
@@ -119,25 +123,39 @@ class Judge:
     ) -> Quality:
         """Quality of `scene` over the views (LPIPS takes about 3 s a megapixel and pair)."""
         found: list[ViewQuality] = []
-        for i, camera in enumerate(progress.track(self.cameras, "comparing views", len(self.cameras))):
-            image = self.renderer.render(scene, camera)
+        images = self.renderer.images(scene, self.cameras)
+        for i, image in enumerate(progress.track(images, "comparing views", len(self.cameras))):
             error = self._original_error[i] if self.photos is not None else None
             references = self.original(i), self._photo(i)
             ssims = self._ssims if with_ssim else None
-            found.append(compare_view(camera.name, image, *references, error, ssims, lpips))
+            found.append(compare_view(self.cameras[i].name, image, *references, error, ssims, lpips))
         return Quality(tuple(found), self.base_psnr)
 
     def estimate(self, scene: DeviceScene) -> Quality:
         """`compare` at a fourth of the pixels, for a search that only has to know where to look next."""
-        every = (slice(None, None, ESTIMATE_STEP),) * 2
         found = []
         for i, camera in enumerate(self.cameras):
             image = self.renderer.render(scene, camera.every(ESTIMATE_STEP))
-            photo = self._photo(i)
-            found.append(
-                compare_view(camera.name, image, self.original(i)[every], None if photo is None else photo[every])
-            )
+            found.append(compare_view(camera.name, image, *self._coarse(i)))
         return Quality(tuple(found), self.base_psnr)
+
+    def _coarse(self, i: int) -> tuple[np.ndarray, np.ndarray | None, float | None]:
+        """What an estimate compares with: original and photo at its pixels, and the error between them."""
+        every = (slice(None, None, ESTIMATE_STEP),) * 2
+        original, photo = self._kept.get(("coarse original", i)), self._kept.get(("coarse photo", i))
+        if original is None:
+            original = _planes(self.original(i)[every])
+            self._keep(("coarse original", i), original)
+        if self.photos is None:
+            return original, None, None
+        if photo is None:
+            found = self._photo(i)
+            assert found is not None
+            photo = _planes(found[every])
+            self._keep(("coarse photo", i), photo)
+        if i not in self._coarse_error:
+            self._coarse_error[i] = mse(original, photo)
+        return original, photo, self._coarse_error[i]
 
     def _ssims(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
         height, width = pairs[0][0].shape[:2]
@@ -171,6 +189,12 @@ class Judge:
         if ("photo", i) in self._kept:
             return self._kept["photo", i]
         return self.photos.load(self.indices[i])
+
+
+def _coarse_pixels(camera: Camera) -> int:
+    """Pixels that an estimate looks at."""
+    few = camera.every(ESTIMATE_STEP)
+    return few.width * few.height
 
 
 def measurement_of(quality: Quality) -> Measurement:

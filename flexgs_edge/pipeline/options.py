@@ -43,6 +43,7 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "layers": ("best", 1),
     "scratch": ("best", None),
     "resume": ("best", False),
+    "cluster": ("best", None),
 }
 """Options that only one `--method` knows, with their defaults."""
 
@@ -166,6 +167,8 @@ class CompressOptions(ViewOptions):
     resume : bool
         Keep every round of the search in the scratch folder until the run is done, and go on from the rounds of a run that was
         cut short (`best`).
+    cluster : str, optional
+        Workers that draw what is scored and compared: the address of a Dask scheduler, or `local:N` (`best`).
     report : str, optional
         Folder for a page about the run (index.html) and its record (result.json).
     dry_run : bool
@@ -198,6 +201,7 @@ class CompressOptions(ViewOptions):
     layers: int = 1
     scratch: str | None = None
     resume: bool = False
+    cluster: str | None = None
     report: str | None = None
     dry_run: bool = False
     force: bool = False

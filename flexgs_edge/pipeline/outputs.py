@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from flexgs_edge.errors import InputError
@@ -32,14 +33,21 @@ def check_outputs(output: str | Path | None, options: CompressOptions) -> Path |
 
 
 @contextmanager
-def temporary_name(output: Path, force: bool) -> Iterator[Path]:
-    """A name beside `output` that becomes `output` when the block ends well, and is removed when it does not."""
+def temporary_name(output: Path, force: bool, word: str | None = None) -> Iterator[Path]:
+    """A name in a folder beside `output` that becomes `output` when the block ends well; the folder is removed in any case.
+
+    With a `word` the folder is named by it, and one that a killed run left is removed first.
+    """
     target = check_writable(output, force)
-    place = target.with_name(f".flexgs-{secrets.token_hex(8)}.tmp.fgs")
+    folder = target.with_name(f".flexgs-out-{word or secrets.token_hex(8)}")
+    shutil.rmtree(folder, ignore_errors=True)
     try:
-        yield place
+        folder.mkdir()
+    except OSError as error:
+        raise InputError(f"{output}: cannot write there ({error.strerror})") from error
+    try:
+        yield folder / f"scene{target.suffix}"
         check_writable(output, force)
-        os.replace(place, target)
+        os.replace(folder / f"scene{target.suffix}", target)
     finally:
-        with suppress(FileNotFoundError):
-            place.unlink()
+        shutil.rmtree(folder, ignore_errors=True)

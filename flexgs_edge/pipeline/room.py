@@ -14,8 +14,16 @@ from flexgs_edge.cameras import Camera
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.refit import descent_bytes
 from flexgs_edge.render import Renderer, sum_bytes
-from flexgs_edge.render.device_scene import COMPACT_ROWS, MOST_SUMS, plane_bytes
+from flexgs_edge.render.device_scene import (
+    COMPACT_ROWS,
+    MIN_CHUNK_ROWS,
+    MOST_SUMS,
+    padded,
+    plane_bytes,
+    upload_bytes,
+)
 from flexgs_edge.render.renderer import FIRST_SHARE
+from flexgs_edge.render.view_buffers import chunk_shapes, shapes_bytes, target_bytes, view_bytes
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.score.cache import fingerprint
@@ -117,12 +125,21 @@ def needed_bytes(
         # A descent holds what is kept, with all that it remembers, at once: as much as the whole scene at the most.
         sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))
         size += source.count * DESCENTS * stored_bytes(source.sh_degree)
-    return size, renderer.least_bytes(source, largest_of(scored), sums)
+    return size, _least_bytes(renderer, source, largest_of(scored), sums)
 
 
 def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:
     """Bytes that the first view of a search in scratch files needs; one that shows more than `FIRST_SHARE` says needs more."""
-    return renderer.compact_bytes(source, largest, -(-source.count // FIRST_SHARE), sum_bytes(MOST_SUMS))
+    rows, shown = padded(min(COMPACT_ROWS, source.count)), -(-source.count // FIRST_SHARE)
+    chunk = rows * (plane_bytes(source.sh_degree) + upload_bytes(source.sh_degree)) + shapes_bytes(chunk_shapes(rows))
+    return view_bytes(renderer.backend, shown, largest) + target_bytes(largest) + sum_bytes(MOST_SUMS) * shown + chunk
+
+
+def _least_bytes(renderer: Renderer, source: SceneSource, camera: Camera, sum_bytes: int) -> int:
+    """Bytes that a view of `source` with targets and sums of `sum_bytes` a row needs at the least, nothing being loaded."""
+    chunk = padded(min(MIN_CHUNK_ROWS, source.count)) * (plane_bytes(source.sh_degree) + upload_bytes(source.sh_degree))
+    view = view_bytes(renderer.backend, source.count, camera) + target_bytes(camera)
+    return view + sum_bytes * source.count + chunk
 
 
 def largest_of(cameras: Sequence[Camera]) -> Camera:

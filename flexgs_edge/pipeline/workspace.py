@@ -14,6 +14,7 @@ from flexgs_edge.grid import GridScene
 from flexgs_edge.kernels import Backend, open_backend
 from flexgs_edge.pipeline.options import ViewOptions
 from flexgs_edge.render import Renderer
+from flexgs_edge.render.cluster import Cluster, Drawing
 from flexgs_edge.report.result import RunInfo
 from flexgs_edge.scratch import MEMORY, Room
 
@@ -60,9 +61,13 @@ class Workspace:
         Everything is taken from it.
     clock : Stopwatch
         Gets the stage `device`.
+    cluster : str, optional
+        Address of workers that draw for it (stage `cluster`), each with the run's memory limit for itself.
     """
 
-    def __init__(self, options: ViewOptions, budget: MemoryBudget, clock: Stopwatch) -> None:
+    def __init__(
+        self, options: ViewOptions, budget: MemoryBudget, clock: Stopwatch, cluster: str | None = None
+    ) -> None:
         assert options.near is not None and options.background is not None
         assert options.extent is not None and options.antialiased is not None
         self.budget = budget
@@ -71,6 +76,10 @@ class Workspace:
         self.renderer = Renderer(
             self.backend, budget, options.near, options.background, options.extent, options.antialiased
         )
+        if cluster is not None:
+            words = options.near, options.background, options.extent, options.antialiased
+            with clock.stage("cluster"):
+                self.renderer.cluster = Cluster(cluster, Drawing(options.device, options.memory_limit, *words))
 
     def __enter__(self) -> Workspace:
         return self
@@ -78,6 +87,8 @@ class Workspace:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self.renderer.cluster is not None:
+            self.renderer.cluster.close()
         self.renderer.release()
         self.backend.close()
 

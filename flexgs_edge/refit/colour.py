@@ -17,6 +17,7 @@ from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.render.view_sums import Maker, ViewSums
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.scratch import fetch, fetched
 
 RELAX_DC = 1.0
 RELAX_SH = 0.25
@@ -129,12 +130,13 @@ def step_colours(
     """One step of some rows, in place: `normal` is their part of `normal_sums`, the rest as for `refit_colours`."""
     weight = np.where(normal[:, 3] > 0, normal[:, 3], np.float32(np.inf))
     # The constant's basis is Y_0 everywhere: its step in coefficients is 1 / Y_0 of the mean residual.
+    fetch(planes["sh_dc"], rows)
     planes["sh_dc"][:, rows] += np.float32(RELAX_DC / SH_C0) * normal[0, :3] / weight[0]
     if not bands or len(normal) == 1:
         return
     count = len(planes["sh_rest"]) // 3
     degree_of = np.repeat(np.arange(1, 5), [sh_rest_count(d) - sh_rest_count(d - 1) for d in range(1, 5)])
-    rest = planes["sh_rest"].reshape(3, count, -1)[:, :, rows]
+    rest = fetched(planes["sh_rest"].reshape(3, count, -1), rows)
     for k in range(len(normal) - 1):
         moved = np.where(degrees[rows] >= degree_of[k], np.float32(RELAX_SH) / weight[k + 1], np.float32(0))
         rest[:, k] += normal[k + 1, :3] * moved

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.constants import DEQUANTIZE_ROWS, LANES
 from flexgs_edge.kernels import Backend
 from flexgs_edge.quantize import QuantizedArray, QuantizedScene
+from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
 
@@ -96,7 +97,7 @@ def activate_chunk(
 
 
 class SourcePlanes:
-    """Fills chunks from a `SceneSource`."""
+    """Fills chunks from a `SceneSource`, whose means and scales stay as they are; colours may change."""
 
     def __init__(self, backend: Backend, source: SceneSource) -> None:
         self.backend = backend
@@ -104,12 +105,15 @@ class SourcePlanes:
         self.count, self.sh_count, self.sh_degree = source.count, source.sh_count, source.sh_degree
         self.origin = source.origin
         self.upload_bytes = upload_bytes(source.sh_degree)
+        self.bounds: dict[int, ChunkBounds] = {}
+        """Of the chunks loaded so far, by their first rows."""
 
     def load(self, start: int, stop: int, degree: int) -> dict[str, Any]:
         """Arrays of the backend, [width, padded(stop - start)], by field name."""
         stride = padded(stop - start)
         names = [name for name in FIELD if degree or name != "sh_rest"]
         host = self.source.read(slice(start, stop), names)
+        self.bounds[start] = ChunkBounds.of(host["means"], host["log_scales"])
         planes = {}
         for name, field in FIELD.items():
             planes[name] = self.backend.array((field.width(degree), stride), np.float32)
@@ -129,6 +133,7 @@ class QuantizedPlanes:
         self.count, self.sh_count, self.sh_degree = quantized.count, quantized.sh_count, quantized.sh_degree
         self.origin = quantized.origin
         self.upload_bytes = 4 * (3 + 4 + 1)
+        self.bounds: dict[int, ChunkBounds] = {}  # every view reads all chunks
         self._arrays: dict[str, tuple[QuantizedArray, Any, Any, Any]] = {}
         for name, array in quantized.arrays.items():
             # Three spare bytes: the kernel reads a code through a window of three.
@@ -213,6 +218,11 @@ class DeviceScene:
         self._least_rows = min(MIN_CHUNK_ROWS, max(self.count, 1))
 
     @property
+    def source(self) -> SceneSource | None:
+        """Where its values come from; None where that is codes on the backend."""
+        return self._planes.source if isinstance(self._planes, SourcePlanes) else None
+
+    @property
     def least_bytes(self) -> int:
         """Bytes that drawing must leave to the scene: none once it is loaded, else its smallest chunk."""
         return 0 if self._resident else self.least_chunk_bytes
@@ -292,20 +302,28 @@ class DeviceScene:
     @property
     def starts(self) -> np.ndarray:
         """[chunks + 1] i64: first row of every chunk, and the number of rows."""
+        if not self._rows:
+            self._decide()
         return np.array([*(start for start, _, _ in self._spans()), self.count], np.int64)
 
     def _load(self, start: int, stop: int, degree: int) -> Chunk:
         planes = self._planes.load(start, stop, degree)
         return activate_chunk(self.backend, start, stop - start, degree, planes, self.antialiased)
 
-    def chunks(self) -> Iterator[Chunk]:
-        """The scene's chunks in row order; a streamed chunk lives until the next one is asked for."""
+    def chunks(self, wanted: Callable[[ChunkBounds], bool] | None = None) -> Iterator[Chunk]:
+        """The scene's chunks in row order; a streamed chunk lives until the next one is asked for.
+
+        Streamed chunks that were loaded before and whose bounds are not `wanted` are left out, and not read.
+        """
         if not self.resident and not self._streamed:
             self._decide()
         if self.resident:
             yield from self._resident
             return
         for span in self._spans():
+            bounds = self._planes.bounds.get(span[0])
+            if wanted is not None and bounds is not None and not wanted(bounds):
+                continue
             chunk = self._load(*span)
             try:
                 yield chunk

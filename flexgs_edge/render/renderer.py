@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,30 +15,26 @@ from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels import Backend
 from flexgs_edge.quantize import QuantizedScene
 from flexgs_edge.render.device_scene import (
-    COMPACT_ROWS,
-    MIN_CHUNK_ROWS,
     SUM_BYTES,
     Chunk,
     DeviceScene,
     QuantizedPlanes,
     SourcePlanes,
-    padded,
-    plane_bytes,
-    upload_bytes,
 )
 from flexgs_edge.render.records import Statistics, camera_record
 from flexgs_edge.render.view_buffers import (
     SORT_DIGIT_BITS,
     SORT_DIGITS,
     ViewBuffers,
-    chunk_shapes,
-    shapes_bytes,
     target_bytes,
     view_bytes,
     view_key,
 )
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.scratch import MEMORY, Room
+
+if TYPE_CHECKING:
+    from flexgs_edge.render.cluster import Cluster
 
 SUM_ROWS = 1 << 18
 """Rows of sums that are on the host at a time."""
@@ -87,6 +83,8 @@ class Renderer:
         Where sums over views go when memory cannot hold them beside a view.
     largest : Camera or None
         The largest view that is to come, where that is known: whether views have room for all rows is decided for it.
+    cluster : Cluster or None
+        Draws the views of `ViewSums.draw` and `images` in this one's stead.
     """
 
     def __init__(
@@ -108,21 +106,25 @@ class Renderer:
         self.antialiased = antialiased
         self.room: Room = MEMORY
         self.largest: Camera | None = None
+        self.cluster: Cluster | None = None
         self.splats_shown = 0
         self.view_rows: np.ndarray | None = None
         """[m] u32, rows of the scene that the sums of the view drawn last belong to; None: all of them."""
         self._buffers: ViewBuffers | None = None
+        self._aimed: Any = None
 
     def aim(self, camera: Camera, origin: np.ndarray) -> None:
         """Put the record of a view into `camera_array`."""
-        assert self._buffers is not None
-        self.backend.write(self._buffers.camera, camera_record(camera, origin, self.near))
+        self.backend.write(self.camera_array, camera_record(camera, origin, self.near))
 
     @property
     def camera_array(self) -> Any:
-        """The record of the view drawn last, in the backend's memory."""
-        assert self._buffers is not None
-        return self._buffers.camera
+        """The record of the view drawn or aimed at last, in the backend's memory."""
+        if self._buffers is not None:
+            return self._buffers.camera
+        if self._aimed is None:  # views drawn elsewhere need no buffers here
+            self._aimed = self.backend.array((32,), np.float32)
+        return self._aimed
 
     @property
     def records_array(self) -> Any:
@@ -139,22 +141,6 @@ class Renderer:
         planes = SourcePlanes(self.backend, source)
         return DeviceScene(self.backend, planes, self.budget, self.antialiased, sum_bytes, targets)
 
-    def least_bytes(self, source: SceneSource, camera: Camera, sum_bytes: int) -> int:
-        """Bytes that a view of `source` with targets and sums of `sum_bytes` a row needs at the least, nothing being loaded."""
-        chunk = padded(min(MIN_CHUNK_ROWS, source.count)) * (
-            plane_bytes(source.sh_degree) + upload_bytes(source.sh_degree)
-        )
-        view = view_bytes(self.backend, source.count, camera) + target_bytes(camera)
-        return view + sum_bytes * source.count + chunk
-
-    def compact_bytes(self, source: SceneSource, camera: Camera, shown: int, sum_bytes: int) -> int:
-        """The same of a view that shows `shown` rows at the most, with sums of `sum_bytes` for each of them."""
-        rows = padded(min(COMPACT_ROWS, source.count))
-        chunk = rows * (plane_bytes(source.sh_degree) + upload_bytes(source.sh_degree)) + shapes_bytes(
-            chunk_shapes(rows)
-        )
-        return view_bytes(self.backend, shown, camera) + target_bytes(camera) + sum_bytes * shown + chunk
-
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
         """Bring a quantized scene to the backend, dequantized there."""
         self.release()
@@ -169,6 +155,15 @@ class Renderer:
             [H, W, 3] f32, linear in the model's own colour space, not clamped.
         """
         return self.render_planes(scene, camera)[:, : camera.height, : camera.width].transpose(1, 2, 0)
+
+    def images(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
+        """`render` of each view, in their order: here, or on the cluster."""
+        if self.cluster is None or scene.source is None:
+            for camera in cameras:
+                yield self.render(scene, camera)
+            return
+        for camera, planes in zip(cameras, self.cluster.planes(scene.source, cameras), strict=True):
+            yield planes[:, : camera.height, : camera.width].transpose(1, 2, 0)
 
     def render_planes(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
         """`render` as the kernels leave it: [3, H, W] f32, both sides rounded up to whole tiles."""
@@ -321,9 +316,10 @@ class Renderer:
 
         When a view shows more than there is room for, the buffers are made anew for what its first part lets expect.
         """
+        record = camera_record(camera, scene.origin, self.near)
         while True:
-            self.backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
-            rows, seen = self._fill_compact(scene, buffers)
+            self.backend.write(buffers.camera, record)
+            rows, seen = self._fill_compact(scene, record, buffers)
             assert buffers.rows is not None
             if len(rows) <= buffers.rows:
                 return buffers, rows
@@ -333,13 +329,13 @@ class Renderer:
             self.release()
             self._buffers = buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
 
-    def _fill_compact(self, scene: DeviceScene, buffers: ViewBuffers) -> tuple[np.ndarray, int]:
+    def _fill_compact(self, scene: DeviceScene, record: np.ndarray, buffers: ViewBuffers) -> tuple[np.ndarray, int]:
         """[m] u32, rows shown, and up to which row of the scene: where they are more than there is room for, it stops."""
         backend, (records, keys, bounds) = self.backend, buffers.chunk
         assert buffers.rows is not None
         found: list[np.ndarray] = []
         at = 0
-        for chunk in scene.chunks():
+        for chunk in scene.chunks(lambda bounds: bounds.seen(record, bool(self.inria_extent))):
             self._project_chunk(scene, chunk, 0, buffers, buffers.chunk)
             depth = backend.read(keys, np.empty(chunk.count, np.uint32))
             shown = np.flatnonzero(depth != CULLED)
@@ -444,3 +440,6 @@ class Renderer:
         if self._buffers is not None:
             self._buffers.release()
             self._buffers = None
+        if self._aimed is not None:
+            self._aimed.release()
+            self._aimed = None

@@ -7,7 +7,9 @@ of one chunk are held at a time. Both add up the same numbers in the same order.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, BinaryIO, Protocol
 
 import numpy as np
@@ -32,6 +34,17 @@ class ChunkSums(Protocol):
 
 
 Maker = Callable[[Chunk], ChunkSums]
+Part = tuple[np.ndarray, np.ndarray]
+"""Rows of a scene [m] u32, ascending, and what each got [m, planes] i64."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A view that was drawn elsewhere."""
+
+    parts: list[Part]
+    picture: np.ndarray | None
+    """As `Renderer.render_planes` gives it."""
 
 
 class ViewSums:
@@ -49,18 +62,55 @@ class ViewSums:
         self._held: dict[int, tuple[int, list[ChunkSums]]] = {}
         self._spool: _Spool | None = None
 
+    def draw(
+        self,
+        kind: str,
+        cameras: Sequence[Camera],
+        targets: Callable[[int], np.ndarray] | None = None,
+        pictures: bool = False,
+    ) -> Iterator[Callable[[], np.ndarray]]:
+        """Draw views and add them, one for each step of the iterator, in their order: here, or on the renderer's cluster.
+
+        Parameters
+        ----------
+        kind : str
+            Method of `Renderer` that gives a view's sums.
+        targets : callable, optional
+            The target of a view by its place among `cameras`, where that method wants one.
+        pictures : bool
+            Whether what is yielded will be asked for.
+
+        Yields
+        ------
+        callable
+            Gives the view as `Renderer.render_planes` does; valid until the next step.
+        """
+        renderer, scene = self._renderer, self._scene
+        if renderer.cluster is None or scene.source is None:
+            for view, camera in enumerate(cameras):
+                self.add_view(view_sums(renderer, scene, kind, camera, targets and targets(view)), camera)
+                yield renderer.drawn_planes
+            return
+        found = renderer.cluster.sums(scene.source, kind, cameras, targets, pictures)
+        for camera, drawn in zip(cameras, found, strict=True):
+            self._add_parts(drawn.parts, camera)
+            yield partial(_picture, drawn)
+
     def add_view(self, sums: Any, camera: Camera) -> None:
         """Add the view drawn last, from `camera`. The order of views is part of the result."""
         if self._renderer.view_rows is not None:
-            if self._spool is None:
-                self._spool = _Spool(self._renderer.room, sums.shape[1], self._scene.starts)
-            self._spool.add(self._renderer, self._renderer.view_rows, sums, camera)
+            self._add_parts(view_parts(self._renderer, self._scene, sums), camera)
             return
         for chunk in self._scene.chunks():
             if chunk.base not in self._held:
                 self._held[chunk.base] = (chunk.count, [make(chunk) for make in self._makers])
             for part in self._held[chunk.base][1]:
                 part.add(chunk, sums, chunk.base)
+
+    def _add_parts(self, parts: Iterable[Part], camera: Camera) -> None:
+        if self._spool is None:
+            self._spool = _Spool(self._renderer.room, self._scene.starts)
+        self._spool.add(parts, camera)
 
     def parts(self) -> Iterator[tuple[slice, list[Any]]]:
         """Rows of the scene and their sums over the views added, one of each kind, chunk by chunk; valid until the next."""
@@ -94,29 +144,26 @@ class ViewSums:
 class _Spool:
     """What the rows of a scene got in some views, in a scratch file: view by view, rows ascending."""
 
-    def __init__(self, room: Room, planes: int, starts: np.ndarray) -> None:
-        self._room, self._planes, self._starts = room, planes, starts
-        self._record = np.dtype([("row", "<u4"), ("sums", "<i8", (planes,))])
+    def __init__(self, room: Room, starts: np.ndarray) -> None:
+        self._room, self._starts = room, starts
+        self._record: np.dtype[Any] | None = None
         self._file: BinaryIO = room.file()
         self._end = 0
         # For each view: its camera, where it begins, and how many of its rows come before each chunk.
         self._views: list[tuple[Camera, int, np.ndarray]] = []
 
-    def add(self, renderer: Renderer, rows: np.ndarray, sums: Any, camera: Camera) -> None:
-        """Write one view: `rows` [m] u32, sums on the backend."""
+    def add(self, parts: Iterable[Part], camera: Camera) -> None:
+        """Write one view."""
         start, before = self._end, np.zeros(len(self._starts), np.int64)
         try:
             self._file.seek(start)
-            for at in range(0, len(rows), SPOOL_ROWS):
-                count = min(SPOOL_ROWS, len(rows) - at)
-                words = np.empty((count, self._planes, 2), np.uint32)
-                values = renderer.backend.read(sums, words, 2 * self._planes * at).view(np.int64)[..., 0]
-                some = np.flatnonzero(values.any(axis=1))
-                block = np.empty(len(some), self._record)
-                block["row"], block["sums"] = rows[at + some], values[some]
+            for rows, values in parts:
+                self._record = np.dtype([("row", "<u4"), ("sums", "<i8", values.shape[1:])])
+                block = np.empty(len(rows), self._record)
+                block["row"], block["sums"] = rows, values
                 self._file.write(block.data)
                 self._end += block.nbytes
-                before += np.searchsorted(block["row"], self._starts)
+                before += np.searchsorted(rows, self._starts)
             self._file.flush()
         except OSError as error:
             raise self._room.full(self._end - start, error) from error
@@ -125,8 +172,11 @@ class _Spool:
     def replay(self, renderer: Renderer, scene: DeviceScene, chunk: Chunk) -> Iterator[Any]:
         """For each view in which a row of the chunk got something: its sums, [stride, planes, 2] u32 on the backend."""
         backend, place = renderer.backend, int(np.searchsorted(self._starts, chunk.base))
-        dense = np.zeros((chunk.stride, self._planes), np.int64)
-        array = backend.array((chunk.stride, self._planes, 2), np.uint32)
+        if self._record is None:  # no view showed anything
+            return
+        shape = (chunk.stride, *self._record["sums"].shape)
+        dense = np.zeros(shape, np.int64)
+        array = backend.array((*shape, 2), np.uint32)
         try:
             for camera, start, before in self._views:
                 low, high = before[place : place + 2].tolist()
@@ -146,3 +196,34 @@ class _Spool:
     def close(self) -> None:
         """Remove the file."""
         self._file.close()
+
+
+def view_sums(renderer: Renderer, scene: DeviceScene, kind: str, camera: Camera, target: np.ndarray | None) -> Any:
+    """The sums of one view, by the method of `Renderer` that is called `kind`; a target where that wants one."""
+    draw: Callable[..., Any] = getattr(renderer, kind)
+    return draw(scene, camera) if target is None else draw(scene, camera, target)
+
+
+def view_parts(renderer: Renderer, scene: DeviceScene, sums: Any) -> Iterator[Part]:
+    """Rows that got something in the view drawn last, in their order, some at a time."""
+    of_view, planes = renderer.view_rows, sums.shape[1]
+    count = scene.count if of_view is None else len(of_view)
+    for at in range(0, count, SPOOL_ROWS):
+        words = np.empty((min(SPOOL_ROWS, count - at), planes, 2), np.uint32)
+        values = renderer.backend.read(sums, words, 2 * planes * at).view(np.int64)[..., 0]
+        some = np.flatnonzero(values.any(axis=1))
+        rows = at + some if of_view is None else of_view[at + some]
+        yield rows.astype(np.uint32), values[some]
+
+
+def drawn_sums(
+    renderer: Renderer, scene: DeviceScene, kind: str, camera: Camera, target: np.ndarray | None, picture: bool
+) -> Drawn:
+    """What a worker sends back of one view."""
+    parts = list(view_parts(renderer, scene, view_sums(renderer, scene, kind, camera, target)))
+    return Drawn(parts, renderer.drawn_planes() if picture else None)
+
+
+def _picture(drawn: Drawn) -> np.ndarray:
+    assert drawn.picture is not None
+    return drawn.picture

@@ -10,6 +10,7 @@ import numpy as np
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
+from flexgs_edge.scratch import fetched
 
 Planes = dict[str, np.ndarray]
 """Arrays by field name, each [width, n] f32."""
@@ -260,7 +261,8 @@ class MemorySource(SceneSource):
         """See `SceneSource.read`."""
         rows, planes = self.begin_read(rows, fields, out)
         for field, plane in planes.items():
-            plane[...] = self._planes[field][:, rows]
+            values = self._planes[field]
+            plane[...] = fetched(values, rows) if isinstance(rows, slice) else values[:, rows]
         return planes
 
 

@@ -19,7 +19,7 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import DeviceScene, Renderer
 from flexgs_edge.render.device_scene import Chunk
 from flexgs_edge.render.view_sums import Maker, ViewSums
-from flexgs_edge.scratch import MEMORY, Room, blocks
+from flexgs_edge.scratch import BLOCK_ROWS, MEMORY, Room, blocks
 
 MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
 """Where the sums of moments stop (colours of some thousands in every view)."""
@@ -51,7 +51,8 @@ class RemovalCosts:
         """Costs over all poses, from sums over some of them each."""
         levels, count = parts[0].moments.shape[0], len(parts[0].removal)
         costs = cls.empty(levels, count, room)
-        for rows in blocks(count):
+        read = (values for part in parts for values in (part.removal, part.weight2, part.moments))
+        for rows in blocks(count, BLOCK_ROWS, *read):
             costs.removal[rows] = sum(part.removal[rows] for part in parts)
             weight2 = costs.weight2[rows] = sum(part.weight2[rows] for part in parts)
             moments = sum(part.moments[:, :, rows] for part in parts)
@@ -155,8 +156,8 @@ def measure_costs(
     degree = scene.sh_degree if sh_costs else 0
     costs = ViewSums(renderer, scene, [cost_sums(renderer, degree)])
     try:
-        for camera in progress.track(cameras, "measuring costs", len(cameras)):
-            costs.add_view(renderer.removal_sums(scene, camera), camera)
+        for _ in progress.track(costs.draw("removal_sums", cameras), "measuring costs", len(cameras)):
+            pass
         found = cost_parts(degree, scene.count, renderer.room)
         for rows, (sums,) in costs.parts():
             put_costs(found, rows, sums)

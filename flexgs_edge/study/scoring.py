@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from flexgs_edge.cameras import Camera
-from flexgs_edge.cameras.order import farthest_order
+from flexgs_edge.cameras.order import covering_order, farthest_order
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
+from flexgs_edge.pipeline.poses import some_positions
 from flexgs_edge.prune import order_from_scores
 from flexgs_edge.render import sum_bytes
 from flexgs_edge.score.removal import measure_costs, moment_bytes
@@ -23,11 +24,12 @@ from flexgs_edge.study.tables import Cell, Table, columns
 FEWEST = 4
 SCORES = {"gs": "the paper's score gs", "removal": "measured costs of removal"}
 ORDERS = {
+    "covering": "each next pose the one that adds most to what those before it see, as compress takes them",
     "farthest": "each next pose farthest from those before it",
     "even": "poses spread evenly by name",
     "first": "the first poses by name",
 }
-COMPARED = ("farthest", "even")
+COMPARED = ("covering", "farthest", "even")
 """Of `ORDERS`, those of `study speed`."""
 ALL = "all"
 HEADS = {"score": "score", "poses": "poses", "views": "views scored"}
@@ -86,8 +88,11 @@ def score_rows(bench: Bench, fewest: int = FEWEST, orders: Sequence[str] = COMPA
     """
     cameras = bench.views.of(bench.views.train)
     counts = view_counts(len(cameras), fewest)
+    positions = some_positions(bench.scene.source)
+    covering = covering_order(cameras, positions, bench.workspace.renderer.near, len(cameras))
     spread = farthest_order(cameras)
     places: dict[str, Callable[[int], list[int]]] = {
+        "covering": lambda count: sorted(covering[:count]),
         "farthest": lambda count: sorted(spread[:count]),
         "even": lambda count: [i * len(cameras) // count for i in range(count)],
         "first": lambda count: list(range(count)),

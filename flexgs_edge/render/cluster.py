@@ -1,0 +1,228 @@
+"""Views drawn by the workers of a Dask cluster; sums and pictures come back in the order of the views.
+
+What is added up, and in which order, is the same as on one machine, so a file does not depend on who drew what. Dask runs
+everything, and what a lost worker was drawing is drawn again by another.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import uuid
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge._version import __version__
+from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.cameras import Camera
+from flexgs_edge.errors import DeviceError, InputError
+from flexgs_edge.kernels import open_backend
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.view_sums import Drawn, drawn_sums
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import MemorySource, SceneSource
+
+LOG = logging.getLogger("flexgs_edge")
+
+AHEAD = 2
+"""Views for each worker that are asked for before the first of them is taken: their sums wait in the workers' memory."""
+SENDINGS = 3
+"""Times that a scene is sent when all workers that held it were lost."""
+CONNECT_SECONDS = 30
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """How workers draw, by the words of `Renderer`; `memory_limit` is each one's own."""
+
+    device: str | None
+    memory_limit: int | None
+    near: float
+    background: tuple[float, float, float]
+    extent: str
+    antialiased: bool
+
+
+class Cluster:
+    """Workers that draw; a context manager.
+
+    Parameters
+    ----------
+    address : str
+        Of a Dask scheduler, such as `tcp://10.0.0.5:8786`, or `local:N` for N processes of one thread each on this machine.
+    drawing : Drawing
+
+    Raises
+    ------
+    InputError
+        When the package is missing, the address is wrong or nobody answers, or workers have another version of this program.
+    """
+
+    def __init__(self, address: str, drawing: Drawing) -> None:
+        try:
+            import distributed
+        except ImportError as error:
+            raise InputError("--cluster needs the package distributed: pip install 'flexgs-edge[cluster]'") from error
+        self._drawing, self._lost = drawing, distributed.KilledWorker
+        self._local: Any = None
+        if address.startswith("local:"):
+            count = address.removeprefix("local:")
+            if not count.isdecimal() or int(count) < 1:
+                raise InputError(f"--cluster {address}: expected a number of processes above 0, such as local:2")
+            self._local = distributed.LocalCluster(
+                n_workers=int(count),
+                threads_per_worker=1,
+                memory_limit=0,  # what draws has a limit of its own
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+                env={"POCL_MAX_PTHREAD_COUNT": "1"},
+            )
+        try:
+            self._client = distributed.Client(self._local or address, timeout=CONNECT_SECONDS, set_as_default=False)
+            versions = set(self._client.run(_version).values())
+        except (OSError, ValueError, ImportError) as error:
+            raise InputError(
+                f"--cluster {address}: no cluster of workers with flexgs-edge answers ({error})"
+            ) from error
+        if versions != {__version__}:
+            self.close()
+            raise InputError(
+                f"--cluster {address}: expected workers with flexgs-edge {__version__}, found "
+                f"{', '.join(sorted(versions)) or 'no worker'}"
+            )
+
+    def close(self) -> None:
+        """Leave the cluster; a local one ends."""
+        self._client.close()
+        if self._local is not None:
+            self._local.close()
+
+    def __enter__(self) -> Cluster:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def planes(self, source: SceneSource, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
+        """`Renderer.render_planes` of each view, in their order."""
+        return self._drawn(_draw_planes, source, [partial(_words, camera) for camera in cameras])
+
+    def sums(
+        self,
+        source: SceneSource,
+        kind: str,
+        cameras: Sequence[Camera],
+        targets: Callable[[int], np.ndarray] | None,
+        pictures: bool,
+    ) -> Iterator[Drawn]:
+        """What rows got in each view, in their order: see `ViewSums.draw`."""
+
+        def words(view: int) -> tuple[Any, ...]:
+            return kind, cameras[view], None if targets is None else targets(view), pictures
+
+        return self._drawn(_draw_sums, source, [partial(words, view) for view in range(len(cameras))])
+
+    def _drawn(
+        self, draw: Callable[..., Any], source: SceneSource, views: Sequence[Callable[[], tuple[Any, ...]]]
+    ) -> Iterator[Any]:
+        if not isinstance(source, MemorySource):
+            source = MemorySource(source.read(slice(0, source.count), list(FIELD)), source.sh_degree, source.origin)
+        done = 0
+        for _ in range(SENDINGS):
+            try:
+                for found in self._ask(draw, source, views[done:]):
+                    yield found
+                    done += 1
+                return
+            except CancelledError:
+                LOG.warning("all workers that held the scene were lost: it is sent again")
+            except self._lost as error:
+                raise DeviceError(
+                    f"--cluster: workers died while they drew ({error}); is their memory too small?"
+                ) from error
+        raise DeviceError(f"--cluster: the workers were lost {SENDINGS} times")
+
+    def _ask(
+        self, draw: Callable[..., Any], source: MemorySource, views: Sequence[Callable[[], tuple[Any, ...]]]
+    ) -> Iterator[Any]:
+        """Results in order; few at a time are under way."""
+        client = self._client
+        held = client.scatter([(uuid.uuid4().hex, source)], broadcast=True, hash=False)[0]
+        most, asked = AHEAD * max(len(client.nthreads()), 1), deque[Any]()
+        try:
+            for view in views:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # targets of large views make "large graphs"
+                    asked.append(client.submit(draw, held, self._drawing, *view(), pure=False))
+                if len(asked) == most:
+                    yield asked.popleft().result()
+            while asked:
+                yield asked.popleft().result()
+        finally:
+            client.cancel([held, *asked])
+
+
+class _Desk:
+    """What a worker process keeps from view to view: a renderer, and the scene sent last."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self._renderer: Renderer | None = None
+        self._drawing: Drawing | None = None
+        self._key = ""
+        self._scene: DeviceScene | None = None
+
+    def ready(self, held: tuple[str, MemorySource], drawing: Drawing) -> tuple[Renderer, DeviceScene]:
+        """The renderer, and the scene loaded."""
+        if self._drawing != drawing or self._renderer is None:
+            self._key, self._scene = "", None
+            budget = MemoryBudget.from_limit(drawing.memory_limit)
+            backend = open_backend(drawing.device, budget)
+            self._renderer = Renderer(
+                backend, budget, drawing.near, drawing.background, drawing.extent, drawing.antialiased
+            )
+            self._drawing = drawing
+        key, source = held
+        if key != self._key or self._scene is None:
+            if self._scene is not None:
+                self._scene.close()
+            self._key, self._scene = key, self._renderer.load(source)
+        return self._renderer, self._scene
+
+
+_DESK = _Desk()
+
+
+def _draw_planes(held: tuple[str, MemorySource], drawing: Drawing, camera: Camera) -> np.ndarray:
+    with _DESK.lock:
+        renderer, scene = _DESK.ready(held, drawing)
+        return renderer.render_planes(scene, camera)
+
+
+def _draw_sums(
+    held: tuple[str, MemorySource],
+    drawing: Drawing,
+    kind: str,
+    camera: Camera,
+    target: np.ndarray | None,
+    picture: bool,
+) -> Drawn:
+    with _DESK.lock:
+        renderer, scene = _DESK.ready(held, drawing)
+        return drawn_sums(renderer, scene, kind, camera, target, picture)
+
+
+def _words(*words: Any) -> tuple[Any, ...]:
+    return words
+
+
+def _version() -> str:
+    return __version__
