@@ -89,7 +89,7 @@ def test_a_scene_that_needs_four_times_the_cap(tmp_path: Path) -> None:
     (tmp_path / "few.json").write_text(json.dumps(poses[::10]))
     command = [CAPPED, "320MiB", sys.executable, "-m", "flexgs_edge", "compress", tmp_path / "point_cloud.ply"]
     command += ["-o", tmp_path / "a.fgs", "--json", tmp_path / "a.json", "--cameras", tmp_path / "few.json", "--images"]
-    command += ["none", "--effort", "fast", "--resolution", "96", "--holdout", "4", "--no-refit", "--max-size", "30MB"]
+    command += ["none", "--effort", "fast", "--resolution", "96", "--holdout", "4", "--no-refit", "--max-size", "11MB"]
     environment = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run(
         [*map(str, command), "--memory-limit", "288MiB"], capture_output=True, text=True, env=environment, check=False
