@@ -54,8 +54,7 @@ def compact(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Renderer, "_fits", lambda *_: False)
     monkeypatch.setattr(renderer_module, "CAPACITY_STEP", 32)
     monkeypatch.setattr(renderer_module, "FIRST_SHARE", 100)
-    for module in (renderer_module, device_scene):
-        monkeypatch.setattr(module, "COMPACT_ROWS", 64)
+    monkeypatch.setattr(device_scene, "COMPACT_ROWS", 64)
 
 
 def found_by(form: str, room: Scratch | None) -> dict[str, np.ndarray]:
@@ -90,7 +89,6 @@ def test_compact_views_give_the_same_bits(
 ) -> None:
     spilled = found_by(form, Scratch(tmp_path))
     # One chunk, so that it is the last one that shows more than there is room for.
-    monkeypatch.setattr(renderer_module, "COMPACT_ROWS", 4096)
     monkeypatch.setattr(device_scene, "COMPACT_ROWS", 4096)
     for name, values in found_by(form, Scratch(tmp_path)).items():
         np.testing.assert_array_equal(values, spilled[name], err_msg=name)

@@ -23,6 +23,7 @@ from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, values_of
 from flexgs_edge.pipeline.best import grid_search, kept_as_it_is, layered, search_best, search_files
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
+from flexgs_edge.pipeline.decompress import decoded
 from flexgs_edge.pipeline.doubts import TrainingPoses, doubts
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
@@ -254,7 +255,7 @@ class _Job:
                     raise TargetError(
                         f"{plan.target.describe()}: {options.layers} layers make the file {size} bytes; ask for fewer layers"
                     )
-                quality = self._measure_source(open_fgs(place), report)
+                quality = self._measure_source(decoded(open_fgs(place), renderer), report)
             LOG.info("wrote %s, %s", output, format_size(size))
         if kept is not None:
             kept.remove()

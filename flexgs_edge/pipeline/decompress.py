@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.codec import GridSource
 from flexgs_edge.codec.coder import CHUNK_ROWS
@@ -16,8 +18,11 @@ from flexgs_edge.kernels import Backend
 from flexgs_edge.pipeline.inputs import load_scene
 from flexgs_edge.pipeline.records import scene_info
 from flexgs_edge.pipeline.workspace import DEVICE_ROWS, Stopwatch, counted_backend, run_info
+from flexgs_edge.render import Renderer
 from flexgs_edge.report.result import DecompressResult
-from flexgs_edge.scene import SceneSource, check_writable, inria_dtype, write_ply
+from flexgs_edge.scene import MemorySource, SceneSource, check_writable, inria_dtype, write_ply
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scratch import BLOCK_ROWS
 
 WRITE_COPIES = 3
 """Times a chunk's rows that decoding and writing hold at once: codes, planes, rows of the PLY."""
@@ -71,6 +76,23 @@ def ahead(source: SceneSource, budget: MemoryBudget, backend: Backend | None = N
         threads -= 1
     with source.whole_in_order(threads):
         yield
+
+
+def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
+    """A file's scene for a renderer that draws several views of it: decoded once, to scratch files, where scenes lie there.
+
+    Otherwise it is the source as it is, which views in memory read once. Views give their memory to the decoder.
+    """
+    room, budget = renderer.room, renderer.budget
+    if not room.spills:
+        return source
+    renderer.release()
+    budget.require("decoding the file", min(source.count, CHUNK_ROWS) * DECODE_BYTES)
+    planes = {name: room.empty((source.width(name), source.count), np.float32) for name in FIELD}
+    with ahead(source, budget):
+        for rows in source.chunks(BLOCK_ROWS):
+            source.read(rows, list(FIELD), {name: values[:, rows] for name, values in planes.items()})
+    return MemorySource(planes, source.sh_degree, source.origin, source.name)
 
 
 def decompress(
