@@ -115,7 +115,7 @@ def test_all_views_are_the_reference_of_a_few(study: tuple[SpeedStudy, Path], be
     rows = rows_of(study, "scoring")
     train = len(bench.views.train)
     assert [(row["score"], row["poses"], row["views"]) for row in rows if row["score"] == "gs"] == [
-        ("gs", "farthest", 4), ("gs", "even", 4), ("gs", "all", train),
+        ("gs", "covering", 4), ("gs", "farthest", 4), ("gs", "even", 4), ("gs", "all", train),
     ]  # fmt: skip
     for row in rows:
         assert (row["spearman"] == 1.0) == (row["poses"] == "all")

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.adapt import SearchResult, Step, Target, adapt, measure_fixed
+from flexgs_edge.adapt import SearchResult, Step, adapt, measure_fixed
 from flexgs_edge.bitspec import PAPER, BitSpec
 from flexgs_edge.budget import MemoryBudget, format_size
 from flexgs_edge.codec import FgsSource, open_fgs
@@ -34,7 +34,7 @@ from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.outputs import check_outputs, temporary_name
 from flexgs_edge.pipeline.plan import Plan, make_settings
 from flexgs_edge.pipeline.poses import scored_poses
-from flexgs_edge.pipeline.records import scene_info, views_info
+from flexgs_edge.pipeline.records import scene_info, step_words, views_info
 from flexgs_edge.pipeline.report import Reporter
 from flexgs_edge.pipeline.room import choose_room, open_checkpoint
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, run_info
@@ -230,7 +230,7 @@ class _Job:
             options,
             self.budget,
             self.clock,
-            on_step=lambda step: LOG.info("%s", _step_words(step, plan.target)),
+            on_step=lambda step: LOG.info("%s", step_words(step, plan.target)),
             progress=self.progress,
             checkpoint=kept,
         )
@@ -283,7 +283,7 @@ class _Job:
                 LOG.info("searching for %s", plan.target.describe())
             file, search = search_files(
                 files, order, renderer, self.source, poses, decide, plan.target, options, self.budget, self.clock,
-                on_step=lambda step: LOG.info("%s", _step_words(step, plan.target)), progress=self.progress,
+                on_step=lambda step: LOG.info("%s", step_words(step, plan.target)), progress=self.progress,
             )  # fmt: skip
             if decide is not None and decide is not report:
                 decide.close()
@@ -350,7 +350,7 @@ class _Job:
         LOG.info("searching for %s", self.plan.target.describe())
 
         def on_step(step: Step) -> None:
-            LOG.info("%s", _step_words(step, self.plan.target))
+            LOG.info("%s", step_words(step, self.plan.target))
 
         return adapt(evaluator, self.plan.target, self.options.effort, self.options.best_effort, on_step)
 
@@ -447,9 +447,3 @@ class _Job:
             training_fidelity=self.trained,
             warnings=warnings,
         )
-
-
-def _step_words(step: Step, target: Target | None) -> str:
-    figure = target.report(step.size, step.measurement) if target else ""
-    figure += " (estimated)" if step.estimated else ""
-    return f"{step.phase}: prune {step.choice.prune / 1000:g}, SH {step.choice.sh / 1000:g}: {figure}, {step.seconds:.1f} s"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+from flexgs_edge.adapt import Step, Target
 from flexgs_edge.pipeline.inputs import Scene, Views
 from flexgs_edge.report.result import SceneInfo, ViewsInfo
 
@@ -32,3 +33,10 @@ def views_info(views: Views) -> ViewsInfo:
         height=max(camera.height for camera in views.cameras),
         notes=views.notes,
     )
+
+
+def step_words(step: Step, target: Target | None) -> str:
+    """A step of a search in a line."""
+    figure = target.report(step.size, step.measurement) if target else ""
+    figure += " (estimated)" if step.estimated else ""
+    return f"{step.phase}: prune {step.choice.prune / 1000:g}, SH {step.choice.sh / 1000:g}: {figure}, {step.seconds:.1f} s"
