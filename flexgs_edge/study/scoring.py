@@ -175,9 +175,9 @@ def _quality(bench: Bench, rows: list[dict[str, Cell]], count: int) -> Experimen
         "Scored views and what they are worth",
         f"The Gaussians are ranked from some of the {count} training poses; then the paper's method removes p = "
         f"{choice.prune / 1000:g} of them and the SH of s = {choice.sh / 1000:g} at its own bits, so all files have one "
-        f"size. gs: {SCORES['gs']}; removal: {SCORES['removal']}, from the pass that measures those of SH as well. farthest: "
-        f"{ORDERS['farthest']}; even: {ORDERS['even']}. Gaussians that no scored pose sees have no score and go first. "
-        "Seconds are of scoring alone.",
+        f"size. gs: {SCORES['gs']}; removal: {SCORES['removal']}, from the pass that measures those of SH as well. covering: "
+        f"{ORDERS['covering']}; farthest: {ORDERS['farthest']}; even: {ORDERS['even']}. Gaussians that no scored pose sees "
+        "have no score and go first. Seconds are of scoring alone.",
         table,
         LineChart(
             "Time of scoring against what it is worth at one size",
@@ -194,12 +194,12 @@ def _quality(bench: Bench, rows: list[dict[str, Cell]], count: int) -> Experimen
 
 
 def _words(rows: Sequence[dict[str, Cell]], whole: dict[str, Cell], score: str, figure: str) -> str:
-    few = [row for row in rows if row["score"] == score and row["poses"] == "farthest"]
+    few = [row for row in rows if row["score"] == score and row["poses"] == COMPARED[0]]
     words = [
         f"{row['views']} views {float(row[figure] or 0):.3f} dB in {float(row['seconds'] or 0):.2f} s"
         for row in [*few, whole]
     ]
-    return f"{score}, {FIGURES[figure].removesuffix(' (dB)')} by farthest poses: {'; '.join(words)}."
+    return f"{score}, {FIGURES[figure].removesuffix(' (dB)')} by {COMPARED[0]} poses: {'; '.join(words)}."
 
 
 def _stability(rows: list[dict[str, Cell]], count: int) -> Experiment:
@@ -237,8 +237,8 @@ def _stability(rows: list[dict[str, Cell]], count: int) -> Experiment:
 
 def _series(rows: Sequence[dict[str, Cell]], score: str, poses: str, x: str, y: str) -> Series:
     shown = [row for row in rows if row["score"] == score and row["poses"] in (poses, ALL)]
-    # Both orders have the same numbers of views: said once.
-    notes = [str(row["views"]) if x != "views" and poses == "farthest" else "" for row in shown]
+    # All orders have the same numbers of views: said once.
+    notes = [str(row["views"]) if x != "views" and poses == COMPARED[0] else "" for row in shown]
     return Series(
         f"{score}, {poses}", [float(row[x] or 0) for row in shown], [float(row[y] or 0) for row in shown], notes=notes
     )
