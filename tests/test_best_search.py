@@ -38,7 +38,8 @@ BYTES = 4000
 class FakePath:
     """A path whose costs are known: descending removes the cheapest and changes no cost."""
 
-    renderer = origin = cameras = targets = None
+    renderer = origin = targets = None
+    cameras: tuple[object, ...] = ()
     room = MEMORY
 
     def __init__(self, count: int = 600, degree: int = 1, unseen: int = 0, scale: float = 1.0) -> None:

@@ -45,8 +45,8 @@ class Effort:
         123 s; at every second (33) 546 kB, 75 s; every third (15) 8 % more bytes. The sample at every second (92) and third
         (41): 121 and 119 kB.
     mended : float
-        Loss after the first round of the colour refit over the loss before it, until a whole result tells (fox .61 to .75, the
-        sample .8 to .9): the fewer pixels are fitted, the less of it holds elsewhere.
+        Loss after the first round of the colour refit over the loss before it, until a whole result tells, with no more poses
+        than `few`: the fewer pixels are fitted, the less of it holds elsewhere.
     passes : float
         Times that the descent to the first whole result looks at every scored pose; 0: colours are refitted instead.
     """

@@ -56,8 +56,11 @@ the search starts."""
 FINE_COLOUR = 2.0**-8
 """Colour steps before the refit, as a share of the final ones: only geometry shall move."""
 MOST_ROUNDS = 24
+MENDED = 0.66
+"""Loss after the first round of the colour refit over the loss before it, until a whole result tells (fox .61 to .75, the sample
+.8 to .9), with more poses than the effort's few: with those `Effort.mended`."""
 FURTHER = 0.92
-"""Loss after each further round of the colour refit over the round before it (fox .92); the first: `Effort.mended`."""
+"""Loss after each further round of the colour refit over the round before it (fox .92)."""
 DRIFT = -0.12
 """What a second refit, which goes on where the first one ended, adds to the excess (fox -.15, the sample -.3 to 0)."""
 DISTILLED = 0.4
@@ -270,9 +273,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
-        rounds = self.effort.refit_rounds - 1
-        mended = math.log(DISTILLED if self.steps else self.effort.mended * FURTHER**rounds)
-        offset = mended if self.refit and not by_size else 0.0
+        offset = math.log(self._mended_part()) if self.refit and not by_size else 0.0
         if steps:
             offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
             if self.refit and not by_size:
@@ -297,6 +298,13 @@ class RateSearch(MultiplierSearch[GridScene]):
             if place == there:
                 break
         return math.exp(place)
+
+    def _mended_part(self) -> float:
+        """Loss after the first whole result's refit, or descent, over the loss before it, as far as it is known before."""
+        if self.steps:
+            return DISTILLED
+        first = self.effort.mended if len(self.path.cameras) <= self.effort.few else MENDED
+        return first * FURTHER ** (self.effort.refit_rounds - 1)
 
     def _choice(self, multiplier: float) -> tuple[Kept, Steps]:
         """What a multiplier keeps, with the colours of the last refit, and the grid steps."""
