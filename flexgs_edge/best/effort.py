@@ -13,6 +13,9 @@ LEAST_VIEWS = 6
 """Poses a step of the refit at the least: steps after 3 poses each fitted fox's 24 scored ones ever better and all others ever
 worse."""
 
+MENDED = 0.66
+"""Loss after the first round of the colour refit over the loss before it, until a whole result tells (fox .61 to .75, the sample
+.8 to .9)."""
 LARGEST_STEP = 4
 """Most pixels from one to the next: splats of one or two pixels must not fall between them in every view."""
 
@@ -35,8 +38,8 @@ class Effort:
         Excess (log of loss over limit) that ends the search when it is no farther below the target: 0.03 are about 1.5 % of
         the bytes.
     few : int
-        Scored poses at the least, where there are as many. Bytes at 1 dB (balanced), from results nearby: fox from all 43
-        poses 541 kB, from 32 534 kB; the sample from all 70 111 kB, from 32 114 kB.
+        Scored poses at the least, where there are as many. Balanced, at a target of 1 dB: fox from all 43 poses 563 kB at 0.93
+        dB, from 32 582 kB at 0.86; the sample from all 70 119 kB at 0.87 dB, from 32 121 kB at 0.90.
     views : int
         Scored poses at the most: more than `few` where these have too few pixels.
     pixels : int
@@ -45,8 +48,7 @@ class Effort:
         123 s; at every second (33) 546 kB, 75 s; every third (15) 8 % more bytes. The sample at every second (92) and third
         (41): 121 and 119 kB.
     mended : float
-        Loss after the first round of the colour refit over the loss before it, until a whole result tells, with no more poses
-        than `few`: the fewer pixels are fitted, the less of it holds elsewhere.
+        `MENDED` with no more poses than `few`: the fewer pixels are fitted, the less of it holds elsewhere.
     passes : float
         Times that the descent to the first whole result looks at every scored pose; 0: colours are refitted instead.
     """
@@ -59,7 +61,7 @@ class Effort:
     few: int
     views: int
     pixels: int
-    mended: float = 0.66
+    mended: float = MENDED
     passes: float = 0.0
 
     def poses_of(self, pixels: Sequence[int], count: int) -> int:

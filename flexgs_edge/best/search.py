@@ -19,7 +19,7 @@ import numpy as np
 from flexgs_edge.adapt import Measurement, Target
 from flexgs_edge.adapt.line import AIM, next_point
 from flexgs_edge.best.choice import BitModel, choose, drop_bands
-from flexgs_edge.best.effort import Effort
+from flexgs_edge.best.effort import MENDED, Effort
 from flexgs_edge.best.kept import Kept, Mended
 from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
 from flexgs_edge.best.results import (
@@ -56,9 +56,6 @@ the search starts."""
 FINE_COLOUR = 2.0**-8
 """Colour steps before the refit, as a share of the final ones: only geometry shall move."""
 MOST_ROUNDS = 24
-MENDED = 0.66
-"""Loss after the first round of the colour refit over the loss before it, until a whole result tells (fox .61 to .75, the sample
-.8 to .9), with more poses than the effort's few: with those `Effort.mended`."""
 FURTHER = 0.92
 """Loss after each further round of the colour refit over the round before it (fox .92)."""
 DRIFT = -0.12
