@@ -19,8 +19,10 @@ import pytest
 
 from flexgs_edge import cli
 from flexgs_edge.adapt import MaxDrop, MaxSize
+from flexgs_edge.best.path import PrunePath
 from flexgs_edge.cli.study.stability import command
 from flexgs_edge.errors import InputError
+from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.progress import SILENT
 from flexgs_edge.render import Renderer
@@ -30,11 +32,12 @@ from flexgs_edge.scene import MemorySource
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.study.bench import Bench, Setting, open_bench
 from flexgs_edge.study.charts import BarChart, LineChart, Series, draw
-from flexgs_edge.study.cliffs import heldout, moves, poses, removal, searches, strays
+from flexgs_edge.study.cliffs import heldout, moves, ours, poses, removal, searches, strays
 from flexgs_edge.study.cliffs.amounts import QUICK
 from flexgs_edge.study.cliffs.baselines import half_positions, tensor_rounded
 from flexgs_edge.study.cliffs.bits import BEST, CHANNEL, TENSOR
 from flexgs_edge.study.cliffs.breaks import BREAK, LOST, Outcome, curve, of_source, where_it_breaks
+from flexgs_edge.study.cliffs.ours import Whole
 from flexgs_edge.study.cliffs.similarity import NO_TURN, Similarity
 from flexgs_edge.study.stability import StabilityStudy, study_stability
 from kernel_fixtures import large_budget, open_form
@@ -182,6 +185,25 @@ def test_the_worst_view_and_the_views_that_did_not_decide(study: Study, bench: B
             (even * number(row["even"]) + (count - even) * number(row["odd"])) / count, abs=2e-4
         )
     assert number(rows[-2]["even"]) <= 1.0
+
+
+def test_a_bit_is_worth_the_same_in_each_pixel_of_fewer(bench: Bench) -> None:
+    """Poses of a fourth of the pixels get a fourth of the multiplier."""
+    given: list[float] = []
+
+    def whole_at(bench: Bench, path: PrunePath, judge: Judge, multiplier: float) -> Whole:
+        given.append(multiplier)
+        return ours.whole_at(bench, path, judge, multiplier)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(moves, "whole_at", whole_at)
+        for width in (40, 20):
+            place = moves.Place(
+                bench, moves.MOVES[moves.AS_IT_IS][0], bench.scene.source, replace(AMOUNTS, few_width=width)
+            )
+            with place.judge() as judge:
+                place.best(judge, 1e-6)
+    assert given[0] == pytest.approx(4 * given[1], rel=0.05)
 
 
 def test_moved_scenes_are_compressed_alike_and_half_positions_are_not(study: Study) -> None:

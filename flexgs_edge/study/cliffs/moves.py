@@ -26,7 +26,7 @@ from flexgs_edge.study.charts import BarChart
 from flexgs_edge.study.cliffs.amounts import Amounts
 from flexgs_edge.study.cliffs.baselines import half_positions
 from flexgs_edge.study.cliffs.breaks import BREAK, LOST, number
-from flexgs_edge.study.cliffs.ours import Whole, walked, whole_at
+from flexgs_edge.study.cliffs.ours import Whole, scored_pixels, walked, whole_at
 from flexgs_edge.study.cliffs.poses import evenly
 from flexgs_edge.study.cliffs.similarity import NO_TURN, Similarity
 from flexgs_edge.study.experiment import Experiment
@@ -117,11 +117,11 @@ class Place:
             judge.close()
             self.renderer.release()
 
-    def best(self, judge: Judge, multiplier: float) -> Found:
-        """The measured method at a multiplier."""
+    def best(self, judge: Judge, price: float) -> Found:
+        """The measured method where a bit is worth so much squared error of each pixel that is scored."""
         train = self.views.of(self.views.train)
         with walked(self.bench, self.source, train, self.renderer) as path:
-            whole = whole_at(self.bench, path, judge, multiplier)
+            whole = whole_at(self.bench, path, judge, price * scored_pixels(path))
         return Found(whole.rows, whole.size, self._fidelity(judge, whole.source))
 
     def paper(self, judge: Judge, choice: Choice) -> Found:
@@ -157,11 +157,7 @@ def few_views(bench: Bench, amounts: Amounts) -> tuple[list[Camera], list[Camera
 def moves(bench: Bench, ours: Whole, amounts: Amounts, folder: Path) -> Experiment:
     """Every move by every method, against the scene as it is."""
     train, _ = few_views(bench, amounts)
-    full = bench.views.of(bench.views.train)[0]
-    # Squared errors are sums over poses and pixels: here are fewer of both.
-    multiplier = (
-        ours.multiplier * len(train) / ours.views * train[0].width * train[0].height / (full.width * full.height)
-    )
+    price = ours.multiplier / ours.pixels
     rows: list[dict[str, Cell]] = []
     names = (AS_IT_IS, *amounts.moves)
     still: dict[str, Found] = {}
@@ -176,7 +172,7 @@ def moves(bench: Bench, ours: Whole, amounts: Amounts, folder: Path) -> Experime
             # What the file itself has lost, before any method sees it.
             input_fidelity = mean_psnr([psnr(mse(a, b)) for a, b in zip(seen, pictures)])
             runs: dict[str, Callable[[], Found]] = {
-                BEST: lambda: place.best(judge, multiplier),  # noqa: B023
+                BEST: lambda: place.best(judge, price),  # noqa: B023
                 PAPER: lambda: place.paper(judge, bench.search.chosen.choice),  # noqa: B023
                 HALF: lambda: place.half(judge),  # noqa: B023
             }

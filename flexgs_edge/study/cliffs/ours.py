@@ -36,8 +36,8 @@ class Whole:
         Squared error that a bit was worth.
     rows : np.ndarray
         [n] i64, rows of the scene that were kept, ascending.
-    views : int
-        Poses that were scored.
+    pixels : int
+        Pixels that were scored, of all poses: squared errors, and the multiplier with them, are sums over these.
     reached : bool
         The target holds.
     """
@@ -46,7 +46,7 @@ class Whole:
     size: int
     multiplier: float
     rows: np.ndarray
-    views: int
+    pixels: int
     reached: bool
 
     @property
@@ -87,6 +87,11 @@ def walked(
         yield path
 
 
+def scored_pixels(path: PrunePath) -> int:
+    """Pixels that a path looks at in all its poses."""
+    return sum(camera.width * camera.height for camera in path.cameras)
+
+
 def search(bench: Bench, path: PrunePath, target: Target, judge: Judge | None = None) -> Whole:
     """The search for a target along a path; the closest result where it cannot be met."""
     judge = judge or bench.judge
@@ -118,4 +123,4 @@ def _search(bench: Bench, path: PrunePath, judge: Judge, renderer: Renderer) -> 
 
 def _whole(made: FixedSearch, grid: GridScene, multiplier: float, reached: bool) -> Whole:
     rows = made.path.scene_rows(made.kept(multiplier).rows)
-    return Whole(grid, coded_size(grid, {}), multiplier, rows, len(made.path.cameras), reached)
+    return Whole(grid, coded_size(grid, {}), multiplier, rows, scored_pixels(made.path), reached)
