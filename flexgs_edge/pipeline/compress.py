@@ -36,7 +36,7 @@ from flexgs_edge.pipeline.plan import Plan, make_settings
 from flexgs_edge.pipeline.poses import scored_poses
 from flexgs_edge.pipeline.records import scene_info, step_words, views_info
 from flexgs_edge.pipeline.report import Reporter
-from flexgs_edge.pipeline.room import choose_room, open_checkpoint
+from flexgs_edge.pipeline.room import choose_room, open_checkpoint, prepare_memory
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, run_info
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice, nonzero_sh, order_from_scores
@@ -97,6 +97,7 @@ def compress(
         views = find_views(options, companions, scene.source)
         # Before any work: the words of the scores file and of the views must fit together.
         plan = Plan.make(options, scene, views)
+        prepare_memory(scene.source, options, budget)
         scores = (
             None if plan.computes_scores or not plan.needs_scores else load_scores(options.score, scene.source.count)
         )

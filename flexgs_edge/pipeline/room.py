@@ -9,7 +9,7 @@ from pathlib import Path
 from flexgs_edge.best.checkpoint import Checkpoint
 from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.path import PARTS, sums_room
-from flexgs_edge.budget import MemoryBudget, format_size
+from flexgs_edge.budget import MemoryBudget, format_size, return_freed_memory
 from flexgs_edge.cameras import Camera
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.refit import descent_bytes
@@ -45,6 +45,13 @@ SPILLED_ROW_BYTES = 24
 """Bytes that each row of a scene in scratch files takes of memory for a moment: choosing the cheapest rows, and lists of rows."""
 SPOOL_ROW_BYTES = 52
 """Bytes that each row that a view shows takes of the scratch file for its sums (`ViewSums`)."""
+
+
+def prepare_memory(source: SceneSource, options: CompressOptions, budget: MemoryBudget) -> None:
+    """Have freed memory returned, where the path of a search is not going to fit: to be called before the device is opened."""
+    rows = source.count
+    if options.method == "best" and rows * row_bytes(source.sh_degree, EFFORTS[options.effort].keep) > budget.free:
+        return_freed_memory()
 
 
 def choose_room(
