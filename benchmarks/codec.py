@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, backend_of, check, parse
-from flexgs_edge.codec import GridSource, channel_bytes, verify, write_grid
+from flexgs_edge.codec import GridSource, channel_bytes, coded_size, verify, write_grid
+from flexgs_edge.codec.coder import encode_grid
 from flexgs_edge.grid import Steps, from_grid, to_grid
 from flexgs_edge.pipeline.decompress import decompress
-from flexgs_edge.pipeline.grid_coder import size_and_bits
+from flexgs_edge.pipeline.grid_coder import bit_model
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.ply import PlySource
 
@@ -95,7 +96,8 @@ def main() -> None:
 
         rate("codec: to grid", lambda: to_grid(planes, degrees, steps, np.zeros(3)))
         rate("codec: encode to a file", lambda: write_grid(path, grid, {}, force=True))
-        rate("codec: size and bits", lambda: size_and_bits(grid))
+        rate("codec: bits", lambda: bit_model(grid, encode_grid(grid)))
+        rate("codec: size", lambda: coded_size(grid, {}))
         rate("codec: positions only", lambda: GridSource(path).read(slice(0, count), ["means"]))
         rate("codec: decode", lambda: GridSource(path).grid())
         if backend.threads:

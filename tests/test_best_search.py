@@ -74,10 +74,13 @@ class World:
         self.path = FakePath()
         self.bits = BitModel(40.0, (12.0,))
 
-    def size_of(self, grid: GridScene) -> tuple[int, BitModel]:
+    def size_of(self, grid: GridScene) -> int:
         self.grids.append(grid)
         assert self.multiplier is not None
-        return round(self.size(self.multiplier)), self.bits
+        return round(self.size(self.multiplier))
+
+    def bits_of(self, grid: GridScene) -> BitModel:
+        return self.bits
 
     def measure(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         if self.multiplier is None:  # the walk down, before anything was coded: pruning alone
@@ -110,7 +113,7 @@ def search(
     words = {"effort": EFFORT, "refit": False, **words}
     World.multiplier = None
     world.path = path or FakePath()
-    found = RateSearch(world.path, world.size_of, world.measure, **words)  # type: ignore[arg-type]
+    found = RateSearch(world.path, world.size_of, world.bits_of, world.measure, **words)  # type: ignore[arg-type]
     return found.run(target, best_effort)
 
 

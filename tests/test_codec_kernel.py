@@ -15,7 +15,7 @@ from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.codec import GridSource, write_grid
 from flexgs_edge.codec.chunk_kernel import ChunkKernel
 from flexgs_edge.codec.coder import CHUNK_ROWS, decode_chunk, encode_grid
-from flexgs_edge.codec.container2 import GridContainer, coded_parts
+from flexgs_edge.codec.container2 import GridContainer, coded_size
 from flexgs_edge.codec.encode_kernels import CountKernel, device_bytes
 from flexgs_edge.codec.model import Model
 from flexgs_edge.codec.walk import ChunkCodes
@@ -115,7 +115,7 @@ def test_the_same_file(name: str, form: str, files: dict[str, Path], tmp_path: P
     grid, rows = GRIDS[name]
     size = write_grid(tmp_path / "a.fgs", grid, {}, chunk_rows=rows, device=open_form(form))
     assert (tmp_path / "a.fgs").read_bytes() == files[name].read_bytes()
-    assert coded_parts(grid, {}, rows, open_form(form))[0] == size
+    assert coded_size(grid, {}, rows, open_form(form)) == size
 
 
 def test_no_rows(tmp_path: Path) -> None:
@@ -151,13 +151,12 @@ def test_a_chunk_of_many_escapes_is_left_to_numpy(tmp_path: Path, monkeypatch: p
 
 
 def test_when_a_device_codes() -> None:
-    grid = replace(GRIDS["one row"][0], count=DEVICE_ROWS)
     backend = open_form("w16")
-    assert coding_device(backend, large_budget(), grid) is backend
-    assert coding_device(backend, MemoryBudget(1 << 20), grid) is None
-    assert coding_device(backend, large_budget(), replace(grid, count=DEVICE_ROWS - 1)) is None
+    assert coding_device(backend, large_budget(), DEVICE_ROWS, 3) is backend
+    assert coding_device(backend, MemoryBudget(1 << 20), DEVICE_ROWS, 3) is None
+    assert coding_device(backend, large_budget(), DEVICE_ROWS - 1, 3) is None
     for other in (None, open_form("gpu"), open_form("numpy")):
-        assert coding_device(other, large_budget(), grid) is None
+        assert coding_device(other, large_budget(), DEVICE_ROWS, 3) is None
 
 
 @pytest.mark.parametrize("name", ["both", "degree 4"])

@@ -274,7 +274,8 @@ def test_fidelity_on_training_poses(project: Path, plain: CompressResult) -> Non
     cameras = [c for i, c in enumerate(read_cameras(project.parent / "cameras.json")) if i % 4]
     assert len(cameras) <= FIT_VIEWS
     renderer = Renderer(open_form("w16"), large_budget())
-    poses = TrainingPoses(renderer, source, cameras)
+    with renderer.load(source) as scene:
+        poses = TrainingPoses(renderer, scene, cameras)
     with renderer.load(coded) as scene:
         found = poses.fidelity(scene)
     poses.close()

@@ -12,22 +12,25 @@ import numpy as np
 import pytest
 
 from flexgs_edge.budget import MemoryBudget
-from flexgs_edge.codec import GridSource, coded_size, file_version, verify
+from flexgs_edge.codec import GridSource, file_version, verify
+from flexgs_edge.codec.coder import encode_grid
 from flexgs_edge.errors import BudgetError, InputError, TargetError
 from flexgs_edge.grid import from_grid
 from flexgs_edge.pipeline.best import alive
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.decompress import decompress
 from flexgs_edge.pipeline.evaluate import evaluate
-from flexgs_edge.pipeline.grid_coder import SETTINGS_MOST, size_and_bits
+from flexgs_edge.pipeline.grid_coder import SETTINGS_MOST, GridCoder, bit_model
 from flexgs_edge.pipeline.info import info
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.trim import trim
+from flexgs_edge.render import Renderer
 from flexgs_edge.report.result import CompressResult
 from flexgs_edge.report.summary import compress_text
 from flexgs_edge.scene import MemorySource, open_scene, write_ply
 from flexgs_edge.scene.fields import FIELD
 from grid_scenes import make_grid
+from kernel_fixtures import large_budget, open_form
 from synthetic import random_scene
 from tiny_project import COUNT, make_project
 
@@ -95,7 +98,8 @@ def test_the_settings_fit_the_room_that_the_search_counts(sample: tuple[Path, Co
     header = len(json.dumps(source.settings))
     assert header < SETTINGS_MOST
     # What the search counted is never below the file: a size target cannot be broken by its settings.
-    counted, bits = size_and_bits(source.grid())
+    coder = GridCoder(Renderer(open_form("w16"), large_budget()))
+    counted, bits = coder.size(source.grid()), coder.bits(source.grid())
     assert 0 <= counted - sample[1].size <= SETTINGS_MOST
     assert bits.base > 20 and all(band > 0 for band in bits.bands)
 
@@ -301,14 +305,17 @@ def test_nothing_is_left_behind(project: Path, tmp_path: Path, monkeypatch: pyte
 
 def test_bits_of_a_grid_add_up_to_its_size() -> None:
     grid = make_grid(700, 3)
-    size, bits = size_and_bits(grid)
-    assert size == coded_size(grid, {}) + SETTINGS_MOST
+    encoded = encode_grid(grid)
+    bits = bit_model(grid, encoded)
     rows = [np.count_nonzero(grid.sh_degrees >= degree) for degree in (1, 2, 3)]
     total = bits.base * 700 + sum(band * count for band, count in zip(bits.bands, rows, strict=True))
-    assert total == pytest.approx(8 * size, rel=1e-9)
-    plain, bits = size_and_bits(make_grid(50, 0))
-    assert bits.bands == () and bits.base * 50 == pytest.approx(8 * plain)
-    assert size_and_bits(make_grid(0, 0))[0] > 0 and from_grid(make_grid(0, 0))["means"].shape == (3, 0)
+    coded = len(encoded.model.to_bytes()) + sum(map(len, encoded.streams()))
+    assert total == pytest.approx(8 * encoded.information, rel=1e-9) and 0.95 * coded < encoded.information < coded
+    plain = encode_grid(make_grid(50, 0))
+    bits = bit_model(make_grid(50, 0), plain)
+    assert bits.bands == () and bits.base * 50 == pytest.approx(8 * plain.information)
+    nothing = make_grid(0, 0)
+    assert bit_model(nothing, encode_grid(nothing)).bands == () and from_grid(nothing)["means"].shape == (3, 0)
 
 
 def test_what_was_compressed_before_stays_as_it_is(

@@ -61,7 +61,9 @@ def test_slopes_of_a_moved_scene_are_the_same() -> None:
     slopes = []
     for source, view, scale in ((scene, camera, 1.0), (move.scene(scene), move.camera(camera), FACTOR)):
         renderer = Renderer(open_form("w8"), large_budget(), near=DEFAULT_NEAR * scale)
-        found = probe_slopes(renderer, source.read(slice(0, source.count), list(FIELD)), source.origin, [view]).per_row
+        found = probe_slopes(
+            renderer, source.read(slice(0, source.count), list(FIELD)), source.origin, [view], 1
+        ).per_row
         slopes.append({**found, "position": found["position"] * scale**2})
         renderer.release()
     assert slopes[1] == pytest.approx(slopes[0], rel=0.01)

@@ -49,6 +49,9 @@ class Effort:
         (41): 121 and 119 kB.
     mended : float
         `MENDED` with no more poses than `few`: the fewer pixels are fitted, the less of it holds elsewhere.
+    probed : int
+        Poses that trial grids are judged on, at most. 4 instead of 8 spare fast a tenth of its time; 2 % fewer bytes on fox, as
+        many on the sample: chance.
     passes : float
         Times that the descent to the first whole result looks at every scored pose; 0: colours are refitted instead.
     """
@@ -62,6 +65,7 @@ class Effort:
     views: int
     pixels: int
     mended: float = MENDED
+    probed: int = 8
     passes: float = 0.0
 
     def poses_of(self, pixels: Sequence[int], count: int) -> int:
@@ -95,7 +99,9 @@ def _lattice(camera: Camera, step: int) -> int:
 
 
 EFFORTS = {
-    "fast": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=1, close=0.08, few=20, views=48, pixels=12, mended=0.84),
+    "fast": Effort(
+        keep=0.8, refit_rounds=1, subsets=7, steps=1, close=0.08, few=20, views=48, pixels=12, mended=0.84, probed=4
+    ),
     "balanced": Effort(
         keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.05, few=32, views=96, pixels=24, mended=0.7
     ),

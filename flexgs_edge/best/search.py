@@ -225,7 +225,9 @@ class RateSearch(MultiplierSearch[GridScene]):
     ----------
     path : PrunePath
     size_of : callable
-        Exact bytes of a grid's file, and the coder's bit model.
+        Exact bytes of a grid's file.
+    bits_of : callable
+        What the coder takes for the Gaussians of a grid.
     measure : callable
         Quality of a grid's decoded planes.
     steps : int
@@ -235,7 +237,8 @@ class RateSearch(MultiplierSearch[GridScene]):
     def __init__(
         self,
         path: PrunePath,
-        size_of: Callable[[GridScene], tuple[int, BitModel]],
+        size_of: Callable[[GridScene], int],
+        bits_of: Callable[[GridScene], BitModel],
         measure: Measure,
         effort: Effort,
         refit: bool = True,
@@ -243,7 +246,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         steps: int = 0,
     ) -> None:
         super().__init__(path, measure, effort, on_step)
-        self.size_of, self.refit, self.steps = size_of, refit, steps
+        self.size_of, self.bits_of, self.refit, self.steps = size_of, bits_of, refit, steps
         if steps:
             self.pruned_part, self.keeps_best = PRUNED_DISTILLED, True
         self._slopes: Slopes | None = None
@@ -253,7 +256,7 @@ class RateSearch(MultiplierSearch[GridScene]):
 
     def _calibrate(self, multiplier: float) -> None:
         """Ask the coder what Gaussians cost near the answer. Once: or every step would search another function."""
-        _, self.bits = self.size_of(self._unmended(multiplier))
+        self.bits = self.bits_of(self._unmended(multiplier))
 
     def _unmended(self, multiplier: float) -> GridScene:
         kept, steps = self._choice(multiplier)
@@ -263,7 +266,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         """The excess of a multiplier's result without a refit of its own."""
         grid = self._unmended(multiplier)
         if target.limit_bytes is not None:
-            return target.excess(self.size_of(grid)[0], None)
+            return target.excess(self.size_of(grid), None)
         return target.excess(0, self.measure(values_of(grid, self.path.room), estimate=True))
 
     def _aim(self, multiplier: float, steps: Sequence[RateStep], target: Target) -> float:
@@ -312,7 +315,9 @@ class RateSearch(MultiplierSearch[GridScene]):
         snapshot = self.path.snapshots[kept.snapshot]
         if self._slopes is None:
             # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
-            self._slopes = probe_slopes(self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras)
+            self._slopes = probe_slopes(
+                self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras, self.effort.probed
+            )
         steps = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
         kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0), self.path.room)
         return kept, holdable(steps, kept.planes)
@@ -321,7 +326,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         started = time.perf_counter()
         kept, steps = self._choice(multiplier)
         grid = self._distilled(multiplier, kept, steps) if self.steps else self._finish(kept, steps)
-        size, _ = self.size_of(grid)
+        size = self.size_of(grid)
         measurement = self.measure(values_of(grid, self.path.room))
         excess = target.excess(size, measurement)
         sh_count = int((kept.degrees > 0).sum())

@@ -25,8 +25,6 @@ from flexgs_edge.scratch import BLOCK_ROWS, blocks
 GEOMETRY = ("position", "scale", "rotation", "opacity")
 VALUES = {"position": 3, "scale": 3, "rotation": 3, "opacity": 1}
 CHANGES = {"position": "means", "scale": "log_scales", "rotation": "quats", "opacity": "opacity_logits"}
-PROBE_VIEWS = 8
-"""Poses that the trial grids are judged on, evenly spread."""
 SMALLEST_THREE = 1.051
 """Mean square of the turn that errors of three stored components make, the fourth following from them, over theirs: mean of
 1 + |xyz|^2 / (3 w^2) over random rotations in their canonical form."""
@@ -51,11 +49,11 @@ class Slopes:
 
 
 def probe_slopes(
-    renderer: Renderer, planes: dict[str, np.ndarray], origin: np.ndarray, cameras: Sequence[Camera]
+    renderer: Renderer, planes: dict[str, np.ndarray], origin: np.ndarray, cameras: Sequence[Camera], most: int
 ) -> Slopes:
-    """Measure the slopes of the geometry on a few poses."""
-    count = planes["means"].shape[1]
-    views = [cameras[i * len(cameras) // min(PROBE_VIEWS, len(cameras))] for i in range(min(PROBE_VIEWS, len(cameras)))]
+    """Measure the slopes of the geometry on `most` poses at the most, evenly spread among the scored ones."""
+    count, some = planes["means"].shape[1], min(most, len(cameras))
+    views = [cameras[i * len(cameras) // some] for i in range(some)]
     with renderer.load(MemorySource(planes, origin=origin)) as scene:
         reference = [to_half(renderer.render(scene, camera)) for camera in views]
     smallest = np.concatenate(
@@ -69,8 +67,8 @@ def probe_slopes(
         field = CHANGES[kind]
         moved = {**planes, field: renderer.room.empty(planes[field].shape, np.float32)}
         for rows in blocks(count, BLOCK_ROWS, *(planes[name] for name in set(CHANGES.values()))):
-            some = {name: values[:, rows] for name, values in planes.items()}
-            moved[field][:, rows] = _on_trial_grid(some, kind, np.float32(trial[kind]))
+            part = {name: values[:, rows] for name, values in planes.items()}
+            moved[field][:, rows] = _on_trial_grid(part, kind, np.float32(trial[kind]))
         with renderer.load(MemorySource(moved, origin=origin)) as scene:
             error = sum(_squared_error(renderer.render(scene, c), r) for c, r in zip(views, reference, strict=True))
         per_row[kind] = error * len(cameras) / len(views) / (count * trial[kind] ** 2)

@@ -91,30 +91,13 @@ def coded_size(
     settings: Mapping[str, Any],
     chunk_rows: int = CHUNK_ROWS,
     device: Device | None = None,
+    encoded: Encoded | None = None,
     room: Room = MEMORY,
 ) -> int:
     """Exact bytes of the file that `write_grid` makes of these arguments."""
-    return coded_parts(grid, settings, chunk_rows, device, room=room)[0]
-
-
-def coded_parts(
-    grid: GridScene,
-    settings: Mapping[str, Any],
-    chunk_rows: int = CHUNK_ROWS,
-    device: Device | None = None,
-    encoded: Encoded | None = None,
-    room: Room = MEMORY,
-) -> tuple[int, float]:
-    """Exact bytes of the file that `write_grid` makes of these arguments, and how many of them the SH take.
-
-    The SH take the information in their symbols and in the degrees of the rows, and their groups' part of the model:
-    what coding the scene again without them would save, but for the header's and the lanes' bytes.
-    """
     encoded = encoded or encode_grid(grid, chunk_rows, device, room)
-    model_bytes = len(encoded.model.to_bytes())
-    header = _header(grid, encoded, model_bytes, settings, chunk_rows)
-    size = header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes
-    return size, encoded.sh_bytes
+    header = _header(grid, encoded, len(encoded.model.to_bytes()), settings, chunk_rows)
+    return header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes
 
 
 def trim_container(
@@ -308,7 +291,6 @@ def channel_bytes(
 __all__ = [
     "GridContainer",
     "channel_bytes",
-    "coded_parts",
     "coded_size",
     "trim_container",
     "verify_grid",

@@ -13,7 +13,6 @@ import numpy as np
 
 from flexgs_edge.adapt import Measurement, Scored, SearchResult, Step, Target
 from flexgs_edge.best.checkpoint import Checkpoint
-from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.layers import assign_layers
 from flexgs_edge.best.path import PrunePath
@@ -56,15 +55,15 @@ def grid_search(
 ) -> SearchMaker[GridScene]:
     """Searches for the grid of a `.fgs`."""
 
-    def size_of(grid: GridScene) -> tuple[int, BitModel]:
-        size, bits = coder.size_and_bits(grid)
-        return (size if options.layers == 1 else round(LAYERS_COST * size)), bits
+    def size_of(grid: GridScene) -> int:
+        size = coder.size(grid)
+        return size if options.layers == 1 else round(LAYERS_COST * size)
 
     plan = EFFORTS[options.effort]
 
     def make(path: PrunePath, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
         steps = distil_steps(options, len(path.cameras))
-        return search(path, size_of, measure, plan, options.refit, report, steps)
+        return search(path, size_of, coder.bits, measure, plan, options.refit, report, steps)
 
     return make
 
@@ -142,7 +141,7 @@ def kept_as_it_is(
     grid = on_grid(source.read(slice(0, source.count), list(FIELD)), steps, source.origin)
     if grid is None:
         return None
-    found, _ = coder.size_and_bits(grid)
+    found = coder.size(grid)
     if (found if options.layers == 1 else round(LAYERS_COST * found)) > limit:
         return None
     with renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
@@ -280,7 +279,7 @@ def layered(
     return assign_layers(
         grid,
         options.layers,
-        GridCoder(renderer).size_and_bits(grid)[1],
+        GridCoder(renderer).bits(grid),
         renderer,
         poses.cameras,
         progress,

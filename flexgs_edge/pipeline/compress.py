@@ -23,7 +23,7 @@ from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, values_of
 from flexgs_edge.pipeline.best import grid_search, kept_as_it_is, layered, search_best, search_files
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
-from flexgs_edge.pipeline.decompress import decoded
+from flexgs_edge.pipeline.decompress import ahead, decoded
 from flexgs_edge.pipeline.doubts import TrainingPoses, doubts
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
@@ -37,7 +37,7 @@ from flexgs_edge.pipeline.poses import scored_poses
 from flexgs_edge.pipeline.records import scene_info, step_words, views_info
 from flexgs_edge.pipeline.report import Reporter
 from flexgs_edge.pipeline.room import choose_room, open_checkpoint, prepare_memory
-from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, run_info
+from flexgs_edge.pipeline.workspace import Stopwatch, Workspace, coding_device, run_info
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.prune import Choice, nonzero_sh, order_from_scores
 from flexgs_edge.quantize import QuantizedScene
@@ -107,7 +107,7 @@ def compress(
         workspace = None if views is None else stack.enter_context(Workspace(options, budget, clock, options.cluster))
         if reporter is not None and views is not None:
             reporter.reserve(budget, views, plan.report)
-        job = _Job(options, scene, views, plan, budget, clock, workspace, progress, reporter, format)
+        job = _Job(stack, options, scene, views, plan, budget, clock, workspace, progress, reporter, format)
         result = job.run(target_path, scores)
     if reporter is not None:
         if target_path is not None and format is None:
@@ -121,6 +121,7 @@ class _Job:
 
     def __init__(
         self,
+        held: ExitStack,
         options: CompressOptions,
         scene: Scene,
         views: Views | None,
@@ -132,7 +133,7 @@ class _Job:
         reporter: Reporter | None = None,
         format: Format | None = None,
     ) -> None:
-        self.reporter, self.format = reporter, format
+        self.held, self.reporter, self.format = held, reporter, format
         self.options, self.scene, self.views, self.plan = options, scene, views, plan
         self.budget, self.clock, self.workspace, self.progress = budget, clock, workspace, progress
         self.source = scene.source
@@ -140,6 +141,7 @@ class _Job:
         self.sensitivity: list[Sensitivity] = []
         self.scores_reused = False
         self.room: Room = MEMORY
+        self.training: TrainingPoses | None = None
         self.trained: float | None = None
 
     def run(self, output: Path | None, scores: np.ndarray | None) -> CompressResult:
@@ -297,7 +299,8 @@ class _Job:
     def _measure_source(self, source: SceneSource, report: Judge) -> Quality:
         assert self.workspace is not None
         renderer = self.workspace.renderer
-        return self._compare(lambda: renderer.load(source), report)
+        with ahead(source, self.budget, coding_device(renderer.backend, self.budget, source.count, source.sh_degree)):
+            return self._compare(lambda: renderer.load(source), report)
 
     def _judges(self) -> tuple[Judge | None, Judge | None]:
         """The judge that decides and the one that reports; one and the same unless the training poses decide."""
@@ -327,6 +330,10 @@ class _Job:
                 report.prepare(device_scene, self.progress)
                 if decide is not report:
                     decide.prepare(device_scene, self.progress)
+                if self.views.train and self.plan.report == self.views.held_out:
+                    training = self.views.of(self.views.train)
+                    self.training = TrainingPoses(renderer, device_scene, training, self.progress)
+                    self.held.callback(self.training.close)
             if self.plan.computes_scores and scores is None:
                 cameras = self.views.of(self.views.train)
                 LOG.info("scoring %d Gaussians over %d training poses", self.source.count, len(cameras))
@@ -383,20 +390,12 @@ class _Job:
 
     def _compare(self, load: Callable[[], DeviceScene], report: Judge) -> Quality:
         """Quality of what `load` brings to the device, over the views that report and (fidelity only) some training poses."""
-        assert self.workspace is not None and self.views is not None
-        views, renderer = self.views, self.workspace.renderer
-        with self.clock.stage("measure"), ExitStack() as held:
-            trained = None
-            if views.train and self.plan.report == views.held_out:
-                # Before the result is there: it is brought to the device, and decoded, only once.
-                trained = TrainingPoses(renderer, self.source, views.of(views.train), self.progress)
-                held.callback(trained.close)
-            with load() as scene:
-                quality = report.compare(scene, with_ssim=True, progress=self.progress)
-                if self.reporter is not None:
-                    self.reporter.look(report, scene, quality, self.clock, self.progress)
-                if trained is not None:
-                    self.trained = trained.fidelity(scene)
+        with self.clock.stage("measure"), load() as scene:
+            quality = report.compare(scene, with_ssim=True, progress=self.progress)
+            if self.reporter is not None:
+                self.reporter.look(report, scene, quality, self.clock, self.progress)
+            if self.training is not None:
+                self.trained = self.training.fidelity(scene)
         return quality
 
     def _result(

@@ -12,7 +12,6 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import DeviceScene, Renderer
 from flexgs_edge.render.quality import mean_psnr, mse, psnr
 from flexgs_edge.render.targets import TargetViews
-from flexgs_edge.scene import SceneSource
 
 FIT_VIEWS = 8
 """Training poses that the finished file is compared on, evenly spread."""
@@ -33,21 +32,19 @@ class TrainingPoses:
     Parameters
     ----------
     renderer : Renderer
-        Draws the original from them at once.
-    source : SceneSource
-        The original.
+    original : DeviceScene
+        Drawn from them at once.
     cameras : sequence of Camera
         All training poses.
     """
 
     def __init__(
-        self, renderer: Renderer, source: SceneSource, cameras: Sequence[Camera], progress: Progress = SILENT
+        self, renderer: Renderer, original: DeviceScene, cameras: Sequence[Camera], progress: Progress = SILENT
     ) -> None:
         count = min(FIT_VIEWS, len(cameras))
         self._renderer = renderer
         self._cameras = [cameras[i * len(cameras) // count].every(FIT_STEP) for i in range(count)]
-        with renderer.load(source) as scene:
-            self._targets = TargetViews.of(renderer, scene, self._cameras, progress=progress)
+        self._targets = TargetViews.of(renderer, original, self._cameras, progress=progress)
 
     def fidelity(self, scene: DeviceScene) -> float | None:
         """Fidelity of `scene`, mean over the poses; `None` when all are identical."""

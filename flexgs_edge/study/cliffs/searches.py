@@ -125,7 +125,7 @@ class _Pretended(RateSearch):
 
     def __init__(self, world: World, effort: str) -> None:
         nothing: Any = None
-        super().__init__(nothing, nothing, nothing, EFFORTS[effort], refit=False)
+        super().__init__(nothing, nothing, nothing, nothing, EFFORTS[effort], refit=False)
         self.world = world
 
     def _start(self, target: Target) -> float:
