@@ -18,7 +18,7 @@ from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses
 from flexgs_edge.best.kept import Mended
 from flexgs_edge.best.path import Snapshot, take_rows
-from flexgs_edge.best.search import DISTILLED, EXTRA_STEPS, RateResult, RateSearch, RateStep
+from flexgs_edge.best.search import DISTILLED, EXTRA_STEPS, RateResult, RateSearch, RateStep, rate_from
 from flexgs_edge.best.steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps
@@ -269,6 +269,12 @@ def test_efforts_grow() -> None:
     assert EFFORTS["max"].passes > 0 == fast.passes == balanced.passes == thorough.passes
 
 
+def test_descents_with_less_to_mend_go_at_smaller_rates() -> None:
+    assert rate_from(30.0) == rate_from(41.0) == rate_from(None) == 1.0
+    assert rate_from(47.0) == pytest.approx(0.5, abs=0.002)  # half the error of 41 dB
+    assert rate_from(53.0) == pytest.approx(0.25, abs=0.002) and rate_from(90.0) == 0.25
+
+
 @pytest.mark.parametrize("found", [0.2, 0.33, 0.5])
 def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: float) -> None:
     """The first whole result takes all steps, the next ones a part; values go on where they were, also those of geometry."""
@@ -281,6 +287,7 @@ def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: 
 
     monkeypatch.setattr(search_module, "distil", distil)
     monkeypatch.setattr(search_module, "refit_colours", lambda renderer, planes, *_, **__: planes)
+    monkeypatch.setattr(search_module, "rate_from", lambda fidelity: 1.0 if fidelity > 0 else 0.0)
     world = World(lambda m: found / DISTILLED * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
     path = FakePath()
     path.cameras, path.between, path.progress = [], [], None  # type: ignore[attr-defined]
