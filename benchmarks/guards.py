@@ -3,7 +3,8 @@
 Fidelity at the training poses and at those of held-out views at other distances from what they look at, the held-out views' drop,
 bytes and processor seconds, with --views-margin off and on.
 
-python -m benchmarks.guards [--scene fox|sample] [--effort fast|balanced|thorough] [--only off|on]
+python -m benchmarks.guards [--scene fox|sample] [--effort fast|balanced|thorough|max] [--only off|on]
+    [--max-drop DB | --max-size BYTES]
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -45,6 +47,7 @@ def main() -> None:
         ("--effort", {"default": "fast"}),
         ("--only", {"choices": ("off", "on")}),
         ("--max-drop", {"type": float, "default": 1.0}),
+        ("--max-size", {"type": int, "metavar": "BYTES"}),
     )
     options = parse(__doc__, repeats=1, scene="sample", more=more)
     backend, budget = backend_of(options)
@@ -68,7 +71,9 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as name:
             place = Path(name) / "out.fgs"
             started = time.process_time()
-            chosen = CompressOptions(effort=options.effort, max_drop=options.max_drop, views_margin=margin)
+            size = options.max_size
+            target: dict[str, Any] = {"max_drop": options.max_drop} if size is None else {"max_size": size}
+            chosen = CompressOptions(effort=options.effort, views_margin=margin, **target)
             result = compress(path, place, chosen)
             seconds = time.process_time() - started
             label = f"{options.scene}, {options.effort}, margin {'on' if margin else 'off'}"

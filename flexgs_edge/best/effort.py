@@ -106,5 +106,5 @@ EFFORTS = {
         keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.05, few=32, views=96, pixels=24, mended=0.7
     ),
     "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, few=400, views=400, pixels=24),
-    "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=96, views=96, pixels=24, passes=7.0),
+    "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=96, views=96, pixels=24, passes=10.0),
 }
