@@ -190,7 +190,7 @@ from flexgs_edge.cli import words
     metavar="STEPS",
     type=int,
     help="Move all that is kept towards the original's own renders (no photos), one view a step; 0: do not (best, .fgs only). "
-    "Default: 7 steps a scored pose with --effort max, else none.",
+    "Default: 10 steps a scored pose with --effort max, else none.",
 )
 @words.drop_invalid_option
 @words.run_options
