@@ -53,7 +53,7 @@ def test_the_peak_stays_below_the_limit_that_the_error_names(tmp_path: Path) -> 
     assert done.returncode == 0, done.stderr
 
     limits = ["20MiB"]
-    for _ in range(8):  # each stage names what it lacks
+    for _ in range(16):  # each stage names what it lacks
         done = compress(tmp_path, "files", limits[-1], max(parse_size(limits[-1]) + PAGES, 300 << 20))
         if done.returncode == 0:
             break
