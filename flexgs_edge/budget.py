@@ -162,10 +162,10 @@ def _left_in_groups(proc: Path, groups: Path) -> Iterator[int]:
 def return_freed_memory() -> None:
     """Have the C library return large arrays to the system when they are freed; nothing where it is not glibc.
 
-    To be called before anything large is allocated: later it was worth 40 MiB where now it is worth 100. By default every free
-    of a mapped array raises the size that is mapped (to 32 MiB), so that the arrays of two threads end up in heaps with holes:
-    a search of 400 000 Gaussians in scratch files peaked at 307 MiB instead of 202, in the same time. Searches in memory
-    have larger arrays, and would take a fifth longer for new pages.
+    By default every free of a mapped array raises the size that is mapped (to 32 MiB), so that the arrays of two threads end
+    up in heaps with holes: a search of 400 000 Gaussians in scratch files peaked at 307 MiB instead of 202, in the same time.
+    To be called before anything large is allocated: after the first views it left 261 to 300. Searches in memory have larger
+    arrays, and would take a fifth longer for new pages.
     """
     with suppress(OSError, AttributeError):
         mallopt = ctypes.CDLL(None).mallopt

@@ -287,7 +287,7 @@ def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: 
 
     monkeypatch.setattr(search_module, "distil", distil)
     monkeypatch.setattr(search_module, "refit_colours", lambda renderer, planes, *_, **__: planes)
-    monkeypatch.setattr(search_module, "rate_from", lambda fidelity: 1.0 if fidelity > 0 else 0.0)
+    monkeypatch.setattr(search_module, "rate_from", lambda fidelity: 1.0)
     world = World(lambda m: found / DISTILLED * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
     path = FakePath()
     path.cameras, path.between, path.progress = [], [], None  # type: ignore[attr-defined]
