@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import GridScene, Planes, Steps, from_grid, to_grid
 from flexgs_edge.scene.fields import sh_rest_count
+from flexgs_edge.scratch import BLOCK_ROWS, MEMORY, Room, blocks
 
 _COMMENT = "flexgs-edge grid "
 
@@ -62,3 +64,30 @@ def on_grid(planes: Planes, steps: Steps, origin: np.ndarray) -> GridScene | Non
         if not np.array_equal(values, given):
             return None
     return grid
+
+
+def lowered(grid: GridScene, room: Room = MEMORY) -> GridScene:
+    """The same values with each row's SH degree as low as its codes allow: what decodes to zero is not in the file.
+
+    So the grid of a file is the one that is found again in the values that it decodes to (`on_grid`), to the byte.
+    """
+    degrees, bands = grid.sh_degrees.copy(), list(grid.sh)
+    for degree in range(grid.sh_degree, 0, -1):
+        codes = grid.sh[degree - 1]
+        rows = np.flatnonzero(grid.sh_degrees >= degree)
+        zero = np.empty(len(rows), bool)
+        for part in blocks(len(rows), BLOCK_ROWS, codes):
+            zero[part] = ~codes[:, part].any(axis=0)
+        # A row that keeps a higher degree keeps this one.
+        zero &= degrees[rows] == degree
+        degrees[rows[zero]] = degree - 1
+        if zero.any():
+            bands[degree - 1] = room.take(codes, np.flatnonzero(~zero))
+    top = int(degrees.max(initial=0))
+    return replace(
+        grid,
+        sh_degree=top,
+        steps=replace(grid.steps, sh=grid.steps.sh[:top]),
+        sh_degrees=degrees,
+        sh=tuple(bands[:top]),
+    )

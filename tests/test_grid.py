@@ -11,7 +11,7 @@ import pytest
 from flexgs_edge.curve import morton
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import GridScene, Steps, from_grid, to_grid
-from flexgs_edge.regrid import grid_comment, on_grid, steps_of
+from flexgs_edge.regrid import grid_comment, lowered, on_grid, steps_of
 from flexgs_edge.rotations import canonical_axes
 from grid_scenes import STEPS, make_grid, make_planes
 
@@ -181,6 +181,31 @@ def test_values_of_a_grid_are_found_on_it_again(degree: int) -> None:
         np.testing.assert_array_equal(values, planes[name][: len(values)] if name != "sh_rest" else values)
     np.testing.assert_array_equal(again.rotation, grid.rotation)
     np.testing.assert_array_equal(again.dc, grid.dc)
+
+
+@pytest.mark.parametrize("zero_above", [0, 1, 2, 3])
+def test_degrees_are_as_low_as_the_codes_allow(zero_above: int) -> None:
+    """Rows whose highest SH codes are zero come back from a file without that degree: the file must not count it."""
+    grid = make_grid(300, 3, 19)
+    rows = np.random.default_rng(4).random(300) < 0.5
+    bands = []
+    for degree, codes in enumerate(grid.sh, start=1):
+        codes = codes.copy()
+        # Of some rows all codes above a degree, of others one band in the middle: that one stays.
+        some = rows if degree > zero_above else ~rows if degree == 2 else np.zeros(300, bool)
+        codes[:, some[grid.sh_degrees >= degree]] = 0
+        bands.append(codes)
+    grid = replace(grid, sh=tuple(bands))
+    low = lowered(grid)
+    again = on_grid(from_grid(grid), grid.steps, grid.origin)
+    assert again is not None and low.sh_degree == again.sh_degree and low.steps == again.steps
+    assert (low.sh_degrees <= grid.sh_degrees).all() and low.sh_degrees[rows].max(initial=0) <= zero_above
+    np.testing.assert_array_equal(low.sh_degrees, again.sh_degrees)
+    for mine, theirs in zip(low.sh, again.sh, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    before, after = (from_grid(some)["sh_rest"].reshape(3, -1, 300) for some in (grid, low))
+    np.testing.assert_array_equal(after, before[:, : after.shape[1]])
+    assert not before[:, after.shape[1] :].any()
 
 
 @pytest.mark.parametrize("field", ["means", "quats", "sh_dc", "log_scales", "opacity_logits"])

@@ -341,6 +341,11 @@ def test_what_was_compressed_before_stays_as_it_is(
         assert again.quality is not None and again.quality.fidelity is None and again.reached
         for field, values in open_scene(tmp_path / "again.fgs").read(slice(0, result.count), list(FIELD)).items():
             np.testing.assert_array_equal(values, planes[field][: len(values)])
+    # What the file says of itself counts to the byte: its own size is enough for it, and one less is not.
+    least = compress(tmp_path / "again.fgs", None, dry_run=True, **{**words, "max_size": again.size})
+    assert least.size <= again.size and least.count == result.count
+    less = compress(tmp_path / "again.fgs", None, dry_run=True, **{**words, "max_size": least.size - 1})
+    assert less.size < least.size and less.quality is not None and less.quality.fidelity is not None
     # Fewer bytes, or Gaussians that shall go, are a search again; so is a quality, which speaks of what is left to lose.
     smaller = compress(tmp_path / "b.ply", None, dry_run=True, **{**words, "max_size": result.size - 500})
     assert smaller.size <= result.size - 500 and smaller.count < result.count

@@ -39,6 +39,7 @@ from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
 from flexgs_edge.grid import GridScene, Steps, recolour, to_grid, values_of
 from flexgs_edge.refit import Schedule, distil, refit_colours
+from flexgs_edge.regrid import lowered
 from flexgs_edge.score.removal import RemovalCosts
 
 LOG = logging.getLogger("flexgs_edge")
@@ -337,12 +338,12 @@ class RateSearch(MultiplierSearch[GridScene]):
         started = time.perf_counter()
         kept, steps = self._choice(multiplier)
         grid = self._distilled(multiplier, kept, steps) if self.steps else self._finish(kept, steps)
+        grid = lowered(grid, self.path.room)
         size = self.size_of(grid)
         measurement = self.measure(values_of(grid, self.path.room))
         excess = target.excess(size, measurement)
-        sh_count = int((kept.degrees > 0).sum())
         seconds = time.perf_counter() - started
-        return RateStep(multiplier, len(kept.rows), sh_count, size, measurement, excess, seconds), grid
+        return RateStep(multiplier, len(kept.rows), grid.sh_count, size, measurement, excess, seconds), grid
 
     def _descended(self, multiplier: float) -> Mended | None:
         """Values of the last descent that kept what this multiplier keeps and more.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -122,6 +122,7 @@ def kept_as_it_is(
     target: Target,
     options: CompressOptions,
     budget: MemoryBudget,
+    settings_of: Callable[[SearchResult], Mapping[str, Any] | None],
 ) -> tuple[GridScene, SearchResult] | None:
     """A scene that lies on a grid of ours and fits the target's bytes already, with nothing lost; else None.
 
@@ -132,6 +133,8 @@ def kept_as_it_is(
     ----------
     source : SceneSource
         A `.fgs`, or a PLY that one was decompressed to and nobody changed.
+    settings_of : callable
+        What the file would say of itself (None: not known), so that its size is known to the byte.
     """
     limit, steps = target.limit_bytes, steps_of(source.comments)
     size = KEPT_COPIES * source.count * sum(4 * field.width(source.sh_degree) for field in FIELD.values())
@@ -141,15 +144,18 @@ def kept_as_it_is(
     grid = on_grid(source.read(slice(0, source.count), list(FIELD)), steps, source.origin)
     if grid is None:
         return None
-    found = coder.size(grid)
-    if (found if options.layers == 1 else round(LAYERS_COST * found)) > limit:
+    layers_cost = 1.0 if options.layers == 1 else LAYERS_COST
+    if round(layers_cost * coder.size(grid, {})) > limit:
         return None
     with renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
         measurement = measurement_of(judge.compare(scene))
-    LOG.info("the scene was compressed before and fits: it stays as it is")
     without = 1000 - min(round(1000 * grid.sh_count / grid.count), 1000)
-    seconds = time.perf_counter() - started
-    step = Step(Choice(0, without), found, measurement, target.excess(found, measurement), "multiplier", seconds)
+    step = Step(Choice(0, without), limit, measurement, 0.0, "multiplier", time.perf_counter() - started)
+    size = coder.size(grid, settings_of(SearchResult(step, True, (step,))))
+    if round(layers_cost * size) > limit:
+        return None
+    LOG.info("the scene was compressed before and fits: it stays as it is")
+    step = replace(step, size=size, excess=target.excess(size, measurement))
     return grid, SearchResult(step, True, (step,))
 
 

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -221,8 +222,9 @@ class _Job:
                 kept = open_checkpoint(renderer, self.source, poses.cameras, options, folder)
         LOG.info("searching for %s", plan.target.describe())
         coder = GridCoder(renderer)
+        settings_of = partial(make_settings, options, plan, self.scene, self.views, bits=None)
         with self.clock.stage("search"):
-            found = kept_as_it_is(coder, renderer, self.source, decide, plan.target, options, self.budget)
+            found = kept_as_it_is(coder, renderer, self.source, decide, plan.target, options, self.budget, settings_of)
         grid, search = found or search_best(
             grid_search(options, coder),
             renderer,
@@ -242,14 +244,12 @@ class _Job:
         if options.layers > 1:
             with self.clock.stage("layers"):
                 grid = layered(grid, renderer, poses, options, self.progress)
-        settings = make_settings(options, plan, self.scene, self.views, search, None)
+        settings = settings_of(search)
         if output is None:
             if self.reporter is not None:
                 self.reporter.read_contents_of(lambda place: coder.write(place, grid, settings))
-            size, quality = (
-                coder.size(grid, settings),
-                self._measure_source(MemorySource(values_of(grid, room), origin=grid.origin), report),
-            )
+            size = coder.size(grid, settings)
+            quality = self._measure_source(MemorySource(values_of(grid, room), origin=grid.origin), report)
         else:
             with temporary_name(output, options.force, None if kept is None else kept.key) as place:
                 with self.clock.stage("write"):

@@ -128,8 +128,10 @@ def generations(bench: Bench, path: PrunePath, ours: Whole, amounts: Amounts, fo
 def _again(bench: Bench, source: SceneSource, size: int) -> Whole:
     """The measured method on a scene, to so many bytes, as `compress` does it."""
     workspace, target = bench.workspace, MaxSize(size + SETTINGS_MOST, bench.plan.judge)
+    renderer, budget = workspace.renderer, workspace.budget
+    # The limit has room for settings, as every search counts them.
     found = kept_as_it_is(
-        GridCoder(workspace.renderer), workspace.renderer, source, bench.judge, target, bench.options, workspace.budget
+        GridCoder(renderer), renderer, source, bench.judge, target, bench.options, budget, lambda result: None
     )
     if found is not None:
         grid, _ = found
