@@ -39,9 +39,9 @@ __kernel void peak(const uint rounds, __global const float *records, __global fl
 #pragma unroll
     for (int k = 0; k < {BLOCKS}; ++k) {{
       FW dx = xs[k] - mx, dy = y - my;
-      FW alpha = splat_alpha(dx, dy, ca, cb, cc, level);
-      FW weight;
-      blend_over(alpha, cr, cg, cbl, red + k, green + k, blue + k, trans + k, &weight);
+      FW alpha, weight;
+      const FW exponent = splat_exponent(dx, dy, ca, cb, cc, level, highest_exponent(level));
+      blend_over(exponent, cr, cg, cbl, red + k, green + k, blue + k, trans + k, &alpha, &weight);
     }}
   }}
   FW all = (FW)0.0f;

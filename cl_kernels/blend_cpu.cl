@@ -202,6 +202,7 @@ __kernel void blend(
     if (!mask) continue;
     __global const float *r = records + (size_t)pair.x * 16;
     const FW mx = (FW)r[0], my = (FW)r[1], ca = (FW)r[2], cb = (FW)r[3], cc = (FW)r[4], level = (FW)r[5];
+    const FW highest = highest_exponent(level);
     const FW cr = (FW)r[6], cg = (FW)r[7], cbl = (FW)r[8];
 #if STATS
     IW hit_sum[BLOCK_VECTORS];
@@ -224,12 +225,12 @@ __kernel void blend(
       for (int v = 0; v < BLOCK_VECTORS; ++v) {
         const int k = b * BLOCK_VECTORS + v;
         FW dx = X_OF(b, v) - mx, dy = y_of[(b >> 2) * BLOCK_VECTORS + v] - my;
-        FW alpha = splat_alpha(dx, dy, ca, cb, cc, level);
-        FW weight;
+        const FW exponent = splat_exponent(dx, dy, ca, cb, cc, level, highest);
+        FW alpha, weight;
 #if STATS == 5
-        const IW hit = pass_through(alpha, trans + k, &weight);
+        const IW hit = pass_through(exponent, trans + k, &alpha, &weight);
 #else
-        const IW hit = blend_over(alpha, cr, cg, cbl, red + k, green + k, blue + k, trans + k, &weight);
+        const IW hit = blend_over(exponent, cr, cg, cbl, red + k, green + k, blue + k, trans + k, &alpha, &weight);
 #endif
 #if STATS
         hit_sum[v] += hit;

@@ -108,17 +108,14 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
       int hit = 0;
       if (list[n].y >> b & 1u) {
         const float dx = (float)px - splats[n][0], dy = (float)py - splats[n][1];
-        alpha = splat_alpha(dx, dy, splats[n][2], splats[n][3], splats[n][4], splats[n][5]);
-        const float next = t * (1.0f - alpha);
-        const int seen = alpha >= ALPHA_MIN;
-        hit = seen && next >= TRANSMITTANCE_MIN;
-        weight = hit ? alpha * t : 0.0f;
-#if STATS != 5
-        red = fma(weight, splats[n][6], red);
-        green = fma(weight, splats[n][7], green);
-        blue = fma(weight, splats[n][8], blue);
+        const float exponent = splat_exponent(
+            dx, dy, splats[n][2], splats[n][3], splats[n][4], splats[n][5], highest_exponent(splats[n][5]));
+#if STATS == 5
+        hit = pass_through(exponent, &t, &alpha, &weight);
+#else
+        hit = blend_over(
+            exponent, splats[n][6], splats[n][7], splats[n][8], &red, &green, &blue, &t, &alpha, &weight);
 #endif
-        t = hit ? next : seen ? -fabs(t) : t;
       }
 #if STATS
       if (p == 0) counts = 0;

@@ -229,7 +229,8 @@ def alphas(splats: _Splats, k: int, xs: np.ndarray, ys: np.ndarray) -> tuple[np.
     exponent_error = (ea * dx * dx + 2 * eb * abs(dx * dy) + ec * dy * dy) / 2 + 5 * EPS * parts
     exponent_error += abs(ca * dx + cb * dy) * splats.mean_error[k, 0]
     exponent_error += abs(cb * dx + cc * dy) * splats.mean_error[k, 1]
-    exponent_error += splats.exponent_error[k] + 2 * EPS * q
+    # The level is added to what the pixel's row decides before the rest is: one rounding of each.
+    exponent_error += splats.exponent_error[k] + 2 * EPS * q + EPS * abs(np.log(splats.opacity[k]))
     full = splats.opacity[k] * np.exp(-q / 2)
     error = np.where(full * (1 - exponent_error) > ALPHA_MAX, EPS, full * exponent_error)
     return np.minimum(ALPHA_MAX, full), error, full >= ALPHA_MAX

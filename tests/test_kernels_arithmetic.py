@@ -10,7 +10,7 @@ import pytest
 import flexgs_edge.constants as constants
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.kernels.source import constants_header, kernel_dir
-from flexgs_edge.kernels.twins.arithmetic import fexp2, flog2, fma, reciprocal
+from flexgs_edge.kernels.twins.arithmetic import f32, fexp2, flog2, fma, reciprocal
 from kernel_fixtures import FORMS, open_form, same_bits
 
 EXP2_ERROR = 2.15e-7
@@ -49,6 +49,19 @@ def any_floats(count: int, seed: int) -> np.ndarray:
     special = np.array([0, -0.0, np.inf, -np.inf, np.nan, 1e-45, -1e-45, 3.4e38, -3.4e38, 1, -1, 0.5, -0.5], np.float32)
     bits[: special.size] = special.view(np.uint32)
     return bits.view(np.float32)
+
+
+def test_limits_of_the_exponent_are_those_of_alpha() -> None:
+    """Kernels compare and cap exponents: to the bit what alpha, as computed, would be compared and capped to."""
+    low, high = (
+        np.sort((f32(limit).view(np.int32) + np.arange(-(1 << 16), 1 << 16, dtype=np.int32)).view(f32))
+        for limit in (constants.LOG2_ALPHA_MIN, constants.LOG2_ALPHA_MAX)
+    )
+    seen = low >= f32(constants.LOG2_ALPHA_MIN)
+    np.testing.assert_array_equal(seen, fexp2(low) >= f32(constants.ALPHA_MIN))
+    assert 0 < seen.sum() < len(seen)
+    capped = fexp2(np.minimum(high, f32(constants.LOG2_ALPHA_MAX)))
+    assert capped.max() == capped[-1] == f32(constants.ALPHA_MAX) < fexp2(high).max()
 
 
 @pytest.mark.parametrize("form", FORMS)

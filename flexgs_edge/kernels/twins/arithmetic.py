@@ -7,11 +7,11 @@ from typing import Any, Union
 import numpy as np
 
 from flexgs_edge.constants import (
-    ALPHA_MAX,
     EXP2_HIGH,
     EXP2_LOW,
     EXP2_MAGIC,
     EXP2_POLY,
+    LOG2_ALPHA_MAX,
     LOG2_PIVOT,
     LOG2_POLY,
     RECIPROCAL_PIVOT,
@@ -48,12 +48,13 @@ def fma(a: Values, b: Values, c: Values) -> np.ndarray:
 
 def fexp2(x: np.ndarray) -> np.ndarray:
     """2^x, as `fexp2` in common.clh: NaN passes."""
-    return np.where(x == x, fexp2_low(np.where(x > f32(EXP2_HIGH), f32(EXP2_HIGH), x)), x)
+    within = np.where(x > f32(EXP2_HIGH), f32(EXP2_HIGH), x)
+    within = np.where(within < f32(EXP2_LOW), f32(EXP2_LOW), within)
+    return np.where(x == x, fexp2_within(within), x)
 
 
-def fexp2_low(x: np.ndarray) -> np.ndarray:
-    """2^x of numbers of at most EXP2_HIGH, as `fexp2_low` in common.clh."""
-    x = np.where(x < f32(EXP2_LOW), f32(EXP2_LOW), x)
+def fexp2_within(x: np.ndarray) -> np.ndarray:
+    """2^x of EXP2_LOW <= x <= EXP2_HIGH, as `fexp2_within` in common.clh."""
     t = x + f32(EXP2_MAGIC)
     i = np.left_shift(t.view(np.int32), 23)
     f = x - (t - f32(EXP2_MAGIC))
@@ -79,12 +80,13 @@ def dot3(*parts: np.ndarray) -> np.ndarray:
     return fma(az, bz, fma(ay, by, ax * bx))
 
 
-def splat_alpha(*parts: np.ndarray) -> np.ndarray:
-    """Opacity of a splat, of (dx, dy, ca, cb, cc, level) given in this order, as `splat_alpha` in common.clh."""
+def splat_exponent(*parts: np.ndarray) -> np.ndarray:
+    """log2 of a splat's alpha, of (dx, dy, ca, cb, cc, level) given in this order, as `splat_exponent` in common.clh."""
     dx, dy, ca, cb, cc, level = parts
-    q = fma(fma(ca, dx, cb * dy), dx, (cc * dy) * dy)
-    less = level - q
-    return np.fmin(fexp2_low(np.where(less < level, less, level)), f32(ALPHA_MAX))
+    row, slope = fma(-(cc * dy), dy, level), fma(ca, dx, cb * dy)
+    exponent = fma(-slope, dx, row)
+    highest = np.where(level < f32(LOG2_ALPHA_MAX), level, f32(LOG2_ALPHA_MAX))
+    return np.where(exponent < highest, exponent, highest)
 
 
 def reciprocal(x: np.ndarray) -> np.ndarray:

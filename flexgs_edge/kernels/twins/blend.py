@@ -12,16 +12,16 @@ import numpy as np
 
 from flexgs_edge.constants import (
     ALPHA_MAX,
-    ALPHA_MIN,
     BLOCK,
     FIXED_ERROR,
     FIXED_LARGEST,
     FIXED_MOMENT,
     FIXED_WEIGHT,
+    LOG2_ALPHA_MIN,
     TILE,
     TRANSMITTANCE_MIN,
 )
-from flexgs_edge.kernels.twins.arithmetic import f32, fma, reciprocal, splat_alpha
+from flexgs_edge.kernels.twins.arithmetic import f32, fexp2_within, fma, reciprocal, splat_exponent
 
 TILES_AT_ONCE = 256
 """Bounds the twin's memory: block lists and, for statistics, one float a pixel of each listed block."""
@@ -221,10 +221,12 @@ def _blend_blocks(
         entry = lists.starts[units] + step
         r = records[rows_of[lists.pair[entry]]]
         dx, dy = pixels[0][units] - r[:, 0:1], pixels[1][units] - r[:, 1:2]
-        alpha = splat_alpha(dx, dy, r[:, 2:3], r[:, 3:4], r[:, 4:5], r[:, 5:6])
+        exponent = splat_exponent(dx, dy, r[:, 2:3], r[:, 3:4], r[:, 4:5], r[:, 5:6])
+        seen = exponent >= f32(LOG2_ALPHA_MIN)
+        # The kernel has anything where nothing is seen, and uses it nowhere.
+        alpha = np.where(seen, fexp2_within(np.where(seen, exponent, f32(0))), f32(0))
         t = trans[units]
-        after = t * (f32(1) - alpha)
-        seen = alpha >= f32(ALPHA_MIN)
+        after = fma(-alpha, t, t)
         hit = seen & (after >= f32(TRANSMITTANCE_MIN))
         weight = np.where(hit, alpha * t, f32(0))
         for c in range(3 if stats != 5 else 0):
