@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from flexgs_edge.device.select import list_devices
     from flexgs_edge.errors import BudgetError, DeviceError, FlexGSError, FormatError, InputError, TargetError
     from flexgs_edge.pipeline.compress import compress
+    from flexgs_edge.pipeline.contents import verify
     from flexgs_edge.pipeline.decompress import decompress
     from flexgs_edge.pipeline.evaluate import evaluate
-    from flexgs_edge.pipeline.info import info, verify
+    from flexgs_edge.pipeline.info import info
     from flexgs_edge.pipeline.inputs import read_scene
     from flexgs_edge.pipeline.options import CompressOptions, ViewOptions
     from flexgs_edge.pipeline.render import render_views
@@ -43,7 +44,7 @@ _HOMES = {
     "evaluate": "pipeline.evaluate",
     "score_gaussians": "pipeline.score",
     "info": "pipeline.info",
-    "verify": "pipeline.info",
+    "verify": "pipeline.contents",
     "trim": "pipeline.trim",
     "synth": "pipeline.synth",
     "worth": "pipeline.worth",

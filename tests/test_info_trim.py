@@ -13,7 +13,8 @@ from flexgs_edge.codec import GridSource, channel_bytes, write_grid
 from flexgs_edge.codec.container import write_container
 from flexgs_edge.errors import FormatError, InputError, TargetError
 from flexgs_edge.grid import GridScene, from_grid
-from flexgs_edge.pipeline.info import info, info_text, verify, verify_json, verify_text
+from flexgs_edge.pipeline.contents import verify, verify_json, verify_text
+from flexgs_edge.pipeline.info import info, info_text
 from flexgs_edge.pipeline.trim import trim, trim_text
 from flexgs_edge.scene import open_scene
 from grid_scenes import make_grid

@@ -16,10 +16,12 @@ import flexgs_edge
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.codec import FgsSource
 from flexgs_edge.errors import BudgetError, InputError, TargetError
+from flexgs_edge.pipeline.companions import companions_of
 from flexgs_edge.pipeline.compress import compress
+from flexgs_edge.pipeline.contents import verify
 from flexgs_edge.pipeline.decompress import decompress
 from flexgs_edge.pipeline.evaluate import evaluate
-from flexgs_edge.pipeline.info import info, info_text, verify
+from flexgs_edge.pipeline.info import info, info_text
 from flexgs_edge.pipeline.inputs import find_views, read_scene
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import CompressOptions, ViewOptions
@@ -424,7 +426,7 @@ def test_resolution_scales_views_and_says_so(project: Path) -> None:
 
 
 def test_references_that_do_not_fit_are_drawn_again(project: Path) -> None:
-    from flexgs_edge.pipeline.inputs import companions_of, load_scene, resolve_drawing
+    from flexgs_edge.pipeline.inputs import load_scene, resolve_drawing
     from flexgs_edge.pipeline.workspace import Stopwatch, Workspace
 
     companions, scene = companions_of(project / "point_cloud.ply"), load_scene(project / "point_cloud.ply")

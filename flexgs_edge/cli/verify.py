@@ -26,7 +26,7 @@ def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
     Exit code 0: every part is whole. 2: something is damaged.
     """
     words.start(quiet, json_path, force)
-    from flexgs_edge.pipeline.info import verify, verify_json, verify_text
+    from flexgs_edge.pipeline.contents import verify, verify_json, verify_text
 
     sections = verify(file)
     words.emit(verify_text(file, sections), verify_json(file, sections), json_path, force)

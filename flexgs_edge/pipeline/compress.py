@@ -24,12 +24,13 @@ from flexgs_edge.formats import Format, read_foreign
 from flexgs_edge.grid import GridScene, values_of
 from flexgs_edge.pipeline.best import grid_search, kept_as_it_is, layered, search_best, search_files
 from flexgs_edge.pipeline.bits import bits_by_sensitivity
+from flexgs_edge.pipeline.companions import companions_of
 from flexgs_edge.pipeline.decompress import ahead, decoded
 from flexgs_edge.pipeline.doubts import TrainingPoses, doubts
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
 from flexgs_edge.pipeline.foreign import WrittenFile, foreign_format, open_files, publish
 from flexgs_edge.pipeline.grid_coder import GridCoder
-from flexgs_edge.pipeline.inputs import Scene, Views, companions_of, find_views, load_scene, resolve_drawing
+from flexgs_edge.pipeline.inputs import Scene, Views, find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.outputs import check_outputs, temporary_name

@@ -10,9 +10,9 @@ from typing import Any
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
+from flexgs_edge.pipeline.companions import companions_of
 from flexgs_edge.pipeline.inputs import (
     WITHOUT_VIEWS,
-    companions_of,
     find_views,
     load_scene,
     merge_companions,

@@ -11,12 +11,12 @@ from typing import Any, TypeVar
 
 import flexgs_edge.codec
 import flexgs_edge.formats  # noqa: F401  (both register readers)
-from flexgs_edge.cameras import Camera, Photos, find_cameras, limit_width, read_cameras, split_views
+from flexgs_edge.cameras import Camera, Photos, limit_width, read_cameras, split_views
 from flexgs_edge.cameras.auto import automatic_rig
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import InputError
 from flexgs_edge.pipeline.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOptions
-from flexgs_edge.scene import Companions, SceneSource, check_scene, find_companions, inria_dtype, open_scene
+from flexgs_edge.scene import Companions, SceneSource, check_scene, inria_dtype, open_scene
 
 Options = TypeVar("Options", bound=ViewOptions)
 
@@ -189,15 +189,3 @@ def merge_companions(first: Companions, second: Companions) -> Companions:
     white = first.white_background if first.white_background is not None else second.white_background
     antialiased = first.antialiased if first.antialiased is not None else second.antialiased
     return Companions(chosen.cameras, chosen.images, white, antialiased)
-
-
-def companions_of(path: str | Path) -> Companions:
-    """What lies beside the scene at `path`; logged, so that nobody wonders where cameras came from."""
-    found = find_companions(path)
-    if found.cameras is None:
-        folder = Path(path) if Path(path).is_dir() else Path(path).parent
-        found = replace(found, cameras=find_cameras(folder))
-    for what, place in (("cameras", found.cameras), ("photos", found.images)):
-        if place is not None:
-            LOG.info("found %s beside the scene: %s", what, place)
-    return found

@@ -15,7 +15,8 @@ import numpy as np
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.errors import InputError
-from flexgs_edge.pipeline.inputs import WITHOUT_VIEWS, companions_of, find_views, load_scene, resolve_drawing
+from flexgs_edge.pipeline.companions import companions_of
+from flexgs_edge.pipeline.inputs import WITHOUT_VIEWS, find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.options import ViewOptions
 from flexgs_edge.pipeline.records import scene_info, views_info
 from flexgs_edge.pipeline.workspace import Stopwatch, Workspace

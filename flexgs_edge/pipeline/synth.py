@@ -14,8 +14,9 @@ from flexgs_edge._version import __version__
 from flexgs_edge.budget import MemoryBudget, format_mib, format_size
 from flexgs_edge.cameras import Camera, inria_json, read_cameras
 from flexgs_edge.errors import InputError
+from flexgs_edge.pipeline.companions import companions_of
 from flexgs_edge.pipeline.decompress import ANTIALIASED_NOTE
-from flexgs_edge.pipeline.inputs import companions_of, load_scene
+from flexgs_edge.pipeline.inputs import load_scene
 from flexgs_edge.pipeline.parts import MOST_PARTS, PartsSource
 from flexgs_edge.pipeline.workspace import Stopwatch, run_info
 from flexgs_edge.scene import SceneSource, atomic_write, check_writable, inria_dtype, write_ply

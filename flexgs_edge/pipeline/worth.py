@@ -11,8 +11,9 @@ from flexgs_edge.budget import MemoryBudget, format_size
 from flexgs_edge.codec import open_fgs
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
+from flexgs_edge.pipeline.companions import companions_of
 from flexgs_edge.pipeline.info import info
-from flexgs_edge.pipeline.inputs import WITHOUT_VIEWS, companions_of, find_views, load_scene, resolve_drawing
+from flexgs_edge.pipeline.inputs import WITHOUT_VIEWS, find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.lesser import DROPPED, ONE_LESS, lesser_scenes
 from flexgs_edge.pipeline.options import ViewOptions

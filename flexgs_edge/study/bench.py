@@ -13,8 +13,9 @@ import numpy as np
 from flexgs_edge.adapt import Measurement, SearchResult, Step, Target, adapt
 from flexgs_edge.bitspec import PAPER, BitSpec
 from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.pipeline.companions import companions_of
 from flexgs_edge.pipeline.evaluator import SceneEvaluator
-from flexgs_edge.pipeline.inputs import Scene, Views, companions_of, find_views, load_scene, resolve_drawing
+from flexgs_edge.pipeline.inputs import Scene, Views, find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.plan import EVERYTHING, Plan
