@@ -112,6 +112,6 @@ __kernel void sh_residual(
     STOREF(fma(fabs(basis), seen[3], LOADF(at, 3 * s)), at, 3 * s);                             \
   }
   ADD_NORMAL(0, (FW)SH_C0)
-#define ADD_BAND(k, value) ADD_NORMAL((k) + 1, value)
-  FOR_EACH_BASIS(degree, x, y, z, ADD_BAND)
+#define ADD_BASIS(k, value) ADD_NORMAL((k) + 1, value)
+  FOR_EACH_BASIS(degree, x, y, z, ADD_BASIS)
 }
