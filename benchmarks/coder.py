@@ -21,7 +21,8 @@ from flexgs_edge.codec import GridSource, channel_bytes, write_grid
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.grid import GridScene, Steps, from_grid, recolour, to_grid
 from flexgs_edge.kernels import open_backend
-from flexgs_edge.pipeline.inputs import companions_of, find_views, load_scene, resolve_drawing
+from flexgs_edge.pipeline.companions import companions_of
+from flexgs_edge.pipeline.inputs import find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.judge import Judge
 from flexgs_edge.pipeline.options import ViewOptions
 from flexgs_edge.progress import Progress

@@ -21,8 +21,9 @@ from benchmarks.harness import SCENES, Bench, backend_of, parse
 from flexgs_edge.cameras import Camera
 from flexgs_edge.cameras.made import at_distance, between
 from flexgs_edge.codec import open_fgs
+from flexgs_edge.pipeline.companions import companions_of
 from flexgs_edge.pipeline.compress import compress
-from flexgs_edge.pipeline.inputs import companions_of, find_views, load_scene, resolve_drawing
+from flexgs_edge.pipeline.inputs import find_views, load_scene, resolve_drawing
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.render import Renderer
 from flexgs_edge.render.depths import visible_depths

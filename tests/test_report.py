@@ -20,6 +20,7 @@ from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import read_cameras
 from flexgs_edge.errors import BudgetError, InputError, TargetError
 from flexgs_edge.kernels import open_backend
+from flexgs_edge.pipeline.companions import companions_of
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.evaluate import evaluate
 from flexgs_edge.pipeline.pictures import encode
@@ -299,7 +300,7 @@ def test_a_report_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_pictures_are_taken_from_the_budget(project: Path) -> None:
-    from flexgs_edge.pipeline.inputs import companions_of, find_views
+    from flexgs_edge.pipeline.inputs import find_views
     from flexgs_edge.pipeline.options import ViewOptions
 
     source = open_scene(project / "point_cloud.ply")
