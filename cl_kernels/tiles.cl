@@ -35,6 +35,13 @@ inline uint tile_mask(int4 first, int4 last, int tile_x) {
   return (rows.s0 | rows.s1) | (rows.s2 | rows.s3);
 }
 
+// The row of tiles at a height in pixels, held in the image. A splat that ends between two pixels may get a row too many: spans of
+// block rows there are empty.
+inline int tile_row(float y, float height) {
+  const float last = height - 1.0f;
+  return (int)(y > 0.0f ? y < last ? y : last : 0.0f) / TILE;
+}
+
 // Calls EACH(tile, mask) for every tile that the splat may show in.
 #define FOR_EACH_TILE(EACH)                                                                                     \
   __global const float *r = records + (size_t)ids[n] * 16;                                                      \
@@ -48,18 +55,17 @@ inline uint tile_mask(int4 first, int4 last, int tile_x) {
       for (int tx = x0; tx <= x1; ++tx) EACH(ty * tiles_x + tx, 0xFFFFu);                                       \
   } else {                                                                                                      \
     const float slack = fma(r[10], SPAN_SLACK_RELATIVE, SPAN_SLACK);                                            \
-    const int y0 = (int)fmax(ceil(r[1] - r[10] - slack), 0.0f);                                                 \
-    const int y1 = (int)fmin(floor(r[1] + r[10] + slack), height - 1.0f);                                       \
-    for (int top = y0 / TILE; top <= y1 / TILE; top += BANDS / 4) {                                             \
+    const int ty0 = tile_row(r[1] - r[10] - slack, height), ty1 = tile_row(r[1] + r[10] + slack, height);       \
+    for (int top = ty0; top <= ty1; top += BANDS / 4) {                                                         \
       int first[BANDS], last[BANDS];                                                                            \
-      const int bands = min(BANDS, 4 * (y1 / TILE - top + 1));                                                  \
+      const int bands = min(BANDS, 4 * (ty1 - top + 1));                                                        \
       for (int v = 0; v < bands; v += W) {                                                                      \
         IW f, l;                                                                                                \
         block_spans(r, top * 4 + v, width, &f, &l);                                                             \
         STOREI(f, first, v);                                                                                    \
         STOREI(l, last, v);                                                                                     \
       }                                                                                                         \
-      for (int t = 0; t < BANDS / 4 && top + t <= y1 / TILE; ++t) {                                             \
+      for (int t = 0; t < BANDS / 4 && top + t <= ty1; ++t) {                                                   \
         const int4 f4 = vload4(t, first), l4 = vload4(t, last);                                                 \
         const int from = min(min(f4.s0, f4.s1), min(f4.s2, f4.s3));                                             \
         const int to = max(max(l4.s0, l4.s1), max(l4.s2, l4.s3));                                               \

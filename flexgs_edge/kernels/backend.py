@@ -26,6 +26,12 @@ class KernelSpec:
     per : str
         What a work-item is: `rows` (a vector of W rows; the launch size counts rows), `item` (one of the launch
         size), `tile` (one item a tile on CPUs, a group of 256 on GPUs).
+    kernel : str
+        Its name in the file, where that differs.
+    stats : int, optional
+        The blend's kind.
+    widest : int
+        Lanes of a vector at most.
     """
 
     file: str
@@ -33,6 +39,7 @@ class KernelSpec:
     per: str = "item"
     kernel: str = ""
     stats: int | None = None
+    widest: int = 16
 
 
 _BLEND = "uuiiii" + "fff" + "bbbbb"
@@ -45,9 +52,10 @@ KERNELS: dict[str, KernelSpec] = {
     "sort_count": KernelSpec("sort.cl", "uubb"),
     "sort_scatter": KernelSpec("sort.cl", "uubbbbb"),
     "exclusive_scan": KernelSpec("sort.cl", "uub"),
-    "tile_room": KernelSpec("tiles.cl", "uubbb"),
-    "tile_count": KernelSpec("tiles.cl", "uuffibbbbb"),
-    "tile_scatter": KernelSpec("tiles.cl", "ubbbb"),
+    # Most splats are in no more than 8 block rows: with vectors of 16 their lists take a fifth longer.
+    "tile_room": KernelSpec("tiles.cl", "uubbb", widest=8),
+    "tile_count": KernelSpec("tiles.cl", "uuffibbbbb", widest=8),
+    "tile_scatter": KernelSpec("tiles.cl", "ubbbb", widest=8),
     "blend": KernelSpec("blend_{form}.cl", _BLEND, "tile", stats=0),
     "blend_stats": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", kernel="blend", stats=1),
     "blend_removal": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", kernel="blend", stats=2),

@@ -96,7 +96,9 @@ class OpenCLBackend:
         """Enqueue the kernel `name` over `size` rows, items or tiles."""
         spec = KERNELS.get(name) or CODEC_KERNELS[name]
         if name not in self._kernels:
-            options = [f"-DW={self.width}"] + ([f"-DSTATS={spec.stats}"] if spec.stats is not None else [])
+            options = [f"-DW={min(self.width, spec.widest)}"] + (
+                [f"-DSTATS={spec.stats}"] if spec.stats is not None else []
+            )
             if self._simulated:
                 options.append("-DNO_FETCH")
             source = load_source(spec.file.format(form=self.form))

@@ -17,7 +17,7 @@ KERNEL_DIR_VARIABLE = "FLEXGS_KERNEL_DIR"
 _COMMON = "common.clh"
 _SHARED = (_COMMON, "sh.clh")
 """Files without kernels, put before every kernel file."""
-_TOGETHER = ("activate.cl", "project.cl", "sort.cl", "tiles.cl", "score.cl", "similarity.cl")
+_TOGETHER = ("activate.cl", "project.cl", "sort.cl", "score.cl", "similarity.cl")
 """Files that make one program: loading a built one from PoCL's cache takes 40 to 70 ms, however small it is."""
 
 
