@@ -45,8 +45,8 @@ TRANSMITTANCE_MIN: Final = 1e-4
 LOG2_E: Final = math.log2(math.e)
 LOG2_255: Final = math.log2(255.0)
 LOG2_ALPHA_MIN: Final = -LOG2_255
-"""The exponent of a splat at a pixel is compared before 2^x is known, which is then nobody's business below: as float32 the least
-x whose 2^x, as computed, is ALPHA_MIN or more."""
+"""The exponent of a splat at a pixel is compared, not its alpha: as float32 this is the least x whose 2^x, as computed, is
+ALPHA_MIN or more. Below it 2^x is not used, and need not be right."""
 LOG2_ALPHA_MAX: Final = -0.0144997
 """The exponent is capped, not alpha: 2^x of this, as computed, is ALPHA_MAX to the bit (of log2(ALPHA_MAX) it is an ulp more)."""
 

@@ -213,9 +213,9 @@ def command(input: str, output: str | None, json_path: str | None, quiet: bool, 
       flexgs-edge compress point_cloud.ply -o scene.fgs --max-size 8MB
           the best that fits
       flexgs-edge compress point_cloud.ply -o scene.fgs --effort fast
-          two thirds of the seconds, 7 to 32 % more bytes (a sample scene, a real one)
+          three fifths of the seconds, 7 to 32 % more bytes (a sample scene, a real one)
       flexgs-edge compress point_cloud.ply -o scene.fgs --effort max
-          a third fewer bytes, in two to three times the time
+          a third fewer bytes, in about twice the time
       flexgs-edge compress point_cloud.ply -o a.fgs --method paper --score-cache s.npz
       flexgs-edge compress point_cloud.ply -o b.fgs --method paper --score-cache s.npz --max-drop 2
           the paper's method: score once, then try another target

@@ -137,20 +137,22 @@ def kept_as_it_is(
         What the file would say of itself (None: not known), so that its size is known to the byte.
     """
     limit, steps = target.limit_bytes, steps_of(source.comments)
-    size = KEPT_COPIES * source.count * sum(4 * field.width(source.sh_degree) for field in FIELD.values())
-    if limit is None or steps is None or options.unseen_share < 1.0 or size > budget.free:
+    held = KEPT_COPIES * source.count * sum(4 * field.width(source.sh_degree) for field in FIELD.values())
+    if limit is None or steps is None or options.unseen_share < 1.0 or held > budget.free:
         return None
     started = time.perf_counter()
     grid = on_grid(source.read(slice(0, source.count), list(FIELD)), steps, source.origin)
     if grid is None:
         return None
     layers_cost = 1.0 if options.layers == 1 else LAYERS_COST
-    if round(layers_cost * coder.size(grid, {})) > limit:
+    size = coder.size(grid, {})  # without what the file says of itself, which holds the measurement
+    if round(layers_cost * size) > limit:
         return None
     with renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
         measurement = measurement_of(judge.compare(scene))
     without = 1000 - min(round(1000 * grid.sh_count / grid.count), 1000)
-    step = Step(Choice(0, without), limit, measurement, 0.0, "multiplier", time.perf_counter() - started)
+    seconds = time.perf_counter() - started
+    step = Step(Choice(0, without), size, measurement, target.excess(size, measurement), "multiplier", seconds)
     size = coder.size(grid, settings_of(SearchResult(step, True, (step,))))
     if round(layers_cost * size) > limit:
         return None
