@@ -207,7 +207,9 @@ MUTATIONS = (
     backward("gradient of the opacity, not of its logit", "slope * ((FW)1.0f - opacity)", "slope"),
     backward("gradient along the direction of SH", "tx = fma(-along, dx, tx) * norm", "tx = tx * norm"),
     backward("gradient: opacity's factor held", "if (antialiased) {\n    // log", "if (antialiased > 1) {\n    // log"),
-    backward("gradient: what is behind stays as it was", "red[k] -= own_light;", "", "blend_cpu.cl"),
+    backward(
+        "gradient: what is behind stays as it was", "red[k] = fma(-weight, own_light, red[k]);", "", "blend_cpu.cl"
+    ),
     backward(
         "gradient at the cap of alpha", "pick(MASK(alpha < (FW)ALPHA_MAX), light, (FW)0.0f)", "light", "blend_cpu.cl"
     ),

@@ -1,4 +1,4 @@
-"""Views: ms by stage and ns by tile pair, hits over the training views, steps of a descent, and the first image of a process.
+"""Views: ms by stage and ns by tile pair, hits and costs over the training views, steps of a descent, the first image of a process.
 
 python -m benchmarks.view [--scene fox|sample] [--device SPEC] [--repeats N]
 """
@@ -84,6 +84,28 @@ def bench_counting(
         1,
         f"{len(train)} training views" + (", total checked" if golden is not None else ""),
     )
+    bench_scores(bench, renderer, scene, [cameras[view] for view in train])
+
+
+def bench_scores(bench: Bench, renderer: Renderer, scene: DeviceScene, cameras: list[Camera]) -> None:
+    """Hit counting and removal costs over drawing the same views: each view in turn, so that all see the same machine."""
+    statistics = Statistics.zeros(scene.count)
+    ways: dict[str, Callable[[Camera], object]] = {
+        "drawing": lambda camera: renderer.render(scene, camera),
+        "hit counting": lambda camera: renderer.add_statistics(scene, camera, statistics),
+        "removal costs": lambda camera: renderer.read_sums(renderer.removal_sums(scene, camera), 2, scene.count),
+    }
+    found = np.empty((len(ways), bench.repeats, len(cameras)))
+    for repeat in range(bench.repeats):
+        for place, camera in enumerate(cameras):
+            for way, draw in enumerate(ways.values()):
+                start = time.perf_counter()
+                draw(camera)
+                found[way, repeat, place] = time.perf_counter() - start
+    totals = found.sum(axis=2)
+    for way, name in enumerate(ways):
+        if way:
+            bench.add(f"{name} over drawing", (totals[way] / totals[0]).tolist(), "x", f"{len(cameras)} training views")
 
 
 def bench_descent(bench: Bench, renderer: Renderer, source: PlySource, cameras: list[Camera]) -> None:

@@ -47,10 +47,9 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
 #if STATS
     ,
     __global uint *hits,
-    __global uint *sums,
-    __global const float *target
+    __global uint *sums
 #endif
-#if STATS >= 4
+#if STATS > 2
     ,
     __global const float *rest
 #endif
@@ -77,16 +76,15 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
   }
   const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
   const size_t here = (size_t)py * pitch + px;
-#if STATS > 1
-  const float target_r = target[here], target_g = target[plane + here], target_b = target[2 * plane + here];
+#if STATS == 2 || STATS == 4
+  const float whole_r = image[here], whole_g = image[plane + here], whole_b = image[2 * plane + here];
 #endif
-#if STATS >= 4
+#if STATS > 2
   const float rest_r = rest[here], rest_g = rest[plane + here], rest_b = rest[2 * plane + here];
 #if STATS == 5
-  if (!resume) red = fma(target_b, rest_b, fma(target_g, rest_g, target_r * rest_r));   // see blend_cpu.cl
+  // See blend_cpu.cl.
+  if (!resume) red = fma(image[2 * plane + here], rest_b, fma(image[plane + here], rest_g, image[here] * rest_r));
 #endif
-#elif STATS == 3
-  const float rest_r = target_r, rest_g = target_g, rest_b = target_b;
 #endif
   ends += (size_t)(blocks - 1) * get_num_groups(0);
   const uint first = tile ? ends[tile - 1] : 0u, last = ends[tile];
@@ -105,12 +103,15 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
     if (!go_on) break;
     for (uint n = 0; n < size; ++n) {
       float weight = 0.0f, alpha = 0.0f;
+#if STATS == 5
+      const float before = t;
+#endif
       int hit = 0;
       if (list[n].y >> b & 1u) {
         const float dx = (float)px - splats[n][0], dy = (float)py - splats[n][1];
         const float exponent = splat_exponent(
             dx, dy, splats[n][2], splats[n][3], splats[n][4], splats[n][5], highest_exponent(splats[n][5]));
-#if STATS == 5
+#if STATS == 3 || STATS == 5
         hit = pass_through(exponent, &t, &alpha, &weight);
 #else
         hit = blend_over(
@@ -120,16 +121,14 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
 #if STATS
       if (p == 0) counts = 0;
 #if STATS == 2 || STATS == 4
-      const float ratio = hit ? alpha * reciprocal(1.0f - alpha) : 0.0f;
-      const float er = fma(weight, splats[n][6], -(ratio * (target_r - red)));
-      const float eg = fma(weight, splats[n][7], -(ratio * (target_g - green)));
-      const float eb = fma(weight, splats[n][8], -(ratio * (target_b - blue)));
-      const float error = fma(eb, eb, fma(eg, eg, er * er));
+      const float ratio = weight / t;
+      const float er = fma(splats[n][6], t, red - whole_r), eg = fma(splats[n][7], t, green - whole_g);
+      const float eb = fma(splats[n][8], t, blue - whole_b);
+      const float error = ratio * ratio * fma(eb, eb, fma(eg, eg, er * er));
 #elif STATS == 5
-      const float own_light = weight * fma(splats[n][8], rest_b, fma(splats[n][7], rest_g, splats[n][6] * rest_r));
-      red -= own_light;
-      const float ratio = hit ? alpha / (1.0f - alpha) : 0.0f;
-      const float light = fma(-ratio, red, own_light);
+      const float own_light = fma(splats[n][8], rest_b, fma(splats[n][7], rest_g, splats[n][6] * rest_r));
+      const float light = (weight / t) * fma(own_light, before, -red);
+      red = fma(-weight, own_light, red);
       const float error = alpha < ALPHA_MAX ? light : 0.0f;   // the slope
 #endif
 #if STATS == 2
@@ -199,7 +198,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
     }
   }
   if (finish) {
-#if STATS != 5
+#if STATS < 2
     __global float *at = image + here;
     at[0] = fma(fabs(t), background_r, red);
     at[plane] = fma(fabs(t), background_g, green);

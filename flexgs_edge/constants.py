@@ -109,9 +109,6 @@ EXP2_POLY: Final = (
 )
 """Degree 5 on [-0.5, 0.5]: relative error 7.5e-8 in reals, 2.15e-7 in float32."""
 
-RECIPROCAL_PIVOT: Final = 0x7EF311C7
-"""Taking the bits of x from it gives 1 / x to 12 %, either way."""
-
 LOG2_PIVOT: Final = 0x3F2AAAAB
 """Bits of 2/3 as float32: log2 splits its argument into 2^e * m with m in [2/3, 4/3)."""
 LOG2_POLY: Final = (

@@ -180,7 +180,7 @@ class Renderer:
         """Add one view to `statistics` (hits and weights of every row)."""
         view = self._prepare(scene, camera)
         hits, sums = self._sum_arrays(scene, view, 1)
-        self._blend(view, "blend_stats", (hits, sums, view.buffers.image))
+        self._blend(view, "blend_stats", (hits, sums))
         rows = slice(None) if self.view_rows is None else self.view_rows
         statistics.hits[rows] += self.backend.read(hits)[: view.count]
         statistics.weights[rows] += self.read_sums(sums, 1, view.count)[0].view(np.uint64)
@@ -196,7 +196,7 @@ class Renderer:
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, 2)
-        self._blend(view, "blend_removal", (hits, sums, view.buffers.image), again=True)
+        self._blend(view, "blend_removal", (hits, sums), again=True)
         return sums
 
     def residual_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
@@ -231,7 +231,7 @@ class Renderer:
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, 6)
         residual = self._residual(view, target)
-        self._blend(view, "blend_both", (hits, sums, view.buffers.image, residual), again=True)
+        self._blend(view, "blend_both", (hits, sums, residual), again=True)
         return sums
 
     def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
@@ -250,7 +250,7 @@ class Renderer:
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, GRADIENT_SUMS)
         residual = self._residual(view, target)
-        self._blend(view, "blend_backward", (hits, sums, view.buffers.image, residual), again=True)
+        self._blend(view, "blend_backward", (hits, sums, residual), again=True)
         return sums
 
     def _residual(self, view: _View, target: np.ndarray) -> Any:

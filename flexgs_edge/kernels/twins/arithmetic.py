@@ -14,7 +14,6 @@ from flexgs_edge.constants import (
     LOG2_ALPHA_MAX,
     LOG2_PIVOT,
     LOG2_POLY,
-    RECIPROCAL_PIVOT,
 )
 
 f32 = np.float32
@@ -87,11 +86,3 @@ def splat_exponent(*parts: np.ndarray) -> np.ndarray:
     exponent = fma(-slope, dx, row)
     highest = np.where(level < f32(LOG2_ALPHA_MAX), level, f32(LOG2_ALPHA_MAX))
     return np.where(exponent < highest, exponent, highest)
-
-
-def reciprocal(x: np.ndarray) -> np.ndarray:
-    """1 / x of 2^-10 <= x <= 1, as `reciprocal` in common.clh."""
-    r = (np.int32(RECIPROCAL_PIVOT) - x.view(np.int32)).view(f32)
-    for _ in range(3):
-        r = fma(r, fma(-x, r, f32(1)), r)
-    return r

@@ -21,7 +21,7 @@ from flexgs_edge.constants import (
     TILE,
     TRANSMITTANCE_MIN,
 )
-from flexgs_edge.kernels.twins.arithmetic import f32, fexp2_within, fma, reciprocal, splat_exponent
+from flexgs_edge.kernels.twins.arithmetic import f32, fexp2_within, fma, splat_exponent
 
 TILES_AT_ONCE = 256
 """Bounds the twin's memory: block lists and, for statistics, one float a pixel of each listed block."""
@@ -151,11 +151,13 @@ def blend(
     image: np.ndarray,
     hits: np.ndarray | None = None,
     sums: np.ndarray | None = None,
-    target: np.ndarray | None = None,
     rest: np.ndarray | None = None,
     stats: int = 0,
 ) -> None:
-    """Blend the tile lists into `state`, and into `image` ([3, padded height, padded width]) at the end."""
+    """Blend the tile lists into `state`, and into `image` ([3, padded height, padded width]) at the end.
+
+    Statistics of more than hits and weights read a finished `image` instead.
+    """
     tile_ends = np.concatenate([[0], ends[(blocks - 1) * size[0] : blocks * size[0]].astype(np.int64)])
     background = np.array([background_r, background_g, background_b], f32)
     for first in range(0, size[0], TILES_AT_ONCE):
@@ -174,16 +176,16 @@ def blend(
             colour = np.zeros((3, len(unit), 16), f32)
             trans = np.where((px < f32(width)) & (py < f32(height)), f32(1), f32(-1))
         ys, xs = py.astype(np.int64), px.astype(np.int64)
-        own_target = target.reshape(image.shape)[:, ys, xs] if stats > 1 and target is not None else None
-        own_rest = own_target if rest is None else rest.reshape(image.shape)[:, ys, xs]
-        if stats == 5 and not resume and own_target is not None and own_rest is not None:
-            # What lies behind a splat, times the residual, goes on in the place of red.
-            red, green, blue = (own_target[c] for c in range(3))
+        own_rest = None if rest is None else rest.reshape(image.shape)[:, ys, xs]
+        whole = image[:, ys, xs] if stats in (2, 4, 5) else None
+        if stats == 5 and not resume and whole is not None and own_rest is not None:
+            # What is still to come in a pixel, times the residual, goes on in the place of red.
+            red, green, blue = whole
             colour[0] = fma(blue, own_rest[2], fma(green, own_rest[1], red * own_rest[0]))
-        entries = _blend_blocks(lists, part[:, 0], records, (px, py), colour, trans, stats, own_target, own_rest)
+        entries = _blend_blocks(lists, part[:, 0], records, (px, py), colour, trans, stats, whole, own_rest)
         if entries is not None and hits is not None and sums is not None:
             _add_sums(stats, size[0], lists, entries, own_rest, part[:, 0], hits, sums)
-        if finish and stats == 5:
+        if finish and stats > 1:
             continue
         if finish:
             image[:, ys, xs] = fma(np.abs(trans), background[:, None, None], colour)
@@ -200,7 +202,7 @@ def _blend_blocks(
     colour: np.ndarray,
     trans: np.ndarray,
     stats: int,
-    target: np.ndarray | None,
+    whole: np.ndarray | None,
     rest: np.ndarray | None,
 ) -> _Entries | None:
     """Blend every block's list into `colour` and `trans`; returns what the statistics need when asked for."""
@@ -229,28 +231,26 @@ def _blend_blocks(
         after = fma(-alpha, t, t)
         hit = seen & (after >= f32(TRANSMITTANCE_MIN))
         weight = np.where(hit, alpha * t, f32(0))
-        for c in range(3 if stats != 5 else 0):
-            colour[c, units] = fma(weight, r[:, 6 + c : 7 + c], colour[c, units])
+        own = [r[:, 6 + c : 7 + c] for c in range(3)]
         trans[units] = np.where(hit, after, np.where(seen, -np.abs(t), t))
+        if stats not in (3, 5):
+            for c in range(3):
+                colour[c, units] = fma(weight, own[c], colour[c, units])
         if not stats:
             continue
         entries.hit[entry], entries.weight[entry] = hit, weight
-        if stats in (2, 4, 5):
-            assert target is not None
-            cr, cg, cb = (r[:, 6 + c : 7 + c] for c in range(3))
-            if stats == 5:
-                assert rest is not None
-                light = weight * fma(cb, rest[2, units], fma(cg, rest[1, units], cr * rest[0, units]))
-                colour[0, units] -= light
-                ratio = np.where(hit, alpha / (f32(1) - alpha), f32(0))
-                light = fma(-ratio, colour[0, units], light)
-                entries.error[entry] = np.where(alpha < f32(ALPHA_MAX), light, f32(0))
-                entries.place[0, entry], entries.place[1, entry] = dx, dy
-            else:
-                ratio = np.where(hit, alpha * reciprocal(f32(1) - alpha), f32(0))
-                behind = (target[c, units] - colour[c, units] for c in range(3))
-                er, eg, eb = (fma(weight, own, -(ratio * b)) for own, b in zip((cr, cg, cb), behind, strict=True))
-                entries.error[entry] = fma(eb, eb, fma(eg, eg, er * er))
+        ratio = weight / trans[units]
+        if stats in (2, 4):
+            assert whole is not None
+            er, eg, eb = (fma(own[c], trans[units], colour[c, units] - whole[c, units]) for c in range(3))
+            entries.error[entry] = ratio * ratio * fma(eb, eb, fma(eg, eg, er * er))
+        elif stats == 5:
+            assert rest is not None
+            light = fma(own[2], rest[2, units], fma(own[1], rest[1, units], own[0] * rest[0, units]))
+            slope = ratio * fma(light, t, -colour[0, units])
+            entries.error[entry] = np.where(alpha < f32(ALPHA_MAX), slope, f32(0))
+            entries.place[0, entry], entries.place[1, entry] = dx, dy
+            colour[0, units] = fma(-weight, light, colour[0, units])
     return entries if stats else None
 
 
