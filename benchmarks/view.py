@@ -1,4 +1,4 @@
-"""Views: ms by stage and ns by tile pair, hits and costs over the training views, steps of a descent, the first image of a process.
+"""Views: ms by stage and ns by tile pair, hits and costs of training views, steps of a descent, the first image of a process.
 
 python -m benchmarks.view [--scene fox|sample] [--device SPEC] [--repeats N]
 """
