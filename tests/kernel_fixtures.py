@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -180,6 +182,18 @@ class PairedBackend:
         """Write to both."""
         self.device.write(array.device, values, offset)
         self.twin.write(array.host, values, offset)
+
+    @contextmanager
+    def mapped(self, array: _PairedArray) -> Iterator[np.ndarray]:
+        """What is written goes to both."""
+        with self.twin.mapped(array.host) as values:
+            yield values
+        with self.device.mapped(array.device) as ours:
+            ours[...] = values
+
+    def mark(self) -> Callable[[], None]:
+        """The device's."""
+        return self.device.mark()
 
     def read(self, array: _PairedArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
         """Read the device's."""

@@ -19,7 +19,7 @@ import numpy as np
 from flexgs_edge.adapt import Measurement, Target
 from flexgs_edge.adapt.line import AIM, next_point
 from flexgs_edge.best.choice import BitModel, choose, drop_bands
-from flexgs_edge.best.effort import MENDED, Effort
+from flexgs_edge.best.effort import Effort
 from flexgs_edge.best.kept import Kept, Mended
 from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
 from flexgs_edge.best.results import (
@@ -315,8 +315,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         """Loss after the first whole result's refit, or descent, over the loss before it, as far as it is known before."""
         if self.steps:
             return DISTILLED
-        first = self.effort.mended if len(self.path.cameras) <= self.effort.few else MENDED
-        return first * FURTHER ** (self.effort.refit_rounds - 1)
+        return self.effort.mended * FURTHER ** (self.effort.refit_rounds - 1)
 
     def _choice(self, multiplier: float) -> tuple[Kept, Steps]:
         """What a multiplier keeps, with the colours of the last refit, and the grid steps."""

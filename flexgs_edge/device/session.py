@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 import warnings
 from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -61,6 +63,8 @@ class Session:
         assert info.handle is not None
         self.context = cl.Context([info.handle])
         self.queue = cl.CommandQueue(self.context)
+        # Of its own: filling an array that no kernel uses must not wait for the kernels of others.
+        self._maps = cl.CommandQueue(self.context)
         self.compile_seconds = 0.0
         self.profile: defaultdict[str, float] | None = None
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
@@ -112,6 +116,22 @@ class Session:
             cl.enqueue_copy(
                 self.queue, array.buffer, values, dst_offset=offset * array.dtype.itemsize, is_blocking=True
             )
+
+    @contextmanager
+    def mapped(self, array: DeviceArray) -> Iterator[np.ndarray]:
+        """`array`, which no kernel uses, on the host to be written: what is in it may be gone. The device has it afterwards."""
+        flags = cl.map_flags.WRITE_INVALIDATE_REGION
+        values, _ = cl.enqueue_map_buffer(self._maps, array.buffer, flags, 0, array.shape, array.dtype)
+        try:
+            yield values
+        finally:
+            values.base.release(self._maps).wait()
+
+    def mark(self) -> Callable[[], None]:
+        """What waits for everything enqueued so far."""
+        marker: cl.Event = cl.enqueue_marker(self.queue)
+        self.queue.flush()
+        return marker.wait
 
     def read(self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
         """Copy `array` (from the flat element `offset` on, as much as `out` holds) to the host, waiting for the queue."""

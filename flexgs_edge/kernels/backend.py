@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -118,6 +119,15 @@ class Backend(Protocol):
     def write(self, array: Any, values: np.ndarray, offset: int = 0) -> None:
         """Copy values into an array."""
 
+    def mapped(self, array: Any) -> AbstractContextManager[np.ndarray]:
+        """An array that is not empty on the host, to be written without a copy where the device shares the host's memory.
+
+        What was in it may be gone; the device has what is in it at the end. Does not wait for kernels: none may use the array.
+        """
+
+    def mark(self) -> Callable[[], None]:
+        """What waits for all kernels launched so far, and for none that is launched later."""
+
     def read(self, array: Any, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
         """Copy an array out."""
 
@@ -180,6 +190,14 @@ class TwinBackend:
         """Copy `values` to the flat element `offset` of `array`."""
         values = np.ascontiguousarray(values, array.data.dtype)
         array.data.reshape(-1)[offset : offset + values.size] = values.reshape(-1)
+
+    def mapped(self, array: HostArray) -> AbstractContextManager[np.ndarray]:
+        """The array itself."""
+        return nullcontext(array.data)
+
+    def mark(self) -> Callable[[], None]:
+        """Kernels have run when `launch` returns."""
+        return lambda: None
 
     def read(self, array: HostArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
         """Copy `array` out, from the flat element `offset` on."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -83,6 +85,14 @@ class OpenCLBackend:
     def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0) -> None:
         """Copy `values` to the flat element `offset` of `array`."""
         self.session.write(array, values, offset)
+
+    def mapped(self, array: DeviceArray) -> AbstractContextManager[np.ndarray]:
+        """`array` on the host, to be written."""
+        return self.session.mapped(array)
+
+    def mark(self) -> Callable[[], None]:
+        """What waits for all kernels launched so far."""
+        return self.session.mark()
 
     def read(self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
         """Copy `array` to the host."""

@@ -20,7 +20,7 @@ from flexgs_edge.render.device_scene import (
     MOST_SUMS,
     padded,
     plane_bytes,
-    upload_bytes,
+    streamed_bytes,
 )
 from flexgs_edge.render.renderer import FIRST_SHARE
 from flexgs_edge.render.view_buffers import chunk_shapes, shapes_bytes, target_bytes, view_bytes
@@ -138,13 +138,13 @@ def needed_bytes(
 def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:
     """Bytes that the first view of a search in scratch files needs; one that shows more than `FIRST_SHARE` says needs more."""
     rows, shown = padded(min(COMPACT_ROWS, source.count)), -(-source.count // FIRST_SHARE)
-    chunk = rows * (plane_bytes(source.sh_degree) + upload_bytes(source.sh_degree)) + shapes_bytes(chunk_shapes(rows))
+    chunk = rows * streamed_bytes(source.sh_degree) + shapes_bytes(chunk_shapes(rows))
     return view_bytes(renderer.backend, shown, largest) + target_bytes(largest) + sum_bytes(MOST_SUMS) * shown + chunk
 
 
 def _least_bytes(renderer: Renderer, source: SceneSource, camera: Camera, sum_bytes: int) -> int:
     """Bytes that a view of `source` with targets and sums of `sum_bytes` a row needs at the least, nothing being loaded."""
-    chunk = padded(min(MIN_CHUNK_ROWS, source.count)) * (plane_bytes(source.sh_degree) + upload_bytes(source.sh_degree))
+    chunk = padded(min(MIN_CHUNK_ROWS, source.count)) * streamed_bytes(source.sh_degree)
     view = view_bytes(renderer.backend, source.count, camera) + target_bytes(camera)
     return view + sum_bytes * source.count + chunk
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,9 +39,13 @@ def plane_bytes(sh_degree: int) -> int:
     return 4 * (3 + 6 + 1 + 3 + FIELD["sh_rest"].width(sh_degree))
 
 
-def upload_bytes(sh_degree: int) -> int:
-    """Bytes a row that loading needs on top for a moment: stored scale, rotation, opacity, and all planes on the host."""
-    return 4 * (3 + 4 + 1) + 4 * (3 + 3 + 4 + 1 + 3 + FIELD["sh_rest"].width(sh_degree))
+RAW_BYTES = 4 * (3 + 4 + 1)
+"""Bytes a row that loading needs on top for a moment: stored scale, rotation, opacity."""
+
+
+def streamed_bytes(sh_degree: int) -> int:
+    """Bytes a row of a streamed chunk, and of the one that is loaded while it is drawn."""
+    return 2 * (plane_bytes(sh_degree) + RAW_BYTES)
 
 
 @dataclass
@@ -73,27 +78,35 @@ def padded(count: int) -> int:
     return -(-count // LANES) * LANES
 
 
-def activate_chunk(
-    backend: Backend, base: int, count: int, degree: int, planes: dict[str, Any], antialiased: bool = False
-) -> Chunk:
-    """Activate stored planes (arrays of the backend with `padded(count)` columns) and free what is not needed after."""
-    stride = padded(count)
-    cov = backend.array((6, stride), np.float32)
-    log2_opacity = backend.array((stride,), np.float32)
-    backend.launch(
-        "activate",
-        (stride,),
-        stride,
-        int(antialiased),
-        planes["log_scales"],
-        planes["quats"],
-        planes["opacity_logits"],
-        cov,
-        log2_opacity,
-    )
-    for name in ("log_scales", "quats", "opacity_logits"):
-        planes[name].release()
-    return Chunk(base, count, stride, degree, planes["means"], cov, log2_opacity, planes["sh_dc"], planes["sh_rest"])
+class _ChunkArrays:
+    """What a chunk lies in on the backend: stored planes, and what they are activated to."""
+
+    def __init__(self, backend: Backend, degree: int, stride: int) -> None:
+        self.backend, self.degree, self.stride = backend, degree, stride
+        shapes = {name: (field.width(degree), stride) for name, field in FIELD.items()}
+        self.stored = {name: backend.array(shape, np.float32) for name, shape in shapes.items()}
+        self.cov = backend.array((6, stride), np.float32)
+        self.log2_opacity = backend.array((stride,), np.float32)
+
+    def activated(self, base: int, count: int, antialiased: bool) -> Chunk:
+        """The chunk of the rows that are stored."""
+        stored, stride = self.stored, self.stride
+        self.backend.launch(
+            "activate", (stride,), stride, int(antialiased), stored["log_scales"], stored["quats"],
+            stored["opacity_logits"], self.cov, self.log2_opacity,
+        )  # fmt: skip
+        colours = stored["sh_dc"], stored["sh_rest"]
+        return Chunk(base, count, stride, self.degree, stored["means"], self.cov, self.log2_opacity, *colours)
+
+    def release_raw(self) -> None:
+        """Free what is not needed once it is activated."""
+        for name in ("log_scales", "quats", "opacity_logits"):
+            self.stored[name].release()
+
+    def release(self) -> None:
+        """Free everything."""
+        for array in (*self.stored.values(), self.cov, self.log2_opacity):
+            array.release()
 
 
 class SourcePlanes:
@@ -104,22 +117,20 @@ class SourcePlanes:
         self.source = source
         self.count, self.sh_count, self.sh_degree = source.count, source.sh_count, source.sh_degree
         self.origin = source.origin
-        self.upload_bytes = upload_bytes(source.sh_degree)
         self.bounds: dict[int, ChunkBounds] = {}
         """Of the chunks loaded so far, by their first rows."""
 
-    def load(self, start: int, stop: int, degree: int) -> dict[str, Any]:
-        """Arrays of the backend, [width, padded(stop - start)], by field name."""
-        stride = padded(stop - start)
-        names = [name for name in FIELD if degree or name != "sh_rest"]
-        host = self.source.read(slice(start, stop), names)
-        self.bounds[start] = ChunkBounds.of(host["means"], host["log_scales"])
-        planes = {}
-        for name, field in FIELD.items():
-            planes[name] = self.backend.array((field.width(degree), stride), np.float32)
-            for channel in range(field.width(degree)):
-                self.backend.write(planes[name], host[name][channel], channel * stride)
-        return planes
+    def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
+        """Fill arrays of the backend, [width, padded(stop - start)] by field name."""
+        with ExitStack() as maps:
+            host = {
+                name: maps.enter_context(self.backend.mapped(array))[:, : stop - start]
+                for name, array in planes.items()
+                if array.shape[0]
+            }
+            self.source.read(slice(start, stop), list(host), host)
+            if start not in self.bounds:
+                self.bounds[start] = ChunkBounds.of(host["means"], host["log_scales"])
 
     def close(self) -> None:
         """Nothing is held."""
@@ -132,7 +143,6 @@ class QuantizedPlanes:
         self.backend = backend
         self.count, self.sh_count, self.sh_degree = quantized.count, quantized.sh_count, quantized.sh_degree
         self.origin = quantized.origin
-        self.upload_bytes = 4 * (3 + 4 + 1)
         self.bounds: dict[int, ChunkBounds] = {}  # every view reads all chunks
         self._arrays: dict[str, tuple[QuantizedArray, Any, Any, Any]] = {}
         for name, array in quantized.arrays.items():
@@ -145,22 +155,19 @@ class QuantizedPlanes:
             backend.write(step, array.step)
             self._arrays[name] = (array, codes, low, step)
 
-    def load(self, start: int, stop: int, degree: int) -> dict[str, Any]:
-        """Arrays of the backend, [width, padded(stop - start)], by field name."""
-        rows, stride = stop - start, padded(stop - start)
-        planes = {}
-        for name, field in FIELD.items():
-            width = field.width(degree)
-            planes[name] = self.backend.array((width, stride), np.float32)
+    def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
+        """Fill arrays of the backend, [width, padded(stop - start)] by field name."""
+        rows = stop - start
+        for name, plane in planes.items():
+            width, stride = plane.shape
             if width == 0:
                 continue
             array, codes, low, step = self._arrays[name]
             size = (-(-rows // DEQUANTIZE_ROWS), width)
             self.backend.launch(
                 "dequantize", size, array.count, array.groups, array.bits, array.planes.shape[1], start, rows, stride,
-                codes, low, step, planes[name],
+                codes, low, step, plane,
             )  # fmt: skip
-        return planes
 
     def close(self) -> None:
         """Free codes and ranges."""
@@ -214,7 +221,7 @@ class DeviceScene:
         self._budget = budget
         self._resident: list[Chunk] = []
         self._rows = 0
-        self._chunk_row_bytes = plane_bytes(planes.sh_degree) + planes.upload_bytes
+        self._chunk_row_bytes = streamed_bytes(planes.sh_degree)
         self._least_rows = min(MIN_CHUNK_ROWS, max(self.count, 1))
 
     @property
@@ -268,18 +275,19 @@ class DeviceScene:
 
     def _decide(self) -> None:
         """Load the scene if it fits, else find the rows of a streamed chunk (fixed from then on)."""
-        planes, budget, later = self._planes, self._budget, self.later_bytes
+        budget, later = self._budget, self.later_bytes
         if self.shown is not None:
             self._rows = min(COMPACT_ROWS, max(self.count, 1))
             self._streamed = True
             return
         most = min(CHUNK_ROWS, max(self.count, 1))
         whole = self.whole_bytes + later
-        fits = budget.free >= whole + padded(self._rows or self._least_rows) * planes.upload_bytes
+        fits = budget.free >= whole + padded(self._rows or self._least_rows) * RAW_BYTES
         if not self._rows:
             spare = budget.free - whole if fits else budget.free - later
-            per_row = planes.upload_bytes if fits else self._chunk_row_bytes
-            self._rows = max(min(most, spare // per_row - LANES), self._least_rows)
+            per_row = RAW_BYTES if fits else self._chunk_row_bytes
+            # Whole vectors: chunks and the sums over them are padded at the ends of the scene's two parts alone.
+            self._rows = max(min(most, (spare // per_row // LANES - 2) * LANES), self._least_rows)
         if fits:
             self._resident = [self._load(*span) for span in self._spans()]
         # Not asked again in the middle of a view, when part of what it left free is taken.
@@ -307,28 +315,46 @@ class DeviceScene:
         return np.array([*(start for start, _, _ in self._spans()), self.count], np.int64)
 
     def _load(self, start: int, stop: int, degree: int) -> Chunk:
-        planes = self._planes.load(start, stop, degree)
-        return activate_chunk(self.backend, start, stop - start, degree, planes, self.antialiased)
+        """A chunk that stays."""
+        arrays = _ChunkArrays(self.backend, degree, padded(stop - start))
+        self._planes.load(start, stop, arrays.stored)
+        chunk = arrays.activated(start, stop - start, self.antialiased)
+        arrays.release_raw()
+        return chunk
 
     def chunks(self, wanted: Callable[[ChunkBounds], bool] | None = None) -> Iterator[Chunk]:
-        """The scene's chunks in row order; a streamed chunk lives until the next one is asked for.
+        """The scene's chunks in row order; a streamed chunk lives until the one after the next is asked for.
 
-        Streamed chunks that were loaded before and whose bounds are not `wanted` are left out, and not read.
+        So the next can be loaded while kernels that were launched with this one run. Streamed chunks that were loaded before and
+        whose bounds are not `wanted` are left out, and not read.
         """
         if not self.resident and not self._streamed:
             self._decide()
         if self.resident:
             yield from self._resident
             return
-        for span in self._spans():
-            bounds = self._planes.bounds.get(span[0])
-            if wanted is not None and bounds is not None and not wanted(bounds):
-                continue
-            chunk = self._load(*span)
-            try:
-                yield chunk
-            finally:
-                chunk.release()
+        # At most two, the older one first, each with what waits for the kernels that use it.
+        slots: list[tuple[_ChunkArrays, Callable[[], None]]] = []
+        try:
+            for start, stop, degree in self._spans():
+                bounds = self._planes.bounds.get(start)
+                if wanted is not None and bounds is not None and not wanted(bounds):
+                    continue
+                stride, arrays = padded(stop - start), None
+                if len(slots) == 2:
+                    arrays, wait = slots.pop(0)
+                    wait()
+                    if (arrays.degree, arrays.stride) != (degree, stride):
+                        arrays.release()
+                        arrays = None
+                arrays = arrays or _ChunkArrays(self.backend, degree, stride)
+                slots.append((arrays, lambda: None))
+                self._planes.load(start, stop, arrays.stored)
+                yield arrays.activated(start, stop - start, self.antialiased)
+                slots[-1] = arrays, self.backend.mark()
+        finally:
+            for arrays, _ in slots:
+                arrays.release()
 
     def refresh(self, *fields: str) -> None:
         """Read `sh_dc` or `sh_rest` again from a source whose values have changed (streamed chunks do so anyway)."""

@@ -45,6 +45,8 @@ CAPACITY_STEP = 1 << 16
 """Compact views make room for multiples of so many rows: views of about one size then share their buffers."""
 FIRST_SHARE = 4
 """Part of a scene's rows (one in four) that a compact view has room for until one shows more."""
+CHUNK_TYPES = (np.float32, np.uint32, np.uint32)
+"""Of records, keys and bounds."""
 GROWTH = 1.1
 """Room beyond what the part of a view that was seen lets expect."""
 
@@ -331,21 +333,24 @@ class Renderer:
 
     def _fill_compact(self, scene: DeviceScene, record: np.ndarray, buffers: ViewBuffers) -> tuple[np.ndarray, int]:
         """[m] u32, rows shown, and up to which row of the scene: where they are more than there is room for, it stops."""
-        backend, (records, keys, bounds) = self.backend, buffers.chunk
+        backend = self.backend
         assert buffers.rows is not None
         found: list[np.ndarray] = []
         at = 0
-        for chunk in scene.chunks(lambda bounds: bounds.seen(record, bool(self.inria_extent))):
+        # Made once: fresh pages for every chunk took longer than the copies.
+        on_host = [np.empty(array.shape, dtype) for array, dtype in zip(buffers.chunk, CHUNK_TYPES, strict=True)]
+        chunks = scene.chunks(lambda bounds: bounds.seen(record, bool(self.inria_extent)))
+        following = next(chunks, None)
+        while chunk := following:
             self._project_chunk(scene, chunk, 0, buffers, buffers.chunk)
-            depth = backend.read(keys, np.empty(chunk.count, np.uint32))
-            shown = np.flatnonzero(depth != CULLED)
+            following = next(chunks, None)  # loaded while the kernel runs
+            splats, depths, counts = map(backend.read, buffers.chunk, (values[: chunk.count] for values in on_host))
+            shown = np.flatnonzero(depths != CULLED)
             if at + len(shown) > buffers.rows:
                 return np.concatenate([*found, shown]), chunk.base + chunk.count
-            backend.write(
-                buffers.records, backend.read(records, np.empty((chunk.count, 16), np.float32))[shown], 16 * at
-            )
-            backend.write(buffers.keys, depth[shown], at)
-            backend.write(buffers.bounds, backend.read(bounds, np.empty(chunk.count, np.uint32))[shown], at)
+            backend.write(buffers.records, splats[shown], 16 * at)
+            backend.write(buffers.keys, depths[shown], at)
+            backend.write(buffers.bounds, counts[shown], at)
             found.append((chunk.base + shown).astype(np.uint32))
             at += len(shown)
         return np.concatenate(found) if found else np.zeros(0, np.uint32), scene.count
