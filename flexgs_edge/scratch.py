@@ -89,9 +89,11 @@ class _Map(mmap.mmap):
 
     room: Scratch
     address: int
+    descriptor: int
 
     def __del__(self) -> None:
         self.room.used -= len(self)
+        os.close(self.descriptor)
 
 
 class Scratch(Room):
@@ -151,9 +153,9 @@ class Scratch(Room):
             try:
                 _reserve(file.fileno(), size)
                 held = _Map(file.fileno(), size)
+                held.room, held.descriptor = self, os.dup(file.fileno())
             except OSError as error:
                 raise self.full(size, error) from error
-        held.room = self
         if hasattr(mmap, "MADV_RANDOM"):
             # Of one row of values the kernel may read ahead. Of planes, a part of the rows is a piece of each: a disk that reads
             # 8 MiB ahead read 180 GB for 1 M Gaussians under a cap of 512 MiB. `fetch` asks for those pieces instead.
@@ -225,11 +227,8 @@ def fetch(values: np.ndarray, rows: slice) -> None:
     rows : slice
         `slice(start, stop)`.
     """
-    base: Any = values
-    while isinstance(base, np.ndarray):
-        base = base.base
-    held = base.obj if isinstance(base, memoryview) else base
-    if not isinstance(held, _Map) or not hasattr(mmap, "MADV_WILLNEED"):
+    held = _map_of(values)
+    if held is None or not hasattr(mmap, "MADV_WILLNEED"):
         return
     first, page = values.ctypes.data - held.address, mmap.PAGESIZE
     low, high = (values.strides[-1] * row for row in (rows.start, rows.stop))
@@ -238,6 +237,42 @@ def fetch(values: np.ndarray, rows: slice) -> None:
         start, stop = (at + low) // page * page, at + high
         if stop > start:
             held.madvise(mmap.MADV_WILLNEED, start, stop - start)
+
+
+def copy_rows(values: np.ndarray, rows: slice, out: np.ndarray) -> None:
+    """`out[...] = values[..., rows]`; a mapped array is read from its file, while other threads go on.
+
+    Parameters
+    ----------
+    values : np.ndarray
+        [..., n], planes C-contiguous.
+    rows : slice
+        `slice(start, stop)`.
+    out : np.ndarray
+        [..., stop - start], planes C-contiguous, of the same type.
+    """
+    held = _map_of(values)
+    if held is None or not hasattr(os, "preadv"):
+        out[...] = fetched(values, rows)
+        return
+    first = values.ctypes.data - held.address + rows.start * values.itemsize
+    for place in np.ndindex(values.shape[:-1]):
+        at = first + sum(number * stride for number, stride in zip(place, values.strides, strict=False))
+        left = out[place].data.cast("B")
+        while left:
+            size = os.preadv(held.descriptor, [left], at)
+            if not size:
+                raise EOFError(f"a scratch file ends at byte {at}")
+            left, at = left[size:], at + size
+
+
+def _map_of(values: np.ndarray) -> _Map | None:
+    """The mapped file that an array lies in."""
+    base: Any = values
+    while isinstance(base, np.ndarray):
+        base = base.base
+    held = base.obj if isinstance(base, memoryview) else base
+    return held if isinstance(held, _Map) else None
 
 
 def fetched(values: np.ndarray, rows: slice) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -76,6 +77,10 @@ class Chunk:
 def padded(count: int) -> int:
     """Elements of a plane that holds `count` rows."""
     return -(-count // LANES) * LANES
+
+
+def _nothing() -> None:
+    """Waits for no kernel."""
 
 
 class _ChunkArrays:
@@ -323,38 +328,61 @@ class DeviceScene:
         return chunk
 
     def chunks(self, wanted: Callable[[ChunkBounds], bool] | None = None) -> Iterator[Chunk]:
-        """The scene's chunks in row order; a streamed chunk lives until the one after the next is asked for.
+        """The scene's chunks in row order; a streamed chunk lives until the next one is asked for, and is loaded before.
 
-        So the next can be loaded while kernels that were launched with this one run. Streamed chunks that were loaded before and
-        whose bounds are not `wanted` are left out, and not read.
+        Streamed chunks that were loaded before and whose bounds are not `wanted` are left out, and not read.
         """
         if not self.resident and not self._streamed:
             self._decide()
         if self.resident:
             yield from self._resident
             return
-        # At most two, the older one first, each with what waits for the kernels that use it.
-        slots: list[tuple[_ChunkArrays, Callable[[], None]]] = []
+        bounds = self._planes.bounds
+        spans = [span for span in self._spans() if wanted is None or span[0] not in bounds or wanted(bounds[span[0]])]
+        slots: list[_ChunkArrays] = []
+        # Kernels that use the chunk before the one that is asked for.
+        done: Callable[[], None] = _nothing
+        loader = ThreadPoolExecutor(1)
         try:
-            for start, stop, degree in self._spans():
-                bounds = self._planes.bounds.get(start)
-                if wanted is not None and bounds is not None and not wanted(bounds):
-                    continue
-                stride, arrays = padded(stop - start), None
-                if len(slots) == 2:
-                    arrays, wait = slots.pop(0)
-                    wait()
-                    if (arrays.degree, arrays.stride) != (degree, stride):
-                        arrays.release()
-                        arrays = None
-                arrays = arrays or _ChunkArrays(self.backend, degree, stride)
-                slots.append((arrays, lambda: None))
-                self._planes.load(start, stop, arrays.stored)
+            loaded = self._load_into(slots, loader, done, *spans[0]) if spans else None
+            for place, (start, stop, _) in enumerate(spans):
+                assert loaded is not None
+                arrays = loaded.result()
+                if place + 1 < len(spans):
+                    loaded = self._load_into(slots, loader, done, *spans[place + 1])
                 yield arrays.activated(start, stop - start, self.antialiased)
-                slots[-1] = arrays, self.backend.mark()
+                done = self.backend.mark()
         finally:
-            for arrays, _ in slots:
+            loader.shutdown()
+            for arrays in slots:
                 arrays.release()
+
+    def _load_into(
+        self,
+        slots: list[_ChunkArrays],
+        loader: Executor,
+        done: Callable[[], None],
+        start: int,
+        stop: int,
+        degree: int,
+    ) -> Future[_ChunkArrays]:
+        """Load a chunk on another thread, in place of the older of two, which `done` waits for the kernels of."""
+        stride, arrays = padded(stop - start), None
+        if len(slots) == 2:
+            arrays = slots.pop(0)
+            if (arrays.degree, arrays.stride) != (degree, stride):
+                done()
+                arrays.release()
+                arrays = None
+        arrays = arrays or _ChunkArrays(self.backend, degree, stride)
+        slots.append(arrays)
+
+        def load() -> _ChunkArrays:
+            done()
+            self._planes.load(start, stop, arrays.stored)
+            return arrays
+
+        return loader.submit(load)
 
     def refresh(self, *fields: str) -> None:
         """Read `sh_dc` or `sh_rest` again from a source whose values have changed (streamed chunks do so anyway)."""

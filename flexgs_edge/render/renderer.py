@@ -339,11 +339,8 @@ class Renderer:
         at = 0
         # Made once: fresh pages for every chunk took longer than the copies.
         on_host = [np.empty(array.shape, dtype) for array, dtype in zip(buffers.chunk, CHUNK_TYPES, strict=True)]
-        chunks = scene.chunks(lambda bounds: bounds.seen(record, bool(self.inria_extent)))
-        following = next(chunks, None)
-        while chunk := following:
+        for chunk in scene.chunks(lambda bounds: bounds.seen(record, bool(self.inria_extent))):
             self._project_chunk(scene, chunk, 0, buffers, buffers.chunk)
-            following = next(chunks, None)  # loaded while the kernel runs
             splats, depths, counts = map(backend.read, buffers.chunk, (values[: chunk.count] for values in on_host))
             shown = np.flatnonzero(depths != CULLED)
             if at + len(shown) > buffers.rows:

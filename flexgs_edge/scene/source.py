@@ -10,7 +10,7 @@ import numpy as np
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
-from flexgs_edge.scratch import fetched
+from flexgs_edge.scratch import copy_rows
 
 Planes = dict[str, np.ndarray]
 """Arrays by field name, each [width, n] f32."""
@@ -262,7 +262,10 @@ class MemorySource(SceneSource):
         rows, planes = self.begin_read(rows, fields, out)
         for field, plane in planes.items():
             values = self._planes[field]
-            plane[...] = fetched(values, rows) if isinstance(rows, slice) else values[:, rows]
+            if isinstance(rows, slice):
+                copy_rows(values, rows, plane)
+            else:
+                plane[...] = values[:, rows]
         return planes
 
 
