@@ -89,11 +89,11 @@ class _Map(mmap.mmap):
 
     room: Scratch
     address: int
-    descriptor: int
+    file: BinaryIO
 
     def __del__(self) -> None:
         self.room.used -= len(self)
-        os.close(self.descriptor)
+        self.file.close()
 
 
 class Scratch(Room):
@@ -149,13 +149,14 @@ class Scratch(Room):
         size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
         if size < _SMALL:
             return np.empty(shape, dtype)
-        with self.file() as file:
-            try:
-                _reserve(file.fileno(), size)
-                held = _Map(file.fileno(), size)
-                held.room, held.descriptor = self, os.dup(file.fileno())
-            except OSError as error:
-                raise self.full(size, error) from error
+        file = self.file()
+        try:
+            _reserve(file.fileno(), size)
+            held = _Map(file.fileno(), size)
+        except OSError as error:
+            file.close()
+            raise self.full(size, error) from error
+        held.room, held.file = self, file
         if hasattr(mmap, "MADV_RANDOM"):
             # Of one row of values the kernel may read ahead. Of planes, a part of the rows is a piece of each: a disk that reads
             # 8 MiB ahead read 180 GB for 1 M Gaussians under a cap of 512 MiB. `fetch` asks for those pieces instead.
@@ -249,10 +250,10 @@ def copy_rows(values: np.ndarray, rows: slice, out: np.ndarray) -> None:
     rows : slice
         `slice(start, stop)`.
     out : np.ndarray
-        [..., stop - start], planes C-contiguous, of the same type.
+        [..., stop - start], of the same type.
     """
     held = _map_of(values)
-    if held is None or not hasattr(os, "preadv"):
+    if held is None or not hasattr(os, "preadv") or out.strides[-1] != out.itemsize:
         out[...] = fetched(values, rows)
         return
     first = values.ctypes.data - held.address + rows.start * values.itemsize
@@ -260,7 +261,7 @@ def copy_rows(values: np.ndarray, rows: slice, out: np.ndarray) -> None:
         at = first + sum(number * stride for number, stride in zip(place, values.strides, strict=False))
         left = out[place].data.cast("B")
         while left:
-            size = os.preadv(held.descriptor, [left], at)
+            size = os.preadv(held.file.fileno(), [left], at)
             if not size:
                 raise EOFError(f"a scratch file ends at byte {at}")
             left, at = left[size:], at + size

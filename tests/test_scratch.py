@@ -17,7 +17,7 @@ from flexgs_edge import scratch
 from flexgs_edge.best.checkpoint import Checkpoint
 from flexgs_edge.best.path import lowest
 from flexgs_edge.errors import BudgetError, InputError
-from flexgs_edge.scratch import MEMORY, Room, Scratch, file_system_of, stable_order
+from flexgs_edge.scratch import MEMORY, Room, Scratch, copy_rows, file_system_of, stable_order
 
 COUNT = 40_000
 
@@ -37,6 +37,20 @@ def test_take_and_copy(room: Room) -> None:
         assert copied.flags.c_contiguous and copied.flags.writeable
     assert room.take(np.zeros((0, COUNT)), rows).shape == (0, len(rows))
     assert room.empty((3, 0), np.float32).shape == (3, 0)
+
+
+@pytest.mark.parametrize("shape", [(COUNT,), (3, COUNT), (2, 4, COUNT)])
+def test_copied_rows_are_those_of_the_array(room: Room, shape: tuple[int, ...]) -> None:
+    """Of a whole array and of some of its planes, into planes that are not next to each other, and into every second element."""
+    held = room.copy(np.random.default_rng(2).normal(size=shape).astype(np.float32))
+    held[..., 7] = 5  # not on the disk yet
+    for values in (held, held[1:]) if held.ndim > 1 else (held,):
+        for start, stop in ((0, COUNT), (5, 4097), (COUNT - 1, COUNT), (9, 9)):
+            wide = np.full((*values.shape[:-1], 3 * COUNT), -1, np.float32)
+            for out in (wide[..., : stop - start], wide[..., COUNT : COUNT + 2 * (stop - start) : 2]):
+                copy_rows(values, slice(start, stop), out)
+                np.testing.assert_array_equal(out, values[..., start:stop])
+            assert (wide[..., stop - start : COUNT] == -1).all() and (wide[..., COUNT + 1 :: 2] == -1).all()
 
 
 def test_what_is_fetched_is_what_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

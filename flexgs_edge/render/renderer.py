@@ -26,6 +26,7 @@ from flexgs_edge.render.view_buffers import (
     SORT_DIGIT_BITS,
     SORT_DIGITS,
     ViewBuffers,
+    chunk_shapes,
     target_bytes,
     view_bytes,
     view_key,
@@ -45,8 +46,6 @@ CAPACITY_STEP = 1 << 16
 """Compact views make room for multiples of so many rows: views of about one size then share their buffers."""
 FIRST_SHARE = 4
 """Part of a scene's rows (one in four) that a compact view has room for until one shows more."""
-CHUNK_TYPES = (np.float32, np.uint32, np.uint32)
-"""Of records, keys and bounds."""
 GROWTH = 1.1
 """Room beyond what the part of a view that was seen lets expect."""
 
@@ -338,7 +337,7 @@ class Renderer:
         found: list[np.ndarray] = []
         at = 0
         # Made once: fresh pages for every chunk took longer than the copies.
-        on_host = [np.empty(array.shape, dtype) for array, dtype in zip(buffers.chunk, CHUNK_TYPES, strict=True)]
+        on_host = [np.empty(shape, dtype) for shape, dtype in chunk_shapes(buffers.chunk[0].shape[0]).values()]
         for chunk in scene.chunks(lambda bounds: bounds.seen(record, bool(self.inria_extent))):
             self._project_chunk(scene, chunk, 0, buffers, buffers.chunk)
             splats, depths, counts = map(backend.read, buffers.chunk, (values[: chunk.count] for values in on_host))
