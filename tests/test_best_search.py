@@ -14,7 +14,6 @@ from flexgs_edge import grid
 from flexgs_edge.adapt import MaxDrop, Measurement, MinFidelity, Target
 from flexgs_edge.adapt.targets import MaxSize
 from flexgs_edge.best import search as search_module
-from flexgs_edge.best.choice import BitModel
 from flexgs_edge.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses
 from flexgs_edge.best.kept import Mended
 from flexgs_edge.best.path import Snapshot, take_rows
@@ -72,15 +71,11 @@ class World:
         self.loss, self.size, self.floor = loss, size, floor
         self.grids: list[GridScene] = []
         self.path = FakePath()
-        self.bits = BitModel(40.0, (12.0,))
 
     def size_of(self, grid: GridScene) -> int:
         self.grids.append(grid)
         assert self.multiplier is not None
         return round(self.size(self.multiplier))
-
-    def bits_of(self, grid: GridScene) -> BitModel:
-        return self.bits
 
     def measure(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         if self.multiplier is None:  # the walk down, before anything was coded: pruning alone
@@ -113,7 +108,7 @@ def search(
     words = {"effort": EFFORT, "refit": False, **words}
     World.multiplier = None
     world.path = path or FakePath()
-    found = RateSearch(world.path, world.size_of, world.bits_of, world.measure, **words)  # type: ignore[arg-type]
+    found = RateSearch(world.path, world.size_of, world.measure, **words)  # type: ignore[arg-type]
     return found.run(target, best_effort)
 
 

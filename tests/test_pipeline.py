@@ -16,15 +16,13 @@ import flexgs_edge
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.codec import FgsSource
 from flexgs_edge.errors import BudgetError, InputError, TargetError
-from flexgs_edge.pipeline.companions import companions_of
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.pipeline.contents import verify
 from flexgs_edge.pipeline.decompress import decompress
 from flexgs_edge.pipeline.evaluate import evaluate
 from flexgs_edge.pipeline.info import info, info_text
-from flexgs_edge.pipeline.inputs import find_views, read_scene
-from flexgs_edge.pipeline.judge import Judge
-from flexgs_edge.pipeline.options import CompressOptions, ViewOptions
+from flexgs_edge.pipeline.inputs import read_scene
+from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.pipeline.render import render_views
 from flexgs_edge.pipeline.score import score_gaussians
 from flexgs_edge.report.result import CompressResult
@@ -423,33 +421,6 @@ def test_a_scene_against_itself_is_identical(project: Path) -> None:
 def test_resolution_scales_views_and_says_so(project: Path) -> None:
     found = evaluate(project / "point_cloud.ply", project / "point_cloud.ply", device="numpy", resolution=20)
     assert (found.views.width, found.views.height) == (20, 15) and "scaled down" in found.views.notes[0]
-
-
-def test_references_that_do_not_fit_are_drawn_again(project: Path) -> None:
-    from flexgs_edge.pipeline.inputs import load_scene, resolve_drawing
-    from flexgs_edge.pipeline.workspace import Stopwatch, Workspace
-
-    companions, scene = companions_of(project / "point_cloud.ply"), load_scene(project / "point_cloud.ply")
-    options = resolve_drawing(ViewOptions(device="numpy"), scene, companions)
-    views = find_views(options, companions, scene.source)
-    assert views is not None
-    found = []
-    for share in (4, 10**9):
-        budget = MemoryBudget(2**28)
-        with Workspace(options, budget, Stopwatch()) as workspace, pytest.MonkeyPatch.context() as patch:
-            patch.setattr("flexgs_edge.pipeline.judge.SHARE", share)
-            before = budget.used
-            judge = Judge(workspace.renderer, scene.source, views, [0, 3, 8], budget)
-            with workspace.renderer.load(scene.source) as loaded:
-                judge.prepare(loaded)
-            some = scene.source.select(np.arange(0, COUNT, 2))
-            with workspace.renderer.load(some) as loaded:
-                found.append(judge.compare(loaded))
-            assert judge.kept == (3 if share == 4 else 0)
-            workspace.renderer.release()
-            judge.close()
-            assert budget.used == before
-    assert found[0] == found[1]
 
 
 def test_info_of_a_file_adds_up(done: tuple[Path, CompressResult]) -> None:

@@ -126,10 +126,6 @@ class MultiplierSearch(ABC, Generic[Product]):
         self.bits = BitModel()
 
     @abstractmethod
-    def _calibrate(self, multiplier: float) -> None:
-        """Ask what Gaussians cost near the answer. Once: or every step would search another function."""
-
-    @abstractmethod
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, Product]:
         """The whole result at a multiplier, measured."""
 
@@ -149,9 +145,7 @@ class MultiplierSearch(ABC, Generic[Product]):
         """Search; raises `TargetError` with the closest point when nothing holds and `best_effort` is not set."""
         steps: list[RateStep] = []
         best: tuple[RateStep, Product] | None = None
-        multiplier = self._start(target)
-        self._calibrate(multiplier)
-        multiplier = self._aim(multiplier, steps, target)
+        multiplier = self._aim(self._start(target), steps, target)
         for count in range(self.effort.steps + EXTRA_STEPS):
             try:
                 step, product = self._whole(multiplier, target)
@@ -238,8 +232,6 @@ class RateSearch(MultiplierSearch[GridScene]):
     path : PrunePath
     size_of : callable
         Exact bytes of a grid's file.
-    bits_of : callable
-        What the coder takes for the Gaussians of a grid.
     measure : callable
         Quality of a grid's decoded planes.
     steps : int
@@ -250,7 +242,6 @@ class RateSearch(MultiplierSearch[GridScene]):
         self,
         path: PrunePath,
         size_of: Callable[[GridScene], int],
-        bits_of: Callable[[GridScene], BitModel],
         measure: Measure,
         effort: Effort,
         refit: bool = True,
@@ -258,17 +249,15 @@ class RateSearch(MultiplierSearch[GridScene]):
         steps: int = 0,
     ) -> None:
         super().__init__(path, measure, effort, on_step)
-        self.size_of, self.bits_of, self.refit, self.steps = size_of, bits_of, refit, steps
+        self.size_of, self.refit, self.steps = size_of, refit, steps
         if steps:
             self.pruned_part, self.keeps_best = PRUNED_DISTILLED, True
         self._slopes: Slopes | None = None
         self._mended: Mended | None = None
         self._descents: list[tuple[float, Mended]] = []
-        self._drift, self._expected = DRIFT_DISTILLED if steps else DRIFT, 0.0
-
-    def _calibrate(self, multiplier: float) -> None:
-        """Ask the coder what Gaussians cost near the answer. Once: or every step would search another function."""
-        self.bits = self.bits_of(self._unmended(multiplier))
+        # Where SH are not refitted, a result has nothing from the one before.
+        self._drift = DRIFT_DISTILLED if steps else DRIFT if effort.refit_rounds else 0.0
+        self._expected = 0.0
 
     def _unmended(self, multiplier: float) -> GridScene:
         kept, steps = self._choice(multiplier)
@@ -399,16 +388,17 @@ class RateSearch(MultiplierSearch[GridScene]):
         moved = values_of(grid, room)
         if self.refit:
             shared = (path.origin, path.cameras, path.targets)
-            moved = refit_colours(
-                path.renderer,
-                moved,
-                degrees,
-                *shared,
-                rounds=self.effort.refit_rounds,
-                subsets=self.effort.subsets_of(len(path.cameras)),
-                progress=path.progress,
-            )
-            self._mended = Mended.of(kept.rows, kept.degrees, order, moved, room)
+            if self.effort.refit_rounds:
+                moved = refit_colours(
+                    path.renderer,
+                    moved,
+                    degrees,
+                    *shared,
+                    rounds=self.effort.refit_rounds,
+                    subsets=self.effort.subsets_of(len(path.cameras)),
+                    progress=path.progress,
+                )
+                self._mended = Mended.of(kept.rows, kept.degrees, order, moved, room)
             grid = replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree]))
             coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], room), room)
             moved = refit_colours(

@@ -63,7 +63,7 @@ def grid_search(
 
     def make(path: PrunePath, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
         steps = distil_steps(options, len(path.cameras))
-        return search(path, size_of, coder.bits, measure, plan, options.refit, report, steps)
+        return search(path, size_of, measure, plan, options.refit, report, steps)
 
     return make
 
@@ -149,7 +149,7 @@ def kept_as_it_is(
     if round(layers_cost * size) > limit:
         return None
     with renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
-        measurement = measurement_of(judge.compare(scene))
+        measurement = measurement_of(judge.compare(scene, with_ssim=judge.reports))
     without = 1000 - min(round(1000 * grid.sh_count / grid.count), 1000)
     seconds = time.perf_counter() - started
     step = Step(Choice(0, without), size, measurement, target.excess(size, measurement), "multiplier", seconds)
@@ -232,7 +232,8 @@ def search_path(
 
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=source.origin)) as kept_scene:
-            return measurement_of(judge.estimate(kept_scene) if estimate else judge.compare(kept_scene))
+            quality = judge.estimate(kept_scene) if estimate else judge.compare(kept_scene, with_ssim=judge.reports)
+            return measurement_of(quality)
 
     def report(step: RateStep) -> None:
         if on_step:

@@ -308,11 +308,10 @@ class _Job:
         if self.workspace is None or self.views is None:
             return None, None
 
-        def judge(indices: list[int], photos: bool) -> Judge:
+        def judge(indices: list[int], reports: bool) -> Judge:
             assert self.workspace is not None and self.views is not None
-            return Judge(
-                self.workspace.renderer, self.source, self.views, indices, self.budget, photos, self.options.base_psnr
-            )
+            shared = (self.workspace.renderer, self.source, self.views, indices, self.budget)
+            return Judge(*shared, with_photos=reports, base_psnr=self.options.base_psnr, reports=reports)
 
         report = judge(self.plan.report, True)
         on_train = self.plan.decide != self.plan.report
@@ -392,11 +391,12 @@ class _Job:
     def _compare(self, load: Callable[[], DeviceScene], report: Judge) -> Quality:
         """Quality of what `load` brings to the device, over the views that report and (fidelity only) some training poses."""
         with self.clock.stage("measure"), load() as scene:
+            # First, since it brings the scene to the backend: the judge then sees whether it is what the search measured.
+            if self.training is not None:
+                self.trained = self.training.fidelity(scene)
             quality = report.compare(scene, with_ssim=True, progress=self.progress)
             if self.reporter is not None:
                 self.reporter.look(report, scene, quality, self.clock, self.progress)
-            if self.training is not None:
-                self.trained = self.training.fidelity(scene)
         return quality
 
     def _result(

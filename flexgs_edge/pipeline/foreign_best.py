@@ -53,9 +53,6 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         """Remove a file that is not the best any more."""
         product.path.unlink()
 
-    def _calibrate(self, multiplier: float) -> None:
-        """Nothing: a file more (minutes for `.sog`) would tell little that the format's own figures do not."""
-
     def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, WrittenFile]:
         started = time.perf_counter()
         kept = self.kept(multiplier)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack
@@ -266,6 +267,17 @@ class DeviceScene:
     def held_bytes(self) -> int:
         """Bytes that the loaded scene takes."""
         return sum(array.nbytes for chunk in self._resident for array in chunk.arrays)
+
+    def fingerprint(self) -> bytes | None:
+        """Digest of all that views are drawn from; None while that is not on the backend."""
+        if not self.resident:
+            return None
+        digest = hashlib.sha256(repr((self.count, self.origin.tolist(), self.antialiased)).encode())
+        for chunk in self._resident:
+            digest.update(repr((chunk.base, chunk.count, chunk.degree)).encode())
+            for array in chunk.arrays:
+                digest.update(self.backend.read(array)[..., : chunk.count].tobytes())
+        return digest.digest()
 
     def be_compact(self, shown: int) -> None:
         """From now on views have room for the rows that they show alone, for so many at first; the scene is streamed."""

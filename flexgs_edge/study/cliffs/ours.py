@@ -60,7 +60,6 @@ class FixedSearch(RateSearch):
 
     def at(self, multiplier: float) -> GridScene:
         """The first whole result at a multiplier."""
-        self._calibrate(multiplier)
         return self._whole(multiplier, MaxDrop(1.0, "modelled drop"))[1]
 
 

@@ -125,14 +125,11 @@ class _Pretended(RateSearch):
 
     def __init__(self, world: World, effort: str) -> None:
         nothing: Any = None
-        super().__init__(nothing, nothing, nothing, nothing, EFFORTS[effort], refit=False)
+        super().__init__(nothing, nothing, nothing, EFFORTS[effort], refit=False)
         self.world = world
 
     def _start(self, target: Target) -> float:
         return MIDDLE / 3
-
-    def _calibrate(self, multiplier: float) -> None:
-        pass
 
     def _probe(self, multiplier: float, target: Target) -> float:
         return target.excess(self.world.size_at(multiplier), self.world.measure_at(multiplier))
