@@ -125,7 +125,7 @@ MUTATIONS = (
     Mutation(
         "SH looked up in the opposite direction", "sh.clh", "dx = px - (FW)camera[21]", "dx = (FW)camera[21] - px"
     ),
-    Mutation("colours below 0 kept", "project.cl", "return fmax(c + (FW)0.5f, (FW)0.0f)", "return c + (FW)0.5f"),
+    Mutation("colours below 0 kept", "project.cl", "= fmax(colour + (FW)0.5f, (FW)0.0f)", "= colour + (FW)0.5f"),
     Mutation("depth order reversed", "project.cl", "as_uint(key_lanes[l]) :", "~as_uint(key_lanes[l]) :"),
     Mutation(
         "ties of depth in reversed order",

@@ -57,7 +57,7 @@ __kernel void peak(const uint rounds, __global const float *records, __global fl
 def bench_peak(bench: Bench, backend: OpenCLBackend) -> float:
     """Lanes a second of the arithmetic alone, on all cores."""
     session, width = backend.session, backend.width
-    source = load_source("activate.cl") + ARITHMETIC  # that file for the constants and helpers before it
+    source = load_source("dequantize.cl") + ARITHMETIC  # that file for the constants and helpers before it
     kernel = session.kernel(source, "peak", (f"-DW={width}",), "ubb")
     records = np.zeros((SPLATS, 16), np.float32)
     records[:, 0], records[:, 1] = np.arange(SPLATS) * 2, 1.5

@@ -9,10 +9,12 @@
 #define BLOCKS 16                // blocks of a tile
 #define RETIRE_EVERY 16          // splats between two looks for blocks whose pixels have all ended
 
-#ifndef STATS
-#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs, 5: gradients) must be defined"
+#if !defined(STATS) || !defined(BLEND)
+#error "BLEND (the kernel's name) and STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs, 5: gradients) must be defined"
 #endif
 
+#ifndef BLEND_HELPERS
+#define BLEND_HELPERS
 // Lane l of vector v is pixel (l + v W) of the block, row by row.
 inline FW lane_x(void) { return TO_F(LANE_INDEX & (IW)3); }
 inline FW lane_y(int v) { return TO_F((LANE_INDEX + (IW)(v * W)) >> 2); }
@@ -36,7 +38,6 @@ inline int any_alive(FW t) {
 #endif
 }
 
-#if STATS
 #define SUMS (STATS == 1 ? 1 : STATS == 2 ? 2 : STATS == 3 ? 4 : STATS == 4 ? 6 : 9)
 #if defined(cl_khr_int64_base_atomics) && defined(__ENDIAN_LITTLE__)
 #pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
@@ -75,9 +76,7 @@ inline uint lane_count(const IW *v) {
 #undef LANE_T
   return (uint)-((f.s0 + f.s2) + (f.s1 + f.s3));
 }
-#endif
 
-#if STATS > 1
 // A tile of an image, block by block.
 inline void load_blocks(__global const float *image, uint tiles_x, int height, int tile_px, int tile_py, FW *r, FW *g, FW *b) {
   const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
@@ -95,7 +94,7 @@ inline void load_blocks(__global const float *image, uint tiles_x, int height, i
 }
 #endif
 
-__kernel void blend(
+__kernel void BLEND(
     const uint tiles_x,
     const uint blocks,                    // rows of `ends`
     const int width,                      // pixels

@@ -6,12 +6,14 @@
 #if W != 1
 #error "the GPU form is scalar: build with -DW=1"
 #endif
-#ifndef STATS
-#error "STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs, 5: gradients) must be defined"
+#if !defined(STATS) || !defined(BLEND)
+#error "BLEND (the kernel's name) and STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs, 5: gradients) must be defined"
 #endif
 
 #define BATCH 64   // splats in local memory at a time
 
+#undef SUMS
+#undef SUM_UNIT
 #if STATS == 1
 #define SUMS 1
 #define SUM_UNIT FIXED_WEIGHT
@@ -29,7 +31,7 @@
 #define SUM_UNIT (c < 4 ? FIXED_WEIGHT : FIXED_MOMENT)
 #endif
 
-__kernel __attribute__((reqd_work_group_size(256, 1, 1))) void blend(
+__kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
     const uint tiles_x,
     const uint blocks,
     const int width,

@@ -5,16 +5,6 @@
 // position 21-23, width height 24-25, dilation 26.
 #define CAM(k) ((FW)camera[k])
 
-// One colour channel in direction (x, y, z); sh_rest holds the channel's coefficients above degree 0.
-inline FW sh_colour(__global const float *dc, __global const float *rest, size_t stride, size_t i, int degree,
-                    FW x, FW y, FW z) {
-  FW c = (FW)SH_C0 * LOADF(dc, i);
-#define ADD_BAND(k, basis) c = fma(basis, LOADF(rest, (size_t)(k) * stride + i), c)
-  FOR_EACH_BASIS(degree, x, y, z, ADD_BAND)
-#undef ADD_BAND
-  return fmax(c + (FW)0.5f, (FW)0.0f);
-}
-
 __kernel void project(
     const uint count,                       // rows of this chunk
     const uint stride,                      // elements of a plane, a multiple of 16
@@ -150,10 +140,14 @@ __kernel void project(
   if (ANY(shown)) {
     FW dx, dy, dz;
     view_direction(camera, px, py, pz, &dx, &dy, &dz);
-    const size_t rest = (size_t)((degree + 1) * (degree + 1) - 1) * s;
-    out[6] = sh_colour(sh_dc, sh_rest, s, i, degree, dx, dy, dz);
-    out[7] = sh_colour(sh_dc + s, sh_rest + rest, s, i, degree, dx, dy, dz);
-    out[8] = sh_colour(sh_dc + 2 * s, sh_rest + 2 * rest, s, i, degree, dx, dy, dz);
+    FW basis[24];
+    FOR_EACH_BASIS(degree, dx, dy, dz, KEEP_BASIS)
+    const int all = (degree + 1) * (degree + 1) - 1;
+    for (int channel = 0; channel < 3; ++channel) {
+      FW colour = (FW)SH_C0 * LOADF(sh_dc, channel * s + i);
+      for (int k = 0; k < all; ++k) colour = fma(basis[k], LOADF(sh_rest, (size_t)(channel * all + k) * s + i), colour);
+      out[6 + channel] = fmax(colour + (FW)0.5f, (FW)0.0f);
+    }
   } else {
     out[6] = out[7] = out[8] = (FW)0.0f;
   }

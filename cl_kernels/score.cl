@@ -66,7 +66,6 @@ __kernel void sh_costs(
   FW x, y, z;
   seen_direction(some, camera, means, s, i, &x, &y, &z);
   FW basis[24];
-#define KEEP_BASIS(k, value) basis[k] = value
   FOR_EACH_BASIS(degree, x, y, z, KEEP_BASIS)
   const int all = (int)((degree + 1) * (degree + 1)) - 1;
   FW d[3] = {(FW)0.0f, (FW)0.0f, (FW)0.0f};
@@ -104,14 +103,13 @@ __kernel void sh_residual(
   if (!ANY(some)) return;
   FW x, y, z;
   seen_direction(some, camera, means, s, i, &x, &y, &z);
-#define ADD_NORMAL(k, value)                                                                    \
-  {                                                                                             \
-    const FW basis = value;                                                                     \
-    __global float *at = normal + (size_t)(k) * 4 * s + i;                                      \
-    for (int c = 0; c < 3; ++c) STOREF(fma(basis, seen[c], LOADF(at, c * s)), at, c * s);       \
-    STOREF(fma(fabs(basis), seen[3], LOADF(at, 3 * s)), at, 3 * s);                             \
+  FW basis[25];
+#define KEEP_AFTER_CONSTANT(k, value) basis[(k) + 1] = value
+  basis[0] = (FW)SH_C0;
+  FOR_EACH_BASIS(degree, x, y, z, KEEP_AFTER_CONSTANT)
+  for (uint k = 0; k < (degree + 1) * (degree + 1); ++k) {
+    __global float *at = normal + (size_t)k * 4 * s + i;
+    for (int c = 0; c < 3; ++c) STOREF(fma(basis[k], seen[c], LOADF(at, c * s)), at, c * s);
+    STOREF(fma(fabs(basis[k]), seen[3], LOADF(at, 3 * s)), at, 3 * s);
   }
-  ADD_NORMAL(0, (FW)SH_C0)
-#define ADD_BASIS(k, value) ADD_NORMAL((k) + 1, value)
-  FOR_EACH_BASIS(degree, x, y, z, ADD_BASIS)
 }

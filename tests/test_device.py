@@ -173,7 +173,11 @@ def test_missing_define() -> None:
     from flexgs_edge.kernels.source import load_source
 
     session = Session(default_device(), large_budget())
-    for name, options in (("activate.cl", ()), ("blend_cpu.cl", ("-DW=16",)), ("blend_gpu.cl", ("-DW=4", "-DSTATS=0"))):
+    for name, options in (
+        ("activate.cl", ()),
+        ("blend_cpu.cl", ("-DW=16",)),
+        ("blend_gpu.cl", ("-DW=4", "-DSTATS=0", "-DBLEND=blend")),
+    ):
         with pytest.raises(DeviceError, match="does not build"):
             session.kernel(load_source(name), "blend" if "blend" in name else "activate", options, "b")
 
@@ -220,7 +224,6 @@ def test_every_signature_fits_its_kernel() -> None:
     session = Session(default_device(), large_budget())
     for form, width in (("cpu", 8), ("gpu", 1)):
         for name, spec in {**KERNELS, **CODEC_KERNELS}.items():
-            options = [f"-DW={width}"] + ([f"-DSTATS={spec.stats}"] if spec.stats is not None else [])
-            source = load_source(spec.file.format(form=form))
-            kernel = session.kernel(source, spec.kernel or name, tuple(options), spec.signature)
+            source = load_source(spec.file.format(form=form), spec.stats, form)
+            kernel = session.kernel(source, name, (f"-DW={width}",), spec.signature)
             assert kernel.num_args == len(spec.signature), name

@@ -66,7 +66,9 @@ def test_every_kernel_file_is_completed(repository: Path) -> None:
     for name in files:
         source = load_source(name)
         marks = re.findall(r'^#line 1 "(.*)"$', source, re.MULTILINE)
-        assert marks[1] == "common.clh" and name in marks and len(set(marks)) == len(marks)
+        assert marks[1] == "common.clh" and name in marks
+        repeated = {mark for mark in marks if marks.count(mark) > 1}
+        assert repeated <= {"blend_cpu.cl"}  # once for each kind
         assert source.index("#pragma OPENCL FP_CONTRACT OFF") < source.index(f'#line 1 "{name}"')
 
 

@@ -27,8 +27,6 @@ class KernelSpec:
     per : str
         What a work-item is: `rows` (a vector of W rows; the launch size counts rows), `item` (one of the launch
         size), `tile` (one item a tile on CPUs, a group of 256 on GPUs).
-    kernel : str
-        Its name in the file, where that differs.
     stats : int, optional
         The blend's kind.
     widest : int
@@ -38,7 +36,6 @@ class KernelSpec:
     file: str
     signature: str
     per: str = "item"
-    kernel: str = ""
     stats: int | None = None
     widest: int = 16
 
@@ -58,11 +55,11 @@ KERNELS: dict[str, KernelSpec] = {
     "tile_count": KernelSpec("tiles.cl", "uuffibbbbb", widest=8),
     "tile_scatter": KernelSpec("tiles.cl", "ubbbb", widest=8),
     "blend": KernelSpec("blend_{form}.cl", _BLEND, "tile", stats=0),
-    "blend_stats": KernelSpec("blend_{form}.cl", _BLEND + "bb", "tile", kernel="blend", stats=1),
-    "blend_removal": KernelSpec("blend_{form}.cl", _BLEND + "bb", "tile", kernel="blend", stats=2),
-    "blend_residual": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", kernel="blend", stats=3),
-    "blend_both": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", kernel="blend", stats=4),
-    "blend_backward": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", kernel="blend", stats=5),
+    "blend_stats": KernelSpec("blend_{form}.cl", _BLEND + "bb", "tile", stats=1),
+    "blend_removal": KernelSpec("blend_{form}.cl", _BLEND + "bb", "tile", stats=2),
+    "blend_residual": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", stats=3),
+    "blend_both": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", stats=4),
+    "blend_backward": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", stats=5),
     "residual": KernelSpec("score.cl", "ubbb", "rows"),
     "sh_costs": KernelSpec("score.cl", "uuuuuubbbbb", "rows"),
     "sh_residual": KernelSpec("score.cl", "uuuuubbbb", "rows"),

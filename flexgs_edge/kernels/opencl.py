@@ -106,13 +106,11 @@ class OpenCLBackend:
         """Enqueue the kernel `name` over `size` rows, items or tiles."""
         spec = KERNELS.get(name) or CODEC_KERNELS[name]
         if name not in self._kernels:
-            options = [f"-DW={min(self.width, spec.widest)}"] + (
-                [f"-DSTATS={spec.stats}"] if spec.stats is not None else []
-            )
+            options = [f"-DW={min(self.width, spec.widest)}"]
             if self._simulated:
                 options.append("-DNO_FETCH")
-            source = load_source(spec.file.format(form=self.form))
-            self._kernels[name] = self.session.kernel(source, spec.kernel or name, tuple(options), spec.signature)
+            source = load_source(spec.file.format(form=self.form), spec.stats, self.form)
+            self._kernels[name] = self.session.kernel(source, name, tuple(options), spec.signature)
         local: tuple[int, ...] = (1,) * len(size)
         if spec.per == "rows":
             size = (size[0] // self.width,)

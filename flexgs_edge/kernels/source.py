@@ -18,7 +18,10 @@ _COMMON = "common.clh"
 _SHARED = (_COMMON, "sh.clh")
 """Files without kernels, put before every kernel file."""
 _TOGETHER = ("activate.cl", "project.cl", "sort.cl", "score.cl", "similarity.cl")
-"""Files that make one program: loading a built one from PoCL's cache takes 40 to 70 ms, however small it is."""
+_BLENDS = {0: "blend", 1: "blend_stats", 2: "blend_removal", 3: "blend_residual", 4: "blend_both", 5: "blend_backward"}
+"""Kernels that the files of the blend make, by STATS."""
+_BLENDS_TOGETHER = (0, 2, 3, 4)
+"""What makes one program: a built one from PoCL's cache takes 40 to 70 ms, however small it is, and building one 300 ms more."""
 
 
 def kernel_dir() -> Path:
@@ -91,7 +94,7 @@ def constants_header() -> str:
     )
 
 
-def load_source(name: str) -> str:
+def load_source(name: str, stats: int | None = None, form: str = "cpu") -> str:
     """The whole program text with the kernel file `name`: every `.clh` helper (`common.clh` first), and the kernels beside it.
 
     `#line` directives make the compiler name the file and line that a person can open.
@@ -100,6 +103,10 @@ def load_source(name: str) -> str:
     ----------
     name : str
         File name in the kernel folder, such as `project.cl`.
+    stats : int, optional
+        The blend's kind, for its files.
+    form : {"cpu", "gpu"}
+        Of the blends beside other kernels.
 
     Raises
     ------
@@ -108,7 +115,14 @@ def load_source(name: str) -> str:
     """
     folder = kernel_dir()
     parts = ['#line 1 "constants.py, as printed by flexgs_edge.kernels.source"\n', constants_header()]
-    for file in (*_SHARED, *(_TOGETHER if name in _TOGETHER else (name,))):
+    pieces: list[tuple[str, int | None]] = [(file, None) for file in _SHARED]
+    if name in _TOGETHER or stats in _BLENDS_TOGETHER:
+        pieces += [(file, None) for file in _TOGETHER] + [(f"blend_{form}.cl", kind) for kind in _BLENDS_TOGETHER]
+    else:
+        pieces.append((name, stats))
+    for file, kind in pieces:
+        if kind is not None:
+            parts.append(f"#undef STATS\n#undef BLEND\n#define STATS {kind}\n#define BLEND {_BLENDS[kind]}\n")
         try:
             text = (folder / file).read_text(encoding="utf-8")
         except OSError as error:
