@@ -105,7 +105,7 @@ EFFORTS = {
         keep=0.8, refit_rounds=0, subsets=7, steps=1, close=0.08, few=18, views=48, pixels=12, mended=0.86, probed=4
     ),
     "balanced": Effort(
-        keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.05, few=32, views=96, pixels=24, mended=0.7
+        keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.06, few=32, views=96, pixels=24, mended=0.7
     ),
     "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, few=400, views=400, pixels=24),
     "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=96, views=96, pixels=24, passes=10.0),
