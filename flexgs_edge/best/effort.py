@@ -102,7 +102,7 @@ def _lattice(camera: Camera, step: int) -> int:
 
 EFFORTS = {
     "fast": Effort(
-        keep=0.8, refit_rounds=0, subsets=7, steps=1, close=0.08, few=18, views=48, pixels=12, mended=0.86, probed=4
+        keep=0.77, refit_rounds=0, subsets=7, steps=1, close=0.08, few=18, views=48, pixels=12, mended=0.86, probed=4
     ),
     "balanced": Effort(
         keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.06, few=32, views=96, pixels=24, mended=0.7
