@@ -29,7 +29,8 @@ class Effort:
     keep : float
         Share of the Gaussians that stays in each round of the path.
     refit_rounds : int
-        Rounds on all coefficients before SH are put on their grid (one on the constant follows).
+        Rounds on all coefficients before SH are put on their grid (one on the constant follows). None in fast: a fifth of its
+        time for 5 % of the bytes.
     subsets : int
         Steps a round at most, as for `refit_colours`.
     steps : int
