@@ -10,6 +10,7 @@ import numpy as np
 
 from flexgs_edge import constants
 from flexgs_edge.errors import DeviceError
+from flexgs_edge.kernels.backend import KERNELS
 
 KERNEL_DIR_VARIABLE = "FLEXGS_KERNEL_DIR"
 """Environment variable that names another kernel folder: the tests plant faults in a copy and expect to see them."""
@@ -18,7 +19,7 @@ _COMMON = "common.clh"
 _SHARED = (_COMMON, "sh.clh")
 """Files without kernels, put before every kernel file."""
 _TOGETHER = ("activate.cl", "project.cl", "sort.cl", "score.cl", "similarity.cl")
-_BLENDS = {0: "blend", 1: "blend_stats", 2: "blend_removal", 3: "blend_residual", 4: "blend_both", 5: "blend_backward"}
+_BLENDS = {spec.stats: name for name, spec in KERNELS.items() if spec.stats is not None}
 """Kernels that the files of the blend make, by STATS."""
 _BLENDS_TOGETHER = (0, 2, 3, 4)
 """What makes one program: a built one from PoCL's cache takes 40 to 70 ms, however small it is, and building one 300 ms more."""
