@@ -81,9 +81,8 @@ def test_one_that_reports_draws_nothing_twice(judged: MakeJudge, monkeypatch: py
 
         first = compare(planes)
         assert drawn == 1 and compare(planes) == first and drawn == 1
-        assert (
-            compare(planes, resident=False) == first and drawn == 2
-        )  # not on the backend yet: nobody knows what it is
+        # Not on the backend yet: nobody knows what it is.
+        assert compare(planes, resident=False) == first and drawn == 2
         assert compare(planes, with_ssim=False) != first and drawn == 3
         # A bit of one number is another scene.
         planes["log_scales"][0, 5] = np.nextafter(planes["log_scales"][0, 5], np.float32(9))

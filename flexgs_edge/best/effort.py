@@ -50,7 +50,8 @@ class Effort:
         (41): 121 and 119 kB.
     mended : float
         `MENDED` at this effort: the fewer pixels are fitted, the less of it holds elsewhere. (More poses than `few` mean more
-        Gaussians, not more pixels for each. A million from 21 poses, fast: with .66 the first result misses by 0.19 dB and three
+        Gaussians, not more pixels for each. A million from 21 poses, fast when it refitted SH:
+        with .66 the first result misses by 0.19 dB and three
         are measured, with .84 it holds at 0.80 dB.)
     probed : int
         Poses that trial grids are judged on, at most. 4 instead of 8 spare fast a tenth of its time; 2 % fewer bytes on fox, as

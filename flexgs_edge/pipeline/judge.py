@@ -143,7 +143,8 @@ class Judge:
             ssims = self._ssims if with_ssim else None
             found.append(compare_view(self.cameras[i].name, image, *references, error, ssims, lpips))
         quality = Quality(tuple(found), self.base_psnr)
-        drawn = scene.fingerprint() if whole else None
+        if whole and drawn is None:
+            drawn = scene.fingerprint()
         if drawn is not None:
             self._known[drawn] = quality
         return quality
