@@ -90,7 +90,7 @@ def backward(
 
 def coder(name: str, old: str, new: str) -> Mutation:
     """A fault in the entropy coder."""
-    return Mutation(name, "decode_chunks.cl", old, new, reference=False, tests=CODER)
+    return Mutation(name, "code_chunks.cl", old, new, reference=False, tests=CODER)
 
 
 def constant(name: str, literal: str, words: str) -> Mutation:

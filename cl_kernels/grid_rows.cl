@@ -1,4 +1,4 @@
-// Codes of chunks that decode_chunks left -> rows of INRIA's PLY in float32, one work-item a chunk.
+// Codes of chunks that code_chunks left -> rows of INRIA's PLY in float32, one work-item a chunk.
 // Specification: flexgs_edge.grid.from_grid. Every operation is rounded once, none is fused; the root is that of a double, which
 // rounds to the right float32.
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
@@ -24,7 +24,7 @@ __kernel void grid_rows(
     const int low_x, const int low_y, const int low_z,  // position code of the first cell
     __global const int *rows,          // [chunks]
     __global const float *steps,       // position, scale, rotation, opacity; luma and chroma of degree 0 and every further one
-    __global const int *codes,         // [chunks, planes, stride] as decode_chunks leaves them
+    __global const int *codes,         // [chunks, planes, stride] as code_chunks leaves them
     __global float *table)             // [chunks, table_rows, columns]
 {
   const size_t chunk = get_global_id(0);

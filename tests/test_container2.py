@@ -264,13 +264,18 @@ def test_golden_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "FOLDER", tmp_path)
     module.main()
     assert (tmp_path / "tiny.fgs").read_bytes() == (GOLDEN / "v2" / "tiny.fgs").read_bytes()
-    source = GridSource(GOLDEN / "v2" / "tiny.fgs")
-    with np.load(GOLDEN / "v2" / "tiny.npz") as expected:
-        for name, plane in source.read(slice(0, source.count), NAMES).items():
-            assert plane.tobytes() == expected[name].tobytes()
-    assert source.settings == module.SETTINGS
-    assert source.container.header.layers == (200, 200)
     check_written_format(GOLDEN / "v2" / "tiny.fgs")
+
+
+@pytest.mark.parametrize("name", ["tiny", "early"])
+def test_golden_files_are_read(name: str) -> None:
+    source = GridSource(GOLDEN / "v2" / f"{name}.fgs")
+    with np.load(GOLDEN / "v2" / "tiny.npz") as expected:
+        for field, plane in source.read(slice(0, source.count), NAMES).items():
+            assert plane.tobytes() == expected[field].tobytes()
+    assert source.settings == regenerator().SETTINGS
+    assert source.container.header.layers == (200, 200)
+    assert (source.container.header.channels is None) == (name == "early")
 
 
 def test_the_share_of_sh_is_what_leaving_them_out_saves() -> None:

@@ -108,12 +108,12 @@ def test_devices_of_this_machine() -> None:
 )
 def test_self_test_can_fail(source: str, verdict: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(select, "_SELF_TEST", select._SELF_TEST.replace("fma(x, y, -y)", source))
-    assert re.fullmatch(verdict, select.run_self_test(default_device().handle))
+    assert re.fullmatch(verdict, select.run_self_test(default_device().context))
 
 
 def test_self_test_sees_contraction(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(select, "_SELF_TEST", select._SELF_TEST.replace("x * y - y", "fma(x, y, -y)"))
-    assert "fused" in select.run_self_test(default_device().handle)
+    assert "fused" in select.run_self_test(default_device().context)
 
 
 def test_no_platform(tmp_path: Path) -> None:

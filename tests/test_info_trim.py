@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from flexgs_edge import cli
-from flexgs_edge.codec import GridSource, channel_bytes, write_grid
+from flexgs_edge.codec import GridSource, channel_bytes, read_header, write_grid
+from flexgs_edge.codec.channels import Channels
 from flexgs_edge.codec.container import write_container
 from flexgs_edge.errors import FormatError, InputError, TargetError
 from flexgs_edge.grid import GridScene, from_grid
@@ -108,11 +109,31 @@ def test_verify_of_version_2_names_the_damaged_part(tmp_path: Path) -> None:
         (tmp_path / "b.fgs").write_bytes(data)
         bad = [section.name for section in verify(tmp_path / "b.fgs") if not section.ok]
         assert bad == ([damaged.name] if damaged.name != "chunk table" else ["chunks", "chunk table"])
+
+
+def test_info_decodes_files_that_were_cut_alone(tmp_path: Path) -> None:
+    path, _ = written(tmp_path)
+    told = info(path)
+    cut = tmp_path / "cut.fgs"
+    trim(path, cut, told["layers"][0]["bytes"] + told["overhead_bytes"] + 2000)
+    assert read_header(cut).channels is None
+    assert info(cut)["channels"]["position"]["bytes"] < told["channels"]["position"]["bytes"]
+    # A chunk that nobody looks at may be damaged: verify finds it, and so does info where it has to decode.
+    data = bytearray(path.read_bytes())
+    data[verify(path)[3].offset] ^= 4
+    path.write_bytes(data)
+    assert info(path) == told
+    data = bytearray(cut.read_bytes())
+    data[verify(cut)[3].offset] ^= 4
+    cut.write_bytes(data)
     with pytest.raises(FormatError, match="checksum"):
-        data = bytearray(path.read_bytes())
-        data[sections[3].offset] ^= 4
-        (tmp_path / "b.fgs").write_bytes(data)
-        info(tmp_path / "b.fgs")
+        info(cut)
+
+
+def test_the_header_agrees_with_the_symbols(tmp_path: Path) -> None:
+    path, grid = written(tmp_path)
+    found = read_header(path).channels
+    assert found == Channels.of(channel_bytes(path), [int(np.count_nonzero(grid.sh_degrees >= d)) for d in (1, 2)])
 
 
 def test_trim_keeps_whole_layers(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ def command(
     """Show what a scene file holds.
 
     For a .fgs: Gaussians, SH degree, bits and bytes of every channel and SH degree, layers, the settings it was made with
-    and the target it reached (files of --method best are decoded for this; use verify to check every byte). For other
+    and the target it reached (files that trim cut are decoded for this; use verify to check every byte). For other
     scene files and model folders: counts, and what lies beside it.
 
     --errors draws the file's own views again with less of each channel: the held-out ones of the cameras beside the file or

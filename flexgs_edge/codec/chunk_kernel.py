@@ -1,4 +1,4 @@
-"""Chunks decoded by the OpenCL kernel `decode_chunks`: the same codes as `coder.decode_chunk`, which is its specification."""
+"""Chunks decoded by the OpenCL kernel `code_chunks`: the same codes as `coder.decode_chunk`, which is its specification."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flexgs_edge.codec.coder import check_end
 from flexgs_edge.codec.model import SHARED, Model
 from flexgs_edge.codec.octree import TooManyNodes
 from flexgs_edge.codec.rans import PRECISION, StreamError, first_states, lane_count
-from flexgs_edge.codec.records import INFO, PLACES, PLANES, RECORD, Device, pack_group, padded
+from flexgs_edge.codec.records import INFO, PLACES, PLANES, RECORD, Device, launch_coding, pack_group, padded
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds
 from flexgs_edge.constants import CODE_LIMIT, RANS_LANES
 from flexgs_edge.grid import Steps
@@ -149,16 +149,15 @@ class ChunkKernel:
             self.device.write(arrays["states"], states, i * RANS_LANES)
             self.device.write(arrays["words"], words, i * self._word_stride)
         self.device.write(arrays["info"], info)
-        self.device.launch(
-            "decode_chunks",
-            (len(chunks),),
-            self._stride,
-            self._word_stride,
-            self._out_planes,
-            self.model.depth,
-            self.model.sh_degree,
-            int(base_only),
-            *(arrays[name] for name in ("info", "states", "words", "records", "slots", "entries", *PLANES, "out")),
+        launch_coding(
+            self.device,
+            len(chunks),
+            (self._stride, self._out_planes, self.model.sh_degree),
+            [arrays[name] for name in ("info", "records", *PLANES, "out")],
+            decoding=(
+                (self._word_stride, self.model.depth, int(base_only)),
+                [arrays[name] for name in ("states", "words", "slots", "entries")],
+            ),
         )
         self.device.read(arrays["info"], info)
         for i, ((rows, data), found) in enumerate(zip(chunks, info.tolist(), strict=True)):

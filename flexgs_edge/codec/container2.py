@@ -9,6 +9,7 @@ from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
+from flexgs_edge.codec.channels import Channels
 from flexgs_edge.codec.coder import (
     CHUNK_ROWS,
     Chunk,
@@ -138,7 +139,16 @@ def _header(
     grid: GridScene, encoded: Encoded, model_bytes: int, settings: Mapping[str, Any], chunk_rows: int
 ) -> GridHeader:
     low = encoded.low.tolist()
-    return GridHeader.of_grid(grid, encoded.layers, low, encoded.model.depth, chunk_rows, model_bytes, settings)
+    channels = Channels.of(_by_alphabet(encoded.model, encoded.bits), [band.shape[1] for band in grid.sh])
+    return GridHeader.of_grid(
+        grid, encoded.layers, low, encoded.model.depth, chunk_rows, model_bytes, settings, channels
+    )
+
+
+def _by_alphabet(model: Model, bits: np.ndarray) -> dict[str, float]:
+    """Bytes by the names of alphabets."""
+    names = ["position", "repeats", *(group.kind.name for group in model.groups)]
+    return dict(zip(names, (bits / 8).tolist(), strict=True))
 
 
 def _finish(file: BinaryIO, header: GridHeader, entries: Sequence[tuple[int, int]]) -> int:
@@ -279,8 +289,7 @@ def channel_bytes(
         codes = container.cost(model, chunk, entry, cost)
         if look is not None:
             look(chunk, entry, codes)
-    names = ["position", "repeats", *(group.kind.name for group in model.groups)]
-    table = dict(zip(names, (cost / 8).tolist(), strict=True))
+    table = _by_alphabet(model, cost)
     payload = sum(entry.section.length for entry in entries)
     table["lanes"] = payload - float(cost.sum()) / 8
     table["model"] = float(container.header.model.length)

@@ -1,4 +1,4 @@
-"""Coding by OpenCL kernels: `count_chunks` makes what `ports.CountPort` does, `encode_chunks` what `rans.Encoder` does."""
+"""Coding by OpenCL kernels: `code_chunks` makes what `ports.CountPort` does, `encode_chunks` what `rans.Encoder` does."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flexgs_edge.codec.groups import Group
 from flexgs_edge.codec.model import SHARED
 from flexgs_edge.codec.ports import CountPort, Raw
 from flexgs_edge.codec.rans import Encoder
-from flexgs_edge.codec.records import INFO, PLACES, PLANES, RECORD, Device, pack_group, padded
+from flexgs_edge.codec.records import INFO, PLACES, PLANES, RECORD, Device, launch_coding, pack_group, padded
 from flexgs_edge.codec.walk import ChunkCodes, base_kinds
 from flexgs_edge.constants import COARSE_ROWS, RANS_LANES
 from flexgs_edge.scene.fields import sh_rest_count
@@ -61,9 +61,8 @@ class CountKernel:
         self._raw += rows * sum(pieces * count for pieces, count in zip(shifts, channels, strict=True))
         self._batches = self._planes * (max((rows - 1) // COARSE_ROWS, 0).bit_length() + 1)
         shapes: dict[str, tuple[tuple[int, ...], str]] = {
-            "cells": ((self._stride,), "u8"),
+            **{name: ((planes, self._stride), kind) for name, (planes, kind) in PLANES.items()},
             "codes": ((self._planes, self._stride), "i4"),
-            **{name: ((planes, self._stride), kind) for name, (planes, kind) in PLANES.items() if name != "cells"},
             "contexts": ((self._log,), "u1"),
             "symbols": ((self._log,), "u1"),
             "raw": ((self._raw,), "u1"),
@@ -102,17 +101,13 @@ class CountKernel:
             self._write("codes", i, planes)
             self._write("cells", i, codes.cells)
         self.device.write(self._arrays["info"], info)
-        self.device.launch(
-            "count_chunks",
-            (len(chunks),),
-            self._stride,
-            self._planes,
-            self.sh_degree,
-            self._log,
-            self._raw,
-            self._first[-1],
-            self._batches,
-            *self._arrays.values(),
+        arrays = list(self._arrays.values())
+        launch_coding(
+            self.device,
+            len(chunks),
+            (self._stride, self._planes, self.sh_degree),
+            arrays[:8],
+            counting=((self._log, self._raw, self._first[-1], self._batches), arrays[8:]),
         )
         self.device.read(self._arrays["info"], info)
         counted = info[:, INFO.index("status")] == 0

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from flexgs_edge.codec.channels import COUNT_MOST, Channels, channel_parts
 from flexgs_edge.codec.coder import CHUNK_ROWS, Chunk, least_bytes, plan_chunks
 from flexgs_edge.codec.layout import (
     MAX_COUNT,
@@ -41,6 +42,7 @@ _KEYS = (
     "sh_degree",
     "steps",
 )
+_OPTIONAL = "channels"
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,8 @@ class GridHeader:
         How the file was made.
     cut_from : dict or None
         `bytes`, `count` and `layers` of the file that this one was cut from.
+    channels : Channels or None
+        What is known without decoding; not of a file that was cut, nor of one that an early writer made.
     """
 
     count: int
@@ -82,6 +86,7 @@ class GridHeader:
     model_bytes: int
     settings: dict[str, Any]
     cut_from: dict[str, int] | None = None
+    channels: Channels | None = None
     block: int = 0
     version: int = 2
 
@@ -95,6 +100,7 @@ class GridHeader:
         chunk_rows: int,
         model_bytes: int,
         settings: Mapping[str, Any],
+        channels: Channels | None = None,
     ) -> GridHeader:
         """The header of a scene; raises `InputError` for settings that JSON cannot hold."""
         x, y, z = (float(value) for value in grid.origin)
@@ -110,6 +116,7 @@ class GridHeader:
             (a, b, c),
             model_bytes,
             dict(settings),
+            channels=channels,
         )
         return header.sealed()
 
@@ -124,7 +131,7 @@ class GridHeader:
         """The header of the first `layers` layers of this file of `size` bytes."""
         source = self.cut_from or {"bytes": size, "count": self.count, "layers": len(self.layers)}
         kept = self.layers[:layers]
-        return replace(self, count=sum(kept), layers=kept, cut_from=source).sealed()
+        return replace(self, count=sum(kept), layers=kept, cut_from=source, channels=None).sealed()
 
     @property
     def grid_steps(self) -> Steps:
@@ -164,14 +171,18 @@ def encode_header(header: GridHeader) -> bytes:
     """The header's bytes."""
     record = asdict(header)
     del record["block"], record["version"]  # known from the preamble
+    if header.channels is None:
+        del record[_OPTIONAL]
     return canonical_json(record)
 
 
 def decode_header(block: bytes) -> GridHeader:
     """Read and check a header; raises `HeaderError` for anything but what `encode_header` can write."""
     record = _parse(block)
-    if not isinstance(record, dict) or tuple(sorted(record)) != _KEYS:
-        raise HeaderError(f"wanted an object with the keys {', '.join(_KEYS)}, got {_short(record)}")
+    if not isinstance(record, dict) or tuple(sorted(record.keys() - {_OPTIONAL})) != _KEYS:
+        raise HeaderError(
+            f"wanted an object with the keys {', '.join(_KEYS)} and perhaps {_OPTIONAL}, got {_short(record)}"
+        )
     count = _integer("count", record["count"], 0, MAX_COUNT)
     layers = _integers("layers", record["layers"], 0, MAX_COUNT)
     if not 1 <= len(layers) <= LAYERS_MOST or sum(layers) != count:
@@ -196,6 +207,7 @@ def decode_header(block: bytes) -> GridHeader:
         _integer("model_bytes", record["model_bytes"], 0, MODEL_MOST),
         record["settings"],
         _cut_from(record["cut_from"]),
+        _channels(record[_OPTIONAL], count, sh_degree) if _OPTIONAL in record else None,
         len(block),
     )
 
@@ -225,6 +237,17 @@ def _cut_from(value: object) -> dict[str, int] | None:
     if not isinstance(value, dict) or tuple(sorted(value)) != ("bytes", "count", "layers"):
         raise HeaderError(f"cut_from: wanted null or an object with bytes, count and layers, got {_short(value)}")
     return {name: _integer(f"cut_from.{name}", value[name], 0, 2**63 - 1) for name in sorted(value)}
+
+
+def _channels(value: object, count: int, sh_degree: int) -> Channels:
+    if not isinstance(value, dict) or tuple(sorted(value)) != ("bytes", "rows"):
+        raise HeaderError(f"channels: wanted an object with bytes and rows, got {_short(value)}")
+    taken = _integers("channels.bytes", value["bytes"], 0, COUNT_MOST)
+    rows = _integers("channels.rows", value["rows"], 0, count)
+    kinds = len(channel_parts(sh_degree))
+    if len(taken) != kinds or len(rows) != sh_degree:
+        raise HeaderError(f"channels: wanted {kinds} bytes and {sh_degree} rows, got {_short(value)}")
+    return Channels(taken, rows)
 
 
 def _integers(name: str, value: object, lowest: int, highest: int) -> tuple[int, ...]:

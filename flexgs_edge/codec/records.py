@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -50,6 +51,41 @@ class Device(Protocol):
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
         """Run a kernel."""
+
+
+def launch_coding(
+    device: Device,
+    chunks: int,
+    shape: tuple[int, int, int],
+    shared: Sequence[Any],
+    decoding: tuple[Sequence[int], Sequence[Any]] | None = None,
+    counting: tuple[Sequence[int], Sequence[Any]] | None = None,
+) -> None:
+    """Run `code_chunks` in one of its directions.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Numbers of a plane, planes of codes, SH degree.
+    shared : sequence of arrays
+        What both directions use, in the kernel's order.
+    decoding, counting : tuple, optional
+        Numbers and arrays of the one direction that is wanted.
+    """
+    # The kernel leaves what belongs to the other direction alone: any array will do.
+    numbers, arrays = decoding or ([0] * 3, [shared[0]] * 4)
+    more_numbers, more_arrays = counting or ([0] * 4, [shared[0]] * 5)
+    device.launch(
+        "code_chunks",
+        (chunks,),
+        int(counting is not None),
+        *shape,
+        *numbers,
+        *more_numbers,
+        *shared,
+        *arrays,
+        *more_arrays,
+    )
 
 
 def padded(rows: int) -> int:

@@ -53,6 +53,8 @@ class DeviceInfo:
     max_alloc_bytes: int
     self_test: str
     handle: cl.Device | None = field(default=None, repr=False, compare=False)
+    context: cl.Context | None = field(default=None, repr=False, compare=False)
+    """The self-test's. PoCL's compiler starts again, for half a second, in the first context after the last one has gone."""
 
     @property
     def usable(self) -> bool:
@@ -60,9 +62,9 @@ class DeviceInfo:
         return self.self_test in ("ok", "not run")
 
     def to_json(self) -> dict[str, Any]:
-        """All fields but the handle."""
-        fields = asdict(DeviceInfo(**{**self.__dict__, "handle": None}))
-        del fields["handle"]
+        """All fields but the handle and the context."""
+        fields = asdict(DeviceInfo(**{**self.__dict__, "handle": None, "context": None}))
+        del fields["handle"], fields["context"]
         return fields
 
 
@@ -94,6 +96,13 @@ def list_devices(self_test: bool = True) -> list[DeviceInfo]:
 def _describe(index: int, platform: Any, device: Any, self_test: bool) -> DeviceInfo:
     import pyopencl as cl
 
+    context, verdict = None, "not run"
+    if self_test:
+        try:
+            context = cl.Context([device])
+            verdict = run_self_test(context)
+        except cl.Error as error:
+            verdict = f"no context: {_first_line(str(error))}"
     kind = "gpu" if device.type & cl.device_type.GPU else "cpu" if device.type & cl.device_type.CPU else "other"
     return DeviceInfo(
         index=index,
@@ -108,12 +117,13 @@ def _describe(index: int, platform: Any, device: Any, self_test: bool) -> Device
         local_bytes=device.local_mem_size,
         global_bytes=device.global_mem_size,
         max_alloc_bytes=device.max_mem_alloc_size,
-        self_test=run_self_test(device) if self_test else "not run",
+        self_test=verdict,
         handle=device,
+        context=context,
     )
 
 
-def run_self_test(device: Any) -> str:
+def run_self_test(context: cl.Context) -> str:
     """`ok`, or one line that says what went wrong."""
     import pyopencl as cl
 
@@ -124,7 +134,6 @@ def run_self_test(device: Any) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            context = cl.Context([device])
             program = cl.Program(context, _SELF_TEST).build(options=["-cl-std=CL1.2"], cache_dir=False)  # type: ignore[arg-type]
         queue = cl.CommandQueue(context)
         inputs = [cl.Buffer(context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=x) for x in (a, b)]

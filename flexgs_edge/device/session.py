@@ -61,7 +61,7 @@ class Session:
         self.info = info
         self.budget = budget
         assert info.handle is not None
-        self.context = cl.Context([info.handle])
+        self.context = info.context or cl.Context([info.handle])
         self.queue = cl.CommandQueue(self.context)
         # Of its own: filling an array that no kernel uses must not wait for the kernels of others.
         self._maps = cl.CommandQueue(self.context)

@@ -73,8 +73,7 @@ KERNELS: dict[str, KernelSpec] = {
 """Every kernel by the name that `Backend.launch` and the twins share."""
 
 CODEC_KERNELS: dict[str, KernelSpec] = {
-    "decode_chunks": KernelSpec("decode_chunks.cl", "uuuuuu" + 12 * "b"),
-    "count_chunks": KernelSpec("decode_chunks.cl", "uuuuuuu" + 13 * "b"),
+    "code_chunks": KernelSpec("code_chunks.cl", 11 * "u" + 17 * "b"),
     "encode_chunks": KernelSpec("encode_chunks.cl", "uubbbbbb"),
     "grid_rows": KernelSpec("grid_rows.cl", "uuuuuiiibbbb"),
 }

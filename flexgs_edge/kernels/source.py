@@ -19,6 +19,8 @@ _COMMON = "common.clh"
 _SHARED = (_COMMON, "sh.clh")
 """Files without kernels, put before every kernel file."""
 _TOGETHER = ("activate.cl", "project.cl", "sort.cl", "score.cl", "similarity.cl")
+_CODEC = ("code_chunks.cl", "encode_chunks.cl")
+"""One program too."""
 _BLENDS = {spec.stats: name for name, spec in KERNELS.items() if spec.stats is not None}
 """Kernels that the files of the blend make, by STATS."""
 _BLENDS_TOGETHER = (0, 2, 3, 4)
@@ -120,7 +122,7 @@ def load_source(name: str, stats: int | None = None, form: str = "cpu") -> str:
     if name in _TOGETHER or stats in _BLENDS_TOGETHER:
         pieces += [(file, None) for file in _TOGETHER] + [(f"blend_{form}.cl", kind) for kind in _BLENDS_TOGETHER]
     else:
-        pieces.append((name, stats))
+        pieces += [(file, stats) for file in (_CODEC if name in _CODEC else (name,))]
     for file, kind in pieces:
         if kind is not None:
             parts.append(f"#undef STATS\n#undef BLEND\n#define STATS {kind}\n#define BLEND {_BLENDS[kind]}\n")

@@ -12,6 +12,7 @@ import numpy as np
 from flexgs_edge._version import __version__
 from flexgs_edge.codec import channel_bytes, read_header
 from flexgs_edge.codec import verify as verify_container
+from flexgs_edge.codec.channels import Channels, channel_parts
 from flexgs_edge.codec.coder import Chunk
 from flexgs_edge.codec.container2 import GridContainer
 from flexgs_edge.codec.layout import Header, Section
@@ -26,7 +27,7 @@ from flexgs_edge.scene import FIELDS, inria_dtype
 def contents(path: str | Path) -> dict[str, Any]:
     """`info` of a `.fgs`.
 
-    Of version 1 only the header is read; version 2 is decoded, since entropy coding shares the bytes out.
+    The header is read; of version 2 a file that was cut is decoded, since entropy coding shares the bytes out.
     """
     place = Path(path)
     header = read_header(place)
@@ -54,44 +55,43 @@ def _packed_info(path: Path, header: Header) -> dict[str, Any]:
 
 
 def _grid_info(path: Path) -> dict[str, Any]:
-    """A file of version 2: what each channel takes is known once its symbols have been decoded."""
-    header = GridContainer(path).header
-    rows_of_degree = np.zeros(header.sh_degree + 1, np.int64)
+    """A file of version 2: what each channel takes stands in its header, or is known once its symbols have been decoded."""
+    container = GridContainer(path)
+    header = container.header
+    known = header.channels or _decoded_channels(path, header)
     layers = [{"rows": rows, "bytes": 0} for rows in header.layers]
-
-    def count(chunk: Chunk, entry: ChunkEntry, codes: ChunkCodes) -> None:
-        degrees = codes.base["sh degree"]
-        rows_of_degree[:] += [int(np.count_nonzero(degrees >= degree)) for degree in range(header.sh_degree + 1)]
+    for chunk, entry in zip(header.chunks(), container.read_table(), strict=True):
         layers[chunk.layer]["bytes"] += entry.section.length
-
-    taken = channel_bytes(path, count)
     channels = {}
-    for name, parts in _grid_parts(header.sh_degree).items():
+    for name, total in zip(channel_parts(header.sh_degree), known.bytes, strict=True):
         degree = int(name.split()[1]) if name.startswith("sh ") and name != "sh degree" else 0
-        rows, total = int(rows_of_degree[degree]), sum(taken[part] for part in parts)
+        rows = (header.count, *known.rows)[degree]
         channels[name] = {
             "rows": rows,
             "step": header.steps["sh"][degree - 1] if degree else header.steps.get(name),
-            "bytes": round(total),
+            "bytes": total,
             "bits_per_row": round(8 * total / rows, 3) if rows else None,
             "bits_per_gaussian": round(8 * total / header.count, 3) if header.count else None,
         }
-    sh_count = int(rows_of_degree[1]) if header.sh_degree else 0
     return {
-        **_fgs_record(path, header, 2, sh_count, channels),
+        **_fgs_record(path, header, 2, known.rows[0] if known.rows else 0, channels),
         "chroma": header.steps["chroma"],
-        "model_bytes": round(taken["model"]),
+        "model_bytes": header.model.length,
         "layers": layers,
         "cut_from": header.cut_from,
     }
 
 
-def _grid_parts(sh_degree: int) -> dict[str, tuple[str, ...]]:
-    """Kinds of value of version 2, and the coder's channels that make them up."""
-    parts: dict[str, tuple[str, ...]] = {"position": ("position", "repeats")}
-    parts |= {name: tuple(f"{name} {axis}" for axis in "xyz") for name in ("scale", "rotation")}
-    parts |= {"opacity": ("opacity",), "dc": ("dc Y", "dc Co", "dc Cg"), "sh degree": ("sh degree",)}
-    return parts | {f"sh {d}": tuple(f"sh {d} {c}" for c in ("Y", "Co", "Cg")) for d in range(1, sh_degree + 1)}
+def _decoded_channels(path: Path, header: GridHeader) -> Channels:
+    """What a file does not say of itself, such as one that was cut."""
+    rows = np.zeros(header.sh_degree, np.int64)
+
+    def count(chunk: Chunk, entry: ChunkEntry, codes: ChunkCodes) -> None:
+        degrees = codes.base["sh degree"]
+        rows[:] += [int(np.count_nonzero(degrees > degree)) for degree in range(header.sh_degree)]
+
+    taken = channel_bytes(path, count)
+    return Channels.of(taken, rows.tolist())
 
 
 def _fgs_record(

@@ -17,8 +17,8 @@ def info(path: str | Path) -> dict[str, Any]:
     Parameters
     ----------
     path : path
-        A `.fgs` (of version 1 only the header is read; version 2 is decoded, since entropy coding shares the bytes out), a
-        `.ply`, a file of another program's format or a model folder.
+        A `.fgs` (its header is read; one that was cut is decoded, since entropy coding shares the bytes out), a `.ply`, a
+        file of another program's format or a model folder.
     """
     place = Path(path)
     if place.suffix.lower() == ".fgs":

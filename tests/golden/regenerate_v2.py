@@ -1,6 +1,8 @@
 """Write tests/golden/v2 anew. Only for a deliberate change of the format, together with a new version number.
 
 python tests/golden/regenerate_v2.py
+
+`early.fgs` is what writers made before headers said what the channels take: readers keep reading it.
 """
 
 from __future__ import annotations

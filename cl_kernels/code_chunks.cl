@@ -1,4 +1,5 @@
-// Decodes chunks of a version 2 file (docs/format.md), one work-item a chunk: octree, repeats, and every channel pass by pass.
+// Decodes chunks of a version 2 file (docs/format.md), or counts their symbols, one work-item a chunk: octree, repeats, and every
+// channel pass by pass.
 // Specification: flexgs_edge.codec (walk, contexts, groups, ports, rans), whose numbers these are to the last bit. Sums are
 // doubles that hold all of their integers exactly, whatever the order; divisions too are rounded as those of float32.
 //
@@ -392,12 +393,9 @@ inline bool get_channel(Chunk *c, uint alphabet, uint count, uint reach, __globa
   for (int k = (int)top; k >= 0; --k) {
     const bool first = k == (int)top;
     const uint begin = first ? 0 : begin_of(count, k), size = first ? ((count - 1) >> top) + 1 : size_of(count, k);
-    if (first) {
-      predict(c, alphabet, terms, 0, size, 0, weights, known, 0);
-    } else {
-      repeat_ends(known, begin);
-      predict(c, alphabet, terms, begin, size, reach, weights, known, mean_out);
-    }
+    if (!first) repeat_ends(known, begin);
+    // In one place: compilers put its body wherever it is called.
+    predict(c, alphabet, terms, begin, size, first ? 0 : reach, weights, known, mean_out);
     const uint offset = first ? 0 : 1 << k, step = first ? k : k + 1;
     if (c->counting) {
       if (!count_pass(c, alphabet, size, out + offset, step)) return false;
@@ -626,74 +624,36 @@ inline bool get_channels(Chunk *c, uint rows, int sh_degree, bool base_only, __g
   return true;
 }
 
-__kernel void decode_chunks(
+// Decodes chunks, or counts the symbols of their channels (positions aside). One kernel for both directions, although each leaves
+// arrays of the other alone: it is most of what the codec adds to a start without compiled kernels, half a second a copy.
+__kernel void code_chunks(
+    const uint counting,               // 1: counts, 0: decodes
     const uint stride,                 // numbers of a plane: rows of the largest chunk, and 96 more
-    const uint word_stride,            // words of a chunk, with RANS_LANES spare ones behind those that it has
-    const uint out_planes,             // 14, and one for each SH coefficient and colour
-    const uint depth,                  // of the octree
+    const uint planes,                 // of codes: 11, and one for each SH coefficient and colour; decoding: 3 more
     const uint sh_degree,              // of the scene
+    // Decoding:
+    const uint word_stride,            // words of a chunk, with RANS_LANES spare ones behind those that it has
+    const uint depth,                  // of the octree
     const uint base_only,              // 1: without SH
-    __global int *info,                // [chunks, INFO] what is wanted and what was found
-    __global uint *states,             // [chunks, RANS_LANES]
-    __global const ushort *words,      // [chunks, word_stride]
-    __global const int *records,       // [alphabets, RECORD]
-    __global const uchar *slots,       // [tables, 2^14] symbol of every slot
-    __global const uint *entries,      // frequency and start of every symbol of every table
-    __global ulong *cells,             // [chunks, 2, stride]: the first of the two holds the rows' cells afterwards
-    __global ushort *weights,          // [chunks, 8, stride]
-    __global uchar *bytes,             // [chunks, BYTES, stride]
-    __global int *ints,                // [chunks, INTS, stride]
-    __global float *floats,            // [chunks, FLOATS, stride]
-    __global int *out)                 // [chunks, out_planes, stride]: x, y, z, base channels, SH by degree, colour, coefficient
-{
-  const size_t i = get_global_id(0);
-  __global int *about = info + i * INFO;
-  if (about[ROWS] == 0) return;  // the host found its head damaged
-  Chunk c;
-  c.lanes = about[LANE_COUNT];
-  c.stride = stride;
-  c.states = states + i * RANS_LANES;
-  c.words = words + i * word_stride;
-  c.at = 0;
-  c.end = about[WORDS];
-  c.records = records;
-  c.slots = slots;
-  c.entries = entries;
-  c.bytes = bytes + i * BYTES * stride;
-  c.ints = ints + i * INTS * stride;
-  c.floats = floats + i * FLOATS * stride;
-  c.status = GOOD;
-  c.found = 0;
-  c.wanted = 0;
-  c.counting = false;
-  const uint rows = about[ROWS];
-  __global int *to = out + i * out_planes * stride;
-  if (get_positions(&c, rows, depth, cells + i * 2 * stride, to))
-    get_channels(&c, rows, (int)sh_degree, base_only, weights + i * 8 * stride, to + 3 * stride);
-  about[STATUS] = (int)c.status;
-  about[FOUND] = (int)(c.found & 0xffffffff);
-  about[FOUND_HIGH] = (int)(c.found >> 32);
-  about[WANTED] = c.wanted;
-  about[AT] = (int)c.at;
-}
-
-// The other way round: symbols and contexts of all channels of chunks, their counts, and raw bits.
-__kernel void count_chunks(
-    const uint stride,                 // as above
-    const uint planes,                 // 11, and one for each SH coefficient and colour
-    const uint sh_degree,
+    // Counting:
     const uint log_most,               // symbols of a chunk
     const uint raw_most,               // room for its raw bytes
     const uint count_most,             // counts of all groups
     const uint batch_most,             // passes of all channels
-    __global int *info,                // [chunks, INFO]: afterwards AT holds the batches, WORDS the raw bytes
+    __global int *info,                // [chunks, INFO] what is wanted and what was found; counted: AT batches, WORDS raw bytes
     __global const int *records,       // [alphabets, RECORD]
-    __global const ulong *cells,       // [chunks, stride]
-    __global int *codes,               // [chunks, planes, stride]
+    __global ulong *cells,             // [chunks, 2, stride]: the first of the two holds the rows' cells (decoding: afterwards)
     __global ushort *weights,          // [chunks, 8, stride]
     __global uchar *bytes,             // [chunks, BYTES, stride]
     __global int *ints,                // [chunks, INTS, stride]
     __global float *floats,            // [chunks, FLOATS, stride]
+    __global int *codes,               // [chunks, planes, stride]: decoded x, y, z; base channels, SH by degree, colour, coefficient
+    // Decoding:
+    __global uint *states,             // [chunks, RANS_LANES]
+    __global const ushort *words,      // [chunks, word_stride]
+    __global const uchar *slots,       // [tables, 2^14] symbol of every slot
+    __global const uint *entries,      // frequency and start of every symbol of every table
+    // Counting:
     __global uchar *contexts,          // [chunks, log_most]
     __global uchar *symbols,           // [chunks, log_most]
     __global uchar *raw,               // [chunks, raw_most]
@@ -703,32 +663,51 @@ __kernel void count_chunks(
   const size_t i = get_global_id(0);
   __global int *about = info + i * INFO;
   const uint rows = about[ROWS];
+  if (rows == 0) return;  // the host found its head damaged
   Chunk c;
   c.stride = stride;
-  c.lanes = 0;
   c.records = records;
   c.bytes = bytes + i * BYTES * stride;
   c.ints = ints + i * INTS * stride;
   c.floats = floats + i * FLOATS * stride;
   c.status = GOOD;
-  c.counting = true;
-  c.counts = counts + i * count_most;
-  c.batches = batches + i * 3 * batch_most;
-  c.log_contexts = contexts + i * log_most;
-  c.log_symbols = symbols + i * log_most;
-  c.log_raw = raw + i * raw_most;
-  c.logged = c.raw_logged = c.batch_count = 0;
-  c.raw_most = raw_most;
-  for (uint n = 0; n < count_most; ++n) c.counts[n] = 0;
-  __global float *x = plane(&c, X), *y = plane(&c, Y), *z = plane(&c, Z);
-  for (uint row = 0; row < rows; ++row) {
-    const ulong cell = cells[i * stride + row];
-    x[row] = (float)every_third(cell >> 2);
-    y[row] = (float)every_third(cell >> 1);
-    z[row] = (float)every_third(cell);
+  c.found = 0;
+  c.wanted = 0;
+  c.counting = counting;
+  c.lanes = c.at = c.logged = c.raw_logged = c.batch_count = 0;
+  __global int *to = codes + i * planes * stride;
+  cells += i * 2 * stride;
+  bool good = true;
+  if (counting) {
+    c.counts = counts + i * count_most;
+    c.batches = batches + i * 3 * batch_most;
+    c.log_contexts = contexts + i * log_most;
+    c.log_symbols = symbols + i * log_most;
+    c.log_raw = raw + i * raw_most;
+    c.raw_most = raw_most;
+    for (uint n = 0; n < count_most; ++n) c.counts[n] = 0;
+    __global float *x = plane(&c, X), *y = plane(&c, Y), *z = plane(&c, Z);
+    for (uint row = 0; row < rows; ++row) {
+      const ulong cell = cells[row];
+      x[row] = (float)every_third(cell >> 2);
+      y[row] = (float)every_third(cell >> 1);
+      z[row] = (float)every_third(cell);
+    }
+  } else {
+    c.lanes = about[LANE_COUNT];
+    c.states = states + i * RANS_LANES;
+    c.words = words + i * word_stride;
+    c.end = about[WORDS];
+    c.slots = slots;
+    c.entries = entries;
+    good = get_positions(&c, rows, depth, cells, to);
+    to += 3 * stride;
   }
-  get_channels(&c, rows, (int)sh_degree, false, weights + i * 8 * stride, codes + i * planes * stride);
+  if (good) get_channels(&c, rows, (int)sh_degree, base_only, weights + i * 8 * stride, to);
   about[STATUS] = (int)c.status;
-  about[AT] = (int)c.batch_count;
-  about[WORDS] = (int)c.raw_logged;
+  about[FOUND] = (int)(c.found & 0xffffffff);
+  about[FOUND_HIGH] = (int)(c.found >> 32);
+  about[WANTED] = c.wanted;
+  about[AT] = (int)(counting ? c.batch_count : c.at);
+  if (counting) about[WORDS] = (int)c.raw_logged;
 }
