@@ -93,7 +93,7 @@ def choose_room(
         "%d Gaussians and the path of their search need %s in memory, %s are free: they go to scratch files in %s "
         "(at most about %s; --scratch names another folder), %d rows at a time; %d bytes of each Gaussian and views of the "
         "Gaussians that they show stay in memory; %d passes over %d poses",
-        rows, format_size(whole), format_size(budget.free), room.folder, format_size(whole + spooled), COMPACT_ROWS,
+        rows, format_size(size + least), format_size(budget.free), room.folder, format_size(whole + spooled), COMPACT_ROWS,
         SPILLED_ROW_BYTES, 2 + EFFORTS[options.effort].refit_rounds, len(scored),
     )  # fmt: skip
     return room

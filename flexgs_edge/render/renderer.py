@@ -278,7 +278,8 @@ class Renderer:
         if not held:
             shapes = (((count,), np.uint32), ((count, channels, 2), np.uint32))
             held = scene.statistics = [self.backend.array(shape, dtype) for shape, dtype in shapes]
-        for array in held:
+        # Hits are counted with weights alone; the other blends leave them out.
+        for array in held[channels > 1 :]:
             self.backend.fill(array, 0)
         return held[0], held[1]
 
