@@ -14,13 +14,7 @@ from flexgs_edge.constants import CULLED, DEFAULT_NEAR
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels import Backend
 from flexgs_edge.quantize import QuantizedScene
-from flexgs_edge.render.device_scene import (
-    SUM_BYTES,
-    Chunk,
-    DeviceScene,
-    QuantizedPlanes,
-    SourcePlanes,
-)
+from flexgs_edge.render.device_scene import SUM_BYTES, Chunk, DeviceScene, QuantizedPlanes, SourcePlanes
 from flexgs_edge.render.records import Statistics, camera_record
 from flexgs_edge.render.view_buffers import (
     SORT_DIGIT_BITS,
@@ -113,6 +107,7 @@ class Renderer:
         """[m] u32, rows of the scene that the sums of the view drawn last belong to; None: all of them."""
         self._buffers: ViewBuffers | None = None
         self._aimed: Any = None
+        self._words = np.empty(0, np.uint32)
 
     def aim(self, camera: Camera, origin: np.ndarray) -> None:
         """Put the record of a view into `camera_array`."""
@@ -264,9 +259,14 @@ class Renderer:
         """[channels, N] i64 from the words of sums, from plane `first` and row `start` on."""
         values = np.empty((channels, count), np.int64)
         planes = sums.shape[1]
+        size = min(SUM_ROWS, count) * planes * 2
+        if self._words.size < size:
+            # Kept from view to view: fresh pages for each took as long as the copy.
+            self._words = np.empty(size, np.uint32)
         for base in range(0, count, SUM_ROWS):
             rows = min(SUM_ROWS, count - base)
-            words = self.backend.read(sums, np.empty((rows, planes, 2), np.uint32), 2 * planes * (start + base))
+            words = self._words[: rows * planes * 2].reshape(rows, planes, 2)
+            self.backend.read(sums, words, 2 * planes * (start + base))
             values[:, base : base + rows] = words.view(np.int64)[:, first : first + channels, 0].T
         return values
 
@@ -439,6 +439,7 @@ class Renderer:
 
     def release(self) -> None:
         """Free the view's buffers (they come back with the next view)."""
+        self._words = np.empty(0, np.uint32)
         if self._buffers is not None:
             self._buffers.release()
             self._buffers = None
