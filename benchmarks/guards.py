@@ -4,7 +4,7 @@ Fidelity at the training poses and at those of held-out views at other distances
 bytes and processor seconds, with --views-margin off and on.
 
 python -m benchmarks.guards [--scene fox|sample] [--effort fast|balanced|thorough|max] [--only off|on]
-    [--max-drop DB | --max-size BYTES]
+    [--max-drop DB | --max-size BYTES] [--distil STEPS]
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ def main() -> None:
         ("--only", {"choices": ("off", "on")}),
         ("--max-drop", {"type": float, "default": 1.0}),
         ("--max-size", {"type": int, "metavar": "BYTES"}),
+        ("--distil", {"type": int, "metavar": "STEPS"}),
     )
     options = parse(__doc__, repeats=1, scene="sample", more=more)
     backend, budget = backend_of(options)
@@ -74,7 +75,7 @@ def main() -> None:
             started = time.process_time()
             size = options.max_size
             target: dict[str, Any] = {"max_drop": options.max_drop} if size is None else {"max_size": size}
-            chosen = CompressOptions(effort=options.effort, views_margin=margin, **target)
+            chosen = CompressOptions(effort=options.effort, views_margin=margin, distil=options.distil, **target)
             result = compress(path, place, chosen)
             seconds = time.process_time() - started
             label = f"{options.scene}, {options.effort}, margin {'on' if margin else 'off'}"

@@ -101,13 +101,16 @@ class CountKernel:
             self._write("codes", i, planes)
             self._write("cells", i, codes.cells)
         self.device.write(self._arrays["info"], info)
-        arrays = list(self._arrays.values())
+        arrays = self._arrays
         launch_coding(
             self.device,
             len(chunks),
             (self._stride, self._planes, self.sh_degree),
-            arrays[:8],
-            counting=((self._log, self._raw, self._first[-1], self._batches), arrays[8:]),
+            [arrays[name] for name in ("info", "records", *PLANES, "codes")],
+            counting=(
+                (self._log, self._raw, self._first[-1], self._batches),
+                [arrays[name] for name in ("contexts", "symbols", "raw", "counts", "batches")],
+            ),
         )
         self.device.read(self._arrays["info"], info)
         counted = info[:, INFO.index("status")] == 0
