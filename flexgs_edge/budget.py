@@ -34,7 +34,7 @@ _UNITS = {
 SAMPLE_SECONDS = 0.05
 """Seconds between looks at the memory: peaks that are shorter may be missed. A look takes 30 microseconds."""
 
-_MALLOPT = {-3: 2 << 20, -1: 1 << 20, -8: 2}
+_MALLOPT = {-3: 8 << 20, -1: 32 << 20, -8: 2}
 """glibc's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD in bytes, and M_ARENA_MAX: heaps of threads."""
 
 

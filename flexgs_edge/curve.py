@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexgs_edge.scratch import BLOCK_ROWS, MEMORY, Room, blocks, stable_order
+from flexgs_edge.scratch import MEMORY, Room, blocks, put_rows, read_rows, stable_order
 
 
 def morton(cells: np.ndarray) -> np.ndarray:
@@ -27,8 +27,8 @@ def near_rows(means: np.ndarray, room: Room = MEMORY) -> np.ndarray:
         order = stable_order(line, room)
         for part in blocks(count):
             ranks[order[part]] = np.arange(part.start, part.stop) * 1024 // count
-    for part in blocks(count, BLOCK_ROWS, cells):
-        index[part] = morton(cells[:, part])
+    for part in blocks(count):
+        put_rows(index, part, morton(read_rows(cells, part)))
     return stable_order(index, room)
 
 

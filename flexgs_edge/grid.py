@@ -16,9 +16,10 @@ import numpy as np
 from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
 from flexgs_edge.curve import morton
 from flexgs_edge.errors import InputError
+from flexgs_edge.ordered import OrderedPlanes
 from flexgs_edge.rotations import canonical_axes
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
-from flexgs_edge.scratch import BLOCK_ROWS, MEMORY, Room, blocks, fetch, fetched, stable_order
+from flexgs_edge.scratch import MEMORY, Room, blocks, put_rows, read_rows, stable_order
 
 POSITION_BITS = 21
 """Cells along an axis of a scene as a power of two: three of them fill a 63-bit curve index."""
@@ -212,16 +213,17 @@ def to_grid(
     position, order = _along_curve(planes["means"], steps.position, layer, room)
     scale, rotation, dc = (room.empty((3, count), np.int32) for _ in range(3))
     opacity = room.empty((count,), np.int32)
-    ordered = _Ordered(planes, order, room)
+    ordered = OrderedPlanes(planes, order, room)
     for part in blocks(count):
         rows = order[part]
         quats, log_scales = ordered.of("quats", part), ordered.of("log_scales", part)
         if rename:
             quats, log_scales = canonical_axes(quats, log_scales)
-        scale[:, part] = _codes("log_scales", log_scales, steps.scale, rows)
-        rotation[:, part] = _codes("quats", quats[1:], steps.rotation, rows)
-        opacity[part] = _codes("opacity_logits", ordered.of("opacity_logits", part), steps.opacity, rows)[0]
-        dc[:, part] = _colour_codes("sh_dc", ordered.of("sh_dc", part)[:, None], steps.colour(steps.dc), rows)[:, 0]
+        logits, colours = ordered.of("opacity_logits", part), ordered.of("sh_dc", part)[:, None]
+        put_rows(scale, part, _codes("log_scales", log_scales, steps.scale, rows))
+        put_rows(rotation, part, _codes("quats", quats[1:], steps.rotation, rows))
+        put_rows(opacity, part, _codes("opacity_logits", logits, steps.opacity, rows)[0])
+        put_rows(dc, part, _colour_codes("sh_dc", colours, steps.colour(steps.dc), rows)[:, 0])
     degrees = degrees[order]
     grid = GridScene(
         count,
@@ -248,8 +250,9 @@ def _along_curve(means: np.ndarray, step: float, layer: np.ndarray | None, room:
     count = means.shape[1]
     codes = room.empty((3, count), np.int32)
     low, high = np.full((3, 1), CODE_LIMIT), np.full((3, 1), -CODE_LIMIT)
-    for part in blocks(count, BLOCK_ROWS, means):
-        codes[:, part] = some = _codes("means", means[:, part], step, np.arange(part.start, part.stop))
+    for part in blocks(count):
+        some = _codes("means", read_rows(means, part), step, np.arange(part.start, part.stop))
+        put_rows(codes, part, some)
         low, high = (
             np.minimum(low, some.min(axis=1, keepdims=True)),
             np.maximum(high, some.max(axis=1, keepdims=True)),
@@ -260,8 +263,8 @@ def _along_curve(means: np.ndarray, step: float, layer: np.ndarray | None, room:
             f"2^{POSITION_BITS}: take a larger step or remove far outliers"
         )
     keys = room.empty((count,), np.uint64)
-    for part in blocks(count, BLOCK_ROWS, codes):
-        keys[part] = morton(codes[:, part] - low)
+    for part in blocks(count):
+        put_rows(keys, part, morton(read_rows(codes, part) - low))
     layers = None if layer is None else _bytes("layer", layer, count, 255)
     order = stable_order(keys, room) if layers is None else np.lexsort((keys, layers)).astype(np.int64)
     return room.take(codes, order), order
@@ -272,15 +275,16 @@ def values_of(grid: GridScene, room: Room = MEMORY) -> dict[str, np.ndarray]:
     planes = {name: room.empty((field.width(grid.sh_degree), grid.count), np.float32) for name, field in FIELD.items()}
     names = [name for name in FIELD if name != "sh_rest"]
     first = np.zeros(grid.sh_degree, np.int64)
-    of_all = (grid.position, grid.scale, grid.rotation, grid.opacity, grid.dc)
-    for part in blocks(grid.count, BLOCK_ROWS, *of_all):
+    for part in blocks(grid.count):
         for name, values in from_grid(grid, part, names).items():
-            planes[name][:, part] = values
+            put_rows(planes[name], part, values)
         # As `from_grid` finds them, but counted once.
         degrees = grid.sh_degrees[part]
         last = first + np.array([np.count_nonzero(degrees > level) for level in range(grid.sh_degree)], np.int64)
-        bands = [fetched(band, slice(a, b)) for band, a, b in zip(grid.sh, first.tolist(), last.tolist(), strict=True)]
-        planes["sh_rest"][:, part] = _spread_bands(grid, degrees, bands)
+        bands = [
+            read_rows(band, slice(a, b)) for band, a, b in zip(grid.sh, first.tolist(), last.tolist(), strict=True)
+        ]
+        put_rows(planes["sh_rest"], part, _spread_bands(grid, degrees, bands))
         first = last
     return planes
 
@@ -301,14 +305,20 @@ def from_grid(
     """
     steps = grid.steps
     makers = {
-        "means": lambda: _values(grid.position[:, rows], steps.position),
-        "sh_dc": lambda: _rgb(grid.dc[:, None, rows], steps.colour(steps.dc))[:, 0],
+        "means": lambda: _values(_part(grid.position, rows), steps.position),
+        "sh_dc": lambda: _rgb(_part(grid.dc, rows)[:, None], steps.colour(steps.dc))[:, 0],
         "sh_rest": lambda: _sh_rest(grid, rows),
-        "opacity_logits": lambda: _values(grid.opacity[None, rows], steps.opacity),
-        "log_scales": lambda: _values(grid.scale[:, rows], steps.scale),
-        "quats": lambda: _quats(_values(grid.rotation[:, rows], steps.rotation)),
+        "opacity_logits": lambda: _values(_part(grid.opacity, rows)[None], steps.opacity),
+        "log_scales": lambda: _values(_part(grid.scale, rows), steps.scale),
+        "quats": lambda: _quats(_values(_part(grid.rotation, rows), steps.rotation)),
     }
     return {field: makers[field]() for field in fields}
+
+
+def _part(values: np.ndarray, rows: slice | np.ndarray) -> np.ndarray:
+    if isinstance(rows, slice) and rows.step in (None, 1):
+        return read_rows(values, slice(*rows.indices(values.shape[-1])[:2]))
+    return values[..., rows]
 
 
 def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:
@@ -321,7 +331,8 @@ def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:
     for degree in range(1, grid.sh_degree + 1):
         if isinstance(rows, slice):
             first = int(np.count_nonzero(grid.sh_degrees[:start] >= degree))
-            bands.append(grid.sh[degree - 1][:, first : first + int(np.count_nonzero(degrees >= degree))])
+            last = first + int(np.count_nonzero(degrees >= degree))
+            bands.append(read_rows(grid.sh[degree - 1], slice(first, last)))
         else:
             bands.append(grid.sh[degree - 1][:, _places(grid.sh_degrees, np.arange(grid.count)[rows], degree)])
     return _spread_bands(grid, degrees, bands)
@@ -344,11 +355,11 @@ def _spread_bands(grid: GridScene, degrees: np.ndarray, bands: Sequence[np.ndarr
 def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray, room: Room = MEMORY) -> GridScene:
     """The same rows with other colours ([3, n] and [3 * K, n] f32, in the grid's row order) put on the same steps."""
     dc = room.empty((3, grid.count), np.int32)
-    for part in blocks(grid.count, BLOCK_ROWS, sh_dc):
-        rows = np.arange(part.start, part.stop)
-        dc[:, part] = _colour_codes("sh_dc", sh_dc[:, None, part], grid.steps.colour(grid.steps.dc), rows)[:, 0]
+    for part in blocks(grid.count):
+        rows, some = np.arange(part.start, part.stop), read_rows(sh_dc, part)[:, None]
+        put_rows(dc, part, _colour_codes("sh_dc", some, grid.steps.colour(grid.steps.dc), rows)[:, 0])
     degrees = range(1, grid.sh_degree + 1)
-    colours = _Ordered({"sh_rest": sh_rest}, None, room)
+    colours = OrderedPlanes({"sh_rest": sh_rest}, None, room)
     bands = tuple(_band_codes(colours, d, np.flatnonzero(grid.sh_degrees >= d), grid.steps, room) for d in degrees)
     return replace(grid, dc=dc, sh=bands)
 
@@ -385,37 +396,8 @@ def _colour_codes(name: str, rgb: np.ndarray, steps: np.ndarray, order: np.ndarr
     return _codes(name, colour, steps[:, None, None].astype(np.float64), order)
 
 
-class _Ordered:
-    """Columns of planes in another order (None: their own), read in parts.
-
-    From memory they are looked up as they are asked for. In files all are put in order first, plane by plane: otherwise places
-    all over every plane would be read for each part.
-    """
-
-    def __init__(self, planes: Planes, order: np.ndarray | None, room: Room) -> None:
-        self._planes, self._order = dict(planes), order
-        if order is not None and room.spills:
-            self._planes = {name: room.take(values, order) for name, values in planes.items() if name != "means"}
-            self._order = None
-
-    def of(self, field: str, rows: slice) -> np.ndarray:
-        """[width, m] of some rows."""
-        values = self._planes[field]
-        values = values.reshape(-1, values.shape[-1])
-        return fetched(values, rows) if self._order is None else values[:, self._order[rows]]
-
-    def band(self, degree: int, rows: np.ndarray) -> np.ndarray:
-        """[3, 2l + 1, m] coefficients of one SH degree of some rows."""
-        values = self._planes["sh_rest"]
-        band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
-        rgb = values.reshape(3, len(values) // 3, values.shape[1])[:, band]
-        if self._order is None and len(rows):
-            fetch(rgb, slice(int(rows[0]), int(rows[-1]) + 1))
-        return rgb[:, :, rows if self._order is None else self._order[rows]]
-
-
 def _band_codes(
-    planes: _Ordered, degree: int, rows: np.ndarray, steps: Steps, room: Room, order: np.ndarray | None = None
+    planes: OrderedPlanes, degree: int, rows: np.ndarray, steps: Steps, room: Room, order: np.ndarray | None = None
 ) -> np.ndarray:
     """[3 * (2l + 1), n] codes of the coefficients of one SH degree; `order` gives input rows for the message."""
     codes = room.empty((3, 2 * degree + 1, len(rows)), np.int32)
@@ -423,7 +405,7 @@ def _band_codes(
         chosen = rows[part]
         named = chosen if order is None else order[chosen]
         rgb = planes.band(degree, chosen)
-        codes[:, :, part] = _colour_codes("sh_rest", rgb, steps.colour(steps.sh[degree - 1]), named)
+        put_rows(codes, part, _colour_codes("sh_rest", rgb, steps.colour(steps.sh[degree - 1]), named))
     return codes.reshape(6 * degree + 3, len(rows))
 
 

@@ -12,7 +12,7 @@ from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import GridScene, Planes, Steps, from_grid, to_grid
 from flexgs_edge.scene.fields import sh_rest_count
-from flexgs_edge.scratch import BLOCK_ROWS, MEMORY, Room, blocks
+from flexgs_edge.scratch import MEMORY, Room, blocks, read_rows
 
 _COMMENT = "flexgs-edge grid "
 
@@ -76,8 +76,8 @@ def lowered(grid: GridScene, room: Room = MEMORY) -> GridScene:
         codes = grid.sh[degree - 1]
         rows = np.flatnonzero(grid.sh_degrees >= degree)
         zero = np.empty(len(rows), bool)
-        for part in blocks(len(rows), BLOCK_ROWS, codes):
-            zero[part] = ~codes[:, part].any(axis=0)
+        for part in blocks(len(rows)):
+            zero[part] = ~read_rows(codes, part).any(axis=0)
         # A row that keeps a higher degree keeps this one.
         zero &= degrees[rows] == degree
         degrees[rows[zero]] = degree - 1

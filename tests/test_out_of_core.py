@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import subprocess
 import sys
@@ -21,8 +22,11 @@ from flexgs_edge.pipeline import compress as compress_module
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.refit import refit_colours
 from flexgs_edge.render import Renderer, Statistics, device_scene
+from flexgs_edge.render import compact as compact_module
 from flexgs_edge.render import renderer as renderer_module
 from flexgs_edge.render.chunk_bounds import ChunkBounds
+from flexgs_edge.render.chunks import SourcePlanes
+from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.records import camera_record
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.scene import write_ply
@@ -52,9 +56,10 @@ def cameras() -> list[Camera]:
 def compact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Views hold what they show, with room for few rows at first, in chunks of 64 rows."""
     monkeypatch.setattr(Renderer, "_fits", lambda *_: False)
-    monkeypatch.setattr(renderer_module, "CAPACITY_STEP", 32)
+    monkeypatch.setattr(compact_module, "CAPACITY_STEP", 32)
     monkeypatch.setattr(renderer_module, "FIRST_SHARE", 100)
     monkeypatch.setattr(device_scene, "COMPACT_ROWS", 64)
+    monkeypatch.setattr(DeviceScene, "_may_stay", lambda *_: False)
 
 
 def found_by(form: str, room: Scratch | None) -> dict[str, np.ndarray]:
@@ -88,6 +93,11 @@ def test_compact_views_give_the_same_bits(
     form: str, compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spilled = found_by(form, Scratch(tmp_path))
+    # Some chunks stay in memory.
+    asked = itertools.count()
+    monkeypatch.setattr(DeviceScene, "_may_stay", lambda *_: next(asked) % 3 == 0)
+    for name, values in found_by(form, Scratch(tmp_path)).items():
+        np.testing.assert_array_equal(values, spilled[name], err_msg=name)
     # One chunk, so that it is the last one that shows more than there is room for.
     monkeypatch.setattr(device_scene, "COMPACT_ROWS", 4096)
     for name, values in found_by(form, Scratch(tmp_path)).items():
@@ -97,6 +107,44 @@ def test_compact_views_give_the_same_bits(
     assert plain["removal"].any() and plain["hits"].any()
     for name, values in plain.items():
         np.testing.assert_array_equal(spilled[name], values, err_msg=name)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_chunks_that_stay_give_way(seed: int, compact: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are read once, unless memory is wanted for something else, at any moment; the one that is used is never taken."""
+    rng, backend, budget, read = np.random.default_rng(seed), open_form("w8"), large_budget(), []
+    monkeypatch.setattr(DeviceScene, "_may_stay", lambda *_: rng.random() < 0.8)
+    plain_read, used = MemorySource.read, budget.used
+
+    def note(self: MemorySource, rows: slice, *words: Any) -> Any:
+        read.append(rows.start)
+        return plain_read(self, rows, *words)
+
+    monkeypatch.setattr(MemorySource, "read", note)
+    planes = SCENE.read(slice(0, SCENE.count), ["means", "sh_rest"])
+    starts = list(range(0, SCENE.count, 64))
+    with DeviceScene(backend, SourcePlanes(backend, SCENE), budget) as scene:
+        scene.be_compact(100)
+        for turn in range(12):
+            stayed = set(scene._pinned)
+            read.clear()
+            found = []
+            for chunk in scene.chunks():
+                if turn % 2:
+                    (reclaim,) = budget.reclaimers
+                    reclaim(int(rng.integers(0, 60_000)))
+                rows = slice(chunk.base, chunk.base + chunk.count)
+                for name, array in (("means", chunk.means), ("sh_rest", chunk.sh_rest)):
+                    np.testing.assert_array_equal(backend.read(array)[:, : chunk.count], planes[name][:, rows])
+                found.append(chunk.base)
+            assert found == starts
+            if turn % 2 == 0:
+                assert read == [start for start in starts if start not in stayed]
+            assert len(read) == len(set(read)) and len(scene._pinned) <= len(starts)
+        for chunk in scene.chunks():  # left in the middle
+            if chunk.base > SCENE.count // 2:
+                break
+    assert not budget.reclaimers and budget.used == used
 
 
 def wide_scene() -> MemorySource:
@@ -313,8 +361,11 @@ def test_kills_lose_no_bytes(tmp_path: Path) -> None:
     (tmp_path / "a.fgs").unlink()
     for share in (0.5, 0.8):
         if run(tmp_path, "--resume", seconds=share * took) is None:
-            assert not (tmp_path / "a.fgs").exists()
-            assert all(name.startswith((".flexgs-", "point", "cameras")) for name in os.listdir(tmp_path))
+            # Killed at its very end, it had given the file its name.
+            assert not (tmp_path / "a.fgs").exists() or (tmp_path / "a.fgs").read_bytes() == expected
+            others = set(os.listdir(tmp_path)) - {"a.fgs"}
+            assert all(name.startswith((".flexgs-", "point", "cameras")) for name in others)
+            (tmp_path / "a.fgs").unlink(missing_ok=True)
     done = run(tmp_path, "--resume", "-f")
     assert done is not None and done.returncode == 0, done
     assert (tmp_path / "a.fgs").read_bytes() == expected

@@ -17,7 +17,7 @@ from flexgs_edge import scratch
 from flexgs_edge.best.checkpoint import Checkpoint
 from flexgs_edge.best.path import lowest
 from flexgs_edge.errors import BudgetError, InputError
-from flexgs_edge.scratch import MEMORY, Room, Scratch, copy_rows, file_system_of, stable_order
+from flexgs_edge.scratch import MEMORY, Room, Scratch, copy_rows, file_system_of, put_rows, read_rows, stable_order
 
 COUNT = 40_000
 
@@ -53,7 +53,50 @@ def test_copied_rows_are_those_of_the_array(room: Room, shape: tuple[int, ...]) 
             assert (wide[..., stop - start : COUNT] == -1).all() and (wide[..., COUNT + 1 :: 2] == -1).all()
 
 
-def test_what_is_fetched_is_what_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("cached", [True, False])
+@pytest.mark.parametrize("shape", [(COUNT,), (3, COUNT), (2, 4, COUNT)])
+def test_rows_that_are_put_are_read(
+    room: Room, shape: tuple[int, ...], cached: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether they are in the kernel's cache or not, by the accessors and through the pages."""
+    monkeypatch.setattr(scratch, "is_cached", lambda address, size: cached)
+    expected = np.random.default_rng(3).normal(size=shape).astype(np.float32)
+    held = room.copy(expected)
+    for start, stop in ((0, COUNT), (5, 4097), (COUNT - 1, COUNT), (9, 9)):
+        rows = slice(start, stop)
+        np.testing.assert_array_equal(read_rows(held, rows), expected[..., rows])
+        part = np.arange(np.prod(expected[..., rows].shape)).reshape(expected[..., rows].shape)
+        for values in (part, 5):
+            put_rows(held, rows, values)  # of another type, or one for all
+            expected[..., rows] = values
+            np.testing.assert_array_equal(read_rows(held, rows), expected[..., rows])
+            np.testing.assert_array_equal(held, expected)
+    if held.ndim > 1:
+        np.testing.assert_array_equal(read_rows(held[1:], slice(3, 8)), expected[1:, ..., 3:8])
+        put_rows(held[1:], slice(3, 8), 7)
+        expected[1:, ..., 3:8] = 7
+        np.testing.assert_array_equal(held, expected)
+
+
+def test_rows_in_any_order_are_taken(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a plane that is read as a whole, where memory holds it; else rows far apart are looked up through the pages."""
+    values = room.copy(np.random.default_rng(4).normal(size=(3, COUNT)))
+    fetched = []
+    monkeypatch.setattr(scratch, "fetch", lambda plane, rows: fetched.append(rows))
+    for whole in (scratch.WHOLE_BYTES, 0):
+        monkeypatch.setattr(scratch, "WHOLE_BYTES", whole)
+        for rows, apart in (
+            (np.arange(0, COUNT, 2), False),
+            (np.array([5, COUNT - 1, 7]), True),
+            (np.arange(0), False),
+        ):
+            fetched.clear()
+            np.testing.assert_array_equal(room.take(values, rows), values[:, rows])
+            assert bool(fetched) is (apart and room.spills and not whole)
+            np.testing.assert_array_equal(scratch.read_listed(values, rows), values[:, rows])
+
+
+def test_a_part_is_fetched_plane_by_plane(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     advise = scratch._Map.madvise
 
@@ -67,17 +110,16 @@ def test_what_is_fetched_is_what_is_read(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(scratch._Map, "madvise", note)
     for view in (values, values[1:, ::2, 5:], values.reshape(12, -1)[3:5], numbers):
         asked.clear()
-        part = scratch.fetched(view, slice(2_100, 5_000))
-        np.testing.assert_array_equal(part, view[..., 2_100:5_000])
+        scratch.fetch(view, slice(2_100, 5_000))
         pieces = [numbers[start // 4 : (start + length) // 4] for _, start, length in asked]
         got = set(np.concatenate(pieces).astype(int).tolist())
+        part = view[..., 2_100:5_000]
         assert got >= set(part.reshape(-1).astype(int).tolist())
         assert len(got) <= part.size + len(pieces) * mmap.PAGESIZE // 4
     asked.clear()
     scratch.fetch(np.zeros((3, 4)), slice(0, 4))
     scratch.fetch(values[:, :0], slice(0, 4))
     assert not asked
-    assert list(scratch.blocks(9_000, 4_000, values))[-1] == slice(8_000, 9_000) and len(asked) == 36
 
 
 def test_files_are_gone_with_their_arrays(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.scene.atomic import DISK_FULL
-from flexgs_edge.scratch import Room, blocks
+from flexgs_edge.scratch import Room, blocks, read_rows
 
 DONE = "done"
 """File of a round that is there last: without it the round was cut short."""
@@ -76,8 +76,8 @@ class Checkpoint:
                         file, {"descr": values.dtype.str, "fortran_order": False, "shape": values.shape}
                     )
                     for plane in values.reshape(-1, values.shape[-1]) if values.size else ():
-                        for rows in blocks(values.shape[-1], 1 << 20, plane):
-                            file.write(np.ascontiguousarray(plane[rows]).data)
+                        for rows in blocks(values.shape[-1], 1 << 20):
+                            file.write(np.ascontiguousarray(read_rows(plane, rows)).data)
                     file.flush()
                     os.fsync(file.fileno())
             (place / DONE).touch()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexgs_edge.scratch import MEMORY, Room, blocks, fetched
+from flexgs_edge.scratch import MEMORY, Room, blocks, put_rows, read_rows
 
 COLOURS = ("sh_dc", "sh_rest")
 
@@ -41,7 +41,7 @@ class Mended:
         """`planes` with these values: geometry wherever a row was kept, colours where it was with the same SH degree."""
         if not len(self.rows) or not len(rows):
             return planes
-        changed = {name: room.copy(planes[name]) for name in self.planes}
+        changed = {name: room.empty(planes[name].shape, planes[name].dtype) for name in self.planes}
         for part in blocks(len(rows)):
             some = rows[part]
             at = np.minimum(np.searchsorted(self.rows, some), len(self.rows) - 1)
@@ -50,14 +50,14 @@ class Mended:
             span = slice(int(at[0]), int(at[-1]) + 1)
             for name, values in changed.items():
                 same = np.flatnonzero(alike if name in COLOURS else kept)
-                mended = fetched(self.planes[name], span)
-                to, places = fetched(values, part), at[same] - span.start
+                to, places = read_rows(planes[name], part).copy(), at[same] - span.start
                 # Of colours a grid may have lost its highest degrees: coefficients are channel by channel.
                 channels = 3 if name in COLOURS else 1
-                for held, new in zip(*(v.reshape(channels, -1, v.shape[-1]) for v in (to, mended)), strict=True):
-                    # Plane by plane, as scratch files have them.
+                both = (v.reshape(channels, -1, v.shape[-1]) for v in (to, self.planes[name]))
+                for held, new in zip(*both, strict=True):
                     for plane, moved in zip(held, new, strict=False):
-                        plane[same] = moved[places]
+                        plane[same] = read_rows(moved, span).take(places)
+                put_rows(values, part, to)
         return {**planes, **changed}
 
 

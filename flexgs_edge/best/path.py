@@ -17,16 +17,21 @@ from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.render.view_sums import ViewSums
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.score.removal import CostParts, RemovalCosts, cost_parts, cost_sums, moment_bytes, put_costs
+from flexgs_edge.score.removal import (
+    PART_NAMES,
+    CostParts,
+    RemovalCosts,
+    cost_parts,
+    cost_sums,
+    moment_bytes,
+    put_costs,
+)
 from flexgs_edge.scratch import MEMORY, Room
 
 PARTS = 2
 """Interleaved parts of the poses; each round measures one, and keeps the sums of the others for the rows that stay. Bytes at 1 dB
 on fox (balanced, refits alike) by processor seconds: one part, .8 kept a round 585 kB / 141 s; two parts, .8 571 / 110, .88 558 /
 134; four parts, .88 581 / 122."""
-
-
-PART_NAMES = ("removal", "weight2", "moments")
 
 
 @dataclass
@@ -129,7 +134,8 @@ class PrunePath:
         """Measure costs on the whole scene."""
         room, start = self.room, take_rows(planes, self.rows, self.room)
         source = MemorySource(start, origin=self.origin)
-        with self.renderer.load(source, sum_bytes(2) + moment_bytes(source.sh_degree)) as scene:
+        room_of_sums = sum_bytes(2) + moment_bytes(source.sh_degree)
+        with self.renderer.load(source, room_of_sums, view_sums=2) as scene:
             self._parts = [self._measure(scene, some, keep=True) for some in self._views]
             for view, camera in enumerate(self.between, start=len(self.cameras)):
                 self.targets.add(view, self.renderer.render_planes(scene, camera))

@@ -20,7 +20,7 @@ from flexgs_edge.render import Renderer
 from flexgs_edge.render.targets import to_half
 from flexgs_edge.rotations import tilted, turned
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.scratch import BLOCK_ROWS, blocks
+from flexgs_edge.scratch import COPY_ROWS, blocks, put_rows, read_rows
 
 GEOMETRY = ("position", "scale", "rotation", "opacity")
 VALUES = {"position": 3, "scale": 3, "rotation": 3, "opacity": 1}
@@ -56,9 +56,7 @@ def probe_slopes(
     views = [cameras[i * len(cameras) // some] for i in range(some)]
     with renderer.load(MemorySource(planes, origin=origin)) as scene:
         reference = [to_half(renderer.render(scene, camera)) for camera in views]
-    smallest = np.concatenate(
-        [planes["log_scales"][:, rows].min(axis=0) for rows in blocks(count, BLOCK_ROWS, planes["log_scales"])]
-    )
+    smallest = np.concatenate([read_rows(planes["log_scales"], rows).min(axis=0) for rows in blocks(count)])
     size = float(np.exp(np.median(smallest.astype(np.float64))))
     # Small enough that squared errors grow with squared steps, large enough to stand clear of half precision references.
     trial = {"position": size / 4, "scale": 0.1, "rotation": 0.03, "opacity": 0.2}
@@ -66,9 +64,9 @@ def probe_slopes(
     for kind in GEOMETRY:
         field = CHANGES[kind]
         moved = {**planes, field: renderer.room.empty(planes[field].shape, np.float32)}
-        for rows in blocks(count, BLOCK_ROWS, *(planes[name] for name in set(CHANGES.values()))):
-            part = {name: values[:, rows] for name, values in planes.items()}
-            moved[field][:, rows] = _on_trial_grid(part, kind, np.float32(trial[kind]))
+        for rows in blocks(count):
+            part = {name: read_rows(planes[name], rows) for name in CHANGES.values()}
+            put_rows(moved[field], rows, _on_trial_grid(part, kind, np.float32(trial[kind])))
         with renderer.load(MemorySource(moved, origin=origin)) as scene:
             error = sum(_squared_error(renderer.render(scene, c), r) for c, r in zip(views, reference, strict=True))
         per_row[kind] = error * len(cameras) / len(views) / (count * trial[kind] ** 2)
@@ -123,25 +121,35 @@ def choose_steps(slopes: Slopes, weight2: np.ndarray, degrees: np.ndarray, sh_de
 
 def holdable(steps: Steps, planes: dict[str, np.ndarray]) -> Steps:
     """`steps`, made coarser where the grid could not hold the planes' values: far outliers, or a multiplier near zero."""
-    count = planes["means"].shape[1]
 
     def finest(name: str, codes: int = CODE_LIMIT - 2) -> float:
-        values = planes[name]
-        parts = (values[:, rows] for rows in blocks(count, BLOCK_ROWS, values))
-        return max((float(np.abs(part).max(initial=0.0)) for part in parts), default=0.0) / codes
+        return max((float(max(-low, high)) for low, high in _ranges(planes[name])), default=0.0) / codes
 
-    width = float(np.ptp(planes["means"], axis=1).max(initial=0.0)) if count else 0.0
+    width = max((float(high - low) for low, high in _ranges(planes["means"])), default=0.0)
     least = 2.0**-70
     colours = CODE_LIMIT // 4  # Co reaches twice the coefficients, and refits move them
+    finest_sh = finest("sh_rest", colours)
     return Steps(
         position=max(steps.position, width / (2**POSITION_BITS - 2), finest("means"), least),
         scale=max(steps.scale, finest("log_scales"), least),
         rotation=max(steps.rotation, 2 / CODE_LIMIT),
         opacity=max(steps.opacity, finest("opacity_logits"), least),
         dc=max(steps.dc, finest("sh_dc", colours), least),
-        sh=tuple(max(step, finest("sh_rest", colours), least) for step in steps.sh),
+        sh=tuple(max(step, finest_sh, least) for step in steps.sh),
         chroma=steps.chroma,
     )
+
+
+def _ranges(planes: np.ndarray) -> list[tuple[np.float32, np.float32]]:
+    """Smallest and largest value of each plane of [width, n] f32; none where n is 0."""
+    ranges = []
+    for plane in planes if planes.shape[1] else ():
+        low, high = plane[0], plane[0]
+        for rows in blocks(len(plane), COPY_ROWS):
+            part = read_rows(plane, rows)
+            low, high = min(low, part.min()), max(high, part.max())
+        ranges.append((low, high))
+    return ranges
 
 
 def reachable(steps: Steps, planes: dict[str, np.ndarray], seen: np.ndarray) -> np.ndarray:
@@ -161,8 +169,8 @@ def reachable(steps: Steps, planes: dict[str, np.ndarray], seen: np.ndarray) -> 
         return np.ones(len(seen), bool)
     means, count = planes["means"], len(seen)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for rows in blocks(count, BLOCK_ROWS, means):
-        some = means[:, rows][:, seen[rows]].astype(np.float64)
+    for rows in blocks(count):
+        some = read_rows(means, rows)[:, seen[rows]].astype(np.float64)
         low, high = (
             np.minimum(low, some.min(axis=1, initial=np.inf)),
             np.maximum(high, some.max(axis=1, initial=-np.inf)),
@@ -174,9 +182,9 @@ def reachable(steps: Steps, planes: dict[str, np.ndarray], seen: np.ndarray) -> 
         "sh_dc": CODE_LIMIT // 4 * steps.dc,
     }
     every = seen.copy()
-    for rows in blocks(count, BLOCK_ROWS, means, *(planes[name] for name in limits)):
-        inside = np.abs(means[:, rows].astype(np.float64) - (low + high)[:, None] / 2).max(axis=0) <= room / 2
+    for rows in blocks(count):
+        inside = np.abs(read_rows(means, rows).astype(np.float64) - (low + high)[:, None] / 2).max(axis=0) <= room / 2
         for name, most in limits.items():
-            inside &= np.abs(planes[name][:, rows]).max(axis=0) <= most
+            inside &= np.abs(read_rows(planes[name], rows)).max(axis=0) <= most
         every[rows] |= inside
     return every

@@ -19,7 +19,7 @@ from flexgs_edge.codec.walk import ChunkCodes, base_kinds, walk_chunk, walk_posi
 from flexgs_edge.curve import morton
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import POSITION_BITS, GridScene
-from flexgs_edge.scratch import BLOCK_ROWS, MEMORY, Room, blocks, fetched
+from flexgs_edge.scratch import MEMORY, Room, blocks, put_rows, read_rows
 
 CHUNK_ROWS = 65536
 SAMPLE_CHUNKS = 2
@@ -56,29 +56,31 @@ def cells_of(grid: GridScene, room: Room = MEMORY) -> tuple[np.ndarray, np.ndarr
     if depth > POSITION_BITS:
         raise InputError(f"position: the scene is 2^{depth} cells wide, expected at most 2^{POSITION_BITS}")
     index = room.empty((grid.count,), np.uint64)
-    for rows in blocks(grid.count, BLOCK_ROWS, grid.position):
-        index[rows] = morton(grid.position[:, rows] - low[:, None])
+    for rows in blocks(grid.count):
+        put_rows(index, rows, morton(read_rows(grid.position, rows) - low[:, None]))
     sorted_ = True
     for rows in blocks(grid.count):
         both = slice(max(rows.start - 1, 0), rows.stop)
-        steps = np.diff(grid.layer[both].astype(np.int16))
-        sorted_ &= not ((steps < 0).any() or (index[both][1:] < index[both][:-1])[steps == 0].any())
+        steps, some = np.diff(grid.layer[both].astype(np.int16)), read_rows(index, both)
+        sorted_ &= not ((steps < 0).any() or (some[1:] < some[:-1])[steps == 0].any())
     if not sorted_:
         raise InputError("grid: expected rows sorted by layer, then by the Morton index of their cell: use to_grid")
     return index, low, depth
 
 
 def chunk_codes(grid: GridScene, cells: np.ndarray, chunk: Chunk) -> ChunkCodes:
-    """The codes of one chunk (views)."""
+    """The codes of one chunk."""
     rows = slice(chunk.start, chunk.stop)
-    scale, dc, rotation = (fetched(values, rows) for values in (grid.scale, grid.dc, grid.rotation))
-    planes = [*scale, grid.opacity[rows], *dc, grid.sh_degrees[rows], *rotation]
+    scale, opacity, dc, rotation = (
+        read_rows(values, rows) for values in (grid.scale, grid.opacity, grid.dc, grid.rotation)
+    )
+    planes = [*scale, opacity, *dc, grid.sh_degrees[rows], *rotation]
     base = {kind.name: plane for kind, plane in zip(base_kinds(), planes, strict=True)}
     sh = []
     for degree, band in enumerate(grid.sh, start=1):
         start = int(np.count_nonzero(grid.sh_degrees[: chunk.start] >= degree))
-        sh.append(fetched(band, slice(start, start + int(np.count_nonzero(base["sh degree"] >= degree)))))
-    return ChunkCodes(cells[rows], base, tuple(sh))
+        sh.append(read_rows(band, slice(start, start + int(np.count_nonzero(base["sh degree"] >= degree)))))
+    return ChunkCodes(read_rows(cells, rows), base, tuple(sh))
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,10 +188,10 @@ def _put_away(batches: list[Batch], room: Room) -> list[Batch]:
 
     def put(values: np.ndarray) -> np.ndarray:
         nonlocal at
-        place = held[at : at + len(values)]
-        place[...] = values
-        at += len(values)
-        return place
+        place = slice(at, at + len(values))
+        put_rows(held, place, values)
+        at = place.stop
+        return held[place]
 
     return [
         (alphabet, put(c), put(s), [(bits, put(values)) for bits, values in raw]) for alphabet, c, s, raw in batches

@@ -37,7 +37,7 @@ from flexgs_edge.regrid import on_grid, steps_of
 from flexgs_edge.render import Renderer
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.scene.source import MemorySource, SceneSource
+from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -192,8 +192,7 @@ def open_path(
     budget.require("a search by measured costs", size + least)
     budget.take("the scene and its path", size)
     try:
-        planes = {name: room.empty((source.width(name), source.count), np.float32) for name in FIELD}
-        source.read(slice(0, source.count), list(FIELD), planes)
+        planes = read_all(source, room)
         with TargetViews(room.folder) as targets:
             with clock.stage("search"):
                 rows = np.flatnonzero(alive(planes["opacity_logits"][0]))

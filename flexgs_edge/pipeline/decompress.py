@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.codec import GridSource
 from flexgs_edge.codec.coder import CHUNK_ROWS
@@ -21,8 +19,7 @@ from flexgs_edge.pipeline.workspace import DEVICE_ROWS, Stopwatch, counted_backe
 from flexgs_edge.render import Renderer
 from flexgs_edge.report.result import DecompressResult
 from flexgs_edge.scene import MemorySource, SceneSource, check_writable, inria_dtype, write_ply
-from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.scratch import BLOCK_ROWS
+from flexgs_edge.scene.source import read_all
 
 WRITE_COPIES = 3
 """Times a chunk's rows that decoding and writing hold at once: codes, planes, rows of the PLY."""
@@ -88,10 +85,8 @@ def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
         return source
     renderer.release()
     budget.require("decoding the file", min(source.count, CHUNK_ROWS) * DECODE_BYTES)
-    planes = {name: room.empty((source.width(name), source.count), np.float32) for name in FIELD}
     with ahead(source, budget):
-        for rows in source.chunks(BLOCK_ROWS):
-            source.read(rows, list(FIELD), {name: values[:, rows] for name, values in planes.items()})
+        planes = read_all(source, room)
     return MemorySource(planes, source.sh_degree, source.origin, source.name)
 
 

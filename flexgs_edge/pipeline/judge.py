@@ -71,6 +71,7 @@ class Judge:
         self.indices = list(indices)
         self._budget = budget
         self._kept: dict[tuple[str, int], np.ndarray] = {}
+        self._away: dict[tuple[str, int], np.ndarray] = {}
         self._original_error: list[float] = []
         self._coarse_error: dict[int, float] = {}
         self._known: dict[bytes, Quality] = {}
@@ -100,18 +101,20 @@ class Judge:
 
     def close(self) -> None:
         """Give the memory of the kept images back."""
-        self._kept = {}
+        self._kept, self._away = {}, {}
         self._budget.give(self._room + self._work)
         self._room = self._work = self._left = 0
         if self._give_back in self._budget.reclaimers:
             self._budget.reclaimers.remove(self._give_back)
 
     def _give_back(self, short: int) -> None:
-        """Give up room and then kept images until `short` bytes are free: they can be drawn and read again."""
+        """Give up room and then kept images until `short` bytes are free: to scratch files, or to be drawn and read again."""
         freed = min(self._left, short)
         self._left -= freed
         while freed < short and self._kept:
-            freed += self._kept.popitem()[1].nbytes
+            key, image = self._kept.popitem()
+            freed += image.nbytes
+            self._put_away(key, image)
         self._room -= freed
         self._budget.give(freed)
 
@@ -160,7 +163,7 @@ class Judge:
     def _coarse(self, i: int) -> tuple[np.ndarray, np.ndarray | None, float | None]:
         """What an estimate compares with: original and photo at its pixels, and the error between them."""
         every = (slice(None, None, ESTIMATE_STEP),) * 2
-        original, photo = self._kept.get(("coarse original", i)), self._kept.get(("coarse photo", i))
+        original, photo = self._held(("coarse original", i)), self._held(("coarse photo", i))
         if original is None:
             original = _planes(self.original(i)[every])
             self._keep(("coarse original", i), original)
@@ -193,20 +196,34 @@ class Judge:
         if image.nbytes <= self._left:
             self._left -= image.nbytes
             self._kept[key] = image
+        else:
+            self._put_away(key, image)
+
+    def _put_away(self, key: tuple[str, int], image: np.ndarray) -> None:
+        """Keep an image in a scratch file, where this run has some: six million Gaussians took 4 s to draw again."""
+        room = self.renderer.room
+        if room.spills:
+            height, width, _ = image.shape
+            planes = room.copy(image.transpose(2, 0, 1).reshape(3, -1))
+            self._away[key] = planes.reshape(3, height, width).transpose(1, 2, 0)
+
+    def _held(self, key: tuple[str, int]) -> np.ndarray | None:
+        return self._kept.get(key, self._away.get(key))
 
     def original(self, i: int) -> np.ndarray:
         """Render of the original from the view `indices[i]`, [H, W, 3] f32."""
-        if ("original", i) in self._kept:
-            return self._kept["original", i]
-        with self.renderer.load(self.source) as scene:
-            return self.renderer.render(scene, self.cameras[i])
+        held = self._held(("original", i))
+        if held is None:
+            with self.renderer.load(self.source) as scene:
+                held = _planes(self.renderer.render(scene, self.cameras[i]))
+            self._keep(("original", i), held)
+        return held
 
     def _photo(self, i: int) -> np.ndarray | None:
         if self.photos is None:
             return None
-        if ("photo", i) in self._kept:
-            return self._kept["photo", i]
-        return self.photos.load(self.indices[i])
+        held = self._held(("photo", i))
+        return self.photos.load(self.indices[i]) if held is None else held
 
 
 def _coarse_pixels(camera: Camera) -> int:

@@ -14,15 +14,9 @@ from flexgs_edge.cameras import Camera
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.refit import descent_bytes
 from flexgs_edge.render import Renderer, sum_bytes
-from flexgs_edge.render.device_scene import (
-    COMPACT_ROWS,
-    MIN_CHUNK_ROWS,
-    MOST_SUMS,
-    padded,
-    plane_bytes,
-    streamed_bytes,
-)
-from flexgs_edge.render.renderer import FIRST_SHARE
+from flexgs_edge.render.chunks import padded, plane_bytes, streamed_bytes
+from flexgs_edge.render.compact import FIRST_SHARE
+from flexgs_edge.render.device_scene import COMPACT_ROWS, MIN_CHUNK_ROWS, MOST_SUMS
 from flexgs_edge.render.view_buffers import chunk_shapes, shapes_bytes, target_bytes, view_bytes
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource

@@ -12,12 +12,12 @@ from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import Renderer, sum_bytes
-from flexgs_edge.render.device_scene import Chunk
+from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.render.view_sums import Maker, ViewSums
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.scratch import fetch, fetched
+from flexgs_edge.scratch import copy_rows, put_rows, read_rows
 
 RELAX_DC = 1.0
 RELAX_SH = 0.25
@@ -71,7 +71,8 @@ def refit_colours(
     subsets = max(min(subsets, len(cameras)), 1)
     parts = [range(first, len(cameras), subsets) for _ in range(rounds) for first in range(subsets)]
     source = MemorySource(planes, origin=origin)
-    with renderer.load(source, sum_bytes(4) + normal_bytes(source.sh_degree), targets=True) as scene:
+    room_of_sums = sum_bytes(4) + normal_bytes(source.sh_degree)
+    with renderer.load(source, room_of_sums, targets=True, view_sums=4) as scene:
         for part in progress.track(parts, "refitting colours", len(parts)):
             normal = ViewSums(renderer, scene, [normal_sums(renderer)])
             try:
@@ -130,13 +131,16 @@ def step_colours(
     """One step of some rows, in place: `normal` is their part of `normal_sums`, the rest as for `refit_colours`."""
     weight = np.where(normal[:, 3] > 0, normal[:, 3], np.float32(np.inf))
     # The constant's basis is Y_0 everywhere: its step in coefficients is 1 / Y_0 of the mean residual.
-    fetch(planes["sh_dc"], rows)
-    planes["sh_dc"][:, rows] += np.float32(RELAX_DC / SH_C0) * normal[0, :3] / weight[0]
+    moved = read_rows(planes["sh_dc"], rows) + np.float32(RELAX_DC / SH_C0) * normal[0, :3] / weight[0]
+    put_rows(planes["sh_dc"], rows, moved)
     if not bands or len(normal) == 1:
         return
     count = len(planes["sh_rest"]) // 3
     degree_of = np.repeat(np.arange(1, 5), [sh_rest_count(d) - sh_rest_count(d - 1) for d in range(1, 5)])
-    rest = fetched(planes["sh_rest"].reshape(3, count, -1), rows)
+    rest = planes["sh_rest"].reshape(3, count, -1)
+    stepped = np.empty((3, count, rows.stop - rows.start), np.float32)
+    copy_rows(rest, rows, stepped)
     for k in range(len(normal) - 1):
         moved = np.where(degrees[rows] >= degree_of[k], np.float32(RELAX_SH) / weight[k + 1], np.float32(0))
-        rest[:, k] += normal[k + 1, :3] * moved
+        stepped[:, k] += normal[k + 1, :3] * moved
+    put_rows(rest, rows, stepped)

@@ -13,7 +13,7 @@ from flexgs_edge.constants import LANES
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.grid import Steps
 from flexgs_edge.render import DeviceScene, Renderer, sum_bytes
-from flexgs_edge.render.device_scene import Chunk
+from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.renderer import GRADIENT_SUMS
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource

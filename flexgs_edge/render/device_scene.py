@@ -5,30 +5,40 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from flexgs_edge.budget import MemoryBudget
-from flexgs_edge.constants import DEQUANTIZE_ROWS, LANES
+from flexgs_edge.constants import LANES
 from flexgs_edge.kernels import Backend
-from flexgs_edge.quantize import QuantizedArray, QuantizedScene
 from flexgs_edge.render.chunk_bounds import ChunkBounds
+from flexgs_edge.render.chunks import (
+    RAW_BYTES,
+    Chunk,
+    ChunkArrays,
+    QuantizedPlanes,
+    SourcePlanes,
+    padded,
+    plane_bytes,
+    streamed_bytes,
+)
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
 
 CHUNK_ROWS = 1 << 18
 """Most rows of a chunk: 60 MB of planes at SH degree 3, large enough that launches cost nothing."""
 MIN_CHUNK_ROWS = 1 << 10
-COMPACT_ROWS = 1 << 15
-"""Rows of a chunk of a scene whose views are compact: 16 MB with all that projecting it takes."""
+COMPACT_ROWS = 1 << 16
+"""Rows of a chunk of a scene whose views are compact: 33 MB with all that projecting it takes."""
+SPARE_SHARE = 4
+"""Part of the limit (one in four) that chunks of a compact scene which stay leave free."""
 
 
 def sum_bytes(planes: int) -> int:
-    """Bytes a row of a scoring pass's hits and of so many planes of 64-bit sums."""
-    return 4 + 8 * planes
+    """Bytes a row of so many planes of 64-bit sums, and of the hits that go with a single one."""
+    return 8 * planes + 4 * (planes == 1)
 
 
 SUM_BYTES = sum_bytes(1)
@@ -36,151 +46,18 @@ MOST_SUMS = 6
 """Planes of sums that a view has at most (`Renderer.residual_and_removal_sums`)."""
 
 
-def plane_bytes(sh_degree: int) -> int:
-    """Bytes a row of an activated chunk: means, covariance (or its factor), log2 of the opacity, colour."""
-    return 4 * (3 + 6 + 1 + 3 + FIELD["sh_rest"].width(sh_degree))
-
-
-RAW_BYTES = 4 * (3 + 4 + 1)
-"""Bytes a row that loading needs on top for a moment: stored scale, rotation, opacity."""
-
-
-def streamed_bytes(sh_degree: int) -> int:
-    """Bytes a row of a streamed chunk, and of the one that is loaded while it is drawn."""
-    return 2 * (plane_bytes(sh_degree) + RAW_BYTES)
-
-
-@dataclass
-class Chunk:
-    """Planes of rows [base, base + count) of a scene, ready for `project`."""
-
-    base: int
-    count: int
-    stride: int
-    degree: int
-    means: Any
-    cov: Any
-    log2_opacity: Any
-    sh_dc: Any
-    sh_rest: Any
-
-    @property
-    def arrays(self) -> tuple[Any, ...]:
-        """All planes."""
-        return self.means, self.cov, self.log2_opacity, self.sh_dc, self.sh_rest
-
-    def release(self) -> None:
-        """Free the planes."""
-        for array in self.arrays:
-            array.release()
-
-
-def padded(count: int) -> int:
-    """Elements of a plane that holds `count` rows."""
-    return -(-count // LANES) * LANES
-
-
 def _nothing() -> None:
     """Waits for no kernel."""
 
 
-class _ChunkArrays:
-    """What a chunk lies in on the backend: stored planes, and what they are activated to."""
+@dataclass
+class _Loading:
+    """A chunk that another thread loads."""
 
-    def __init__(self, backend: Backend, degree: int, stride: int) -> None:
-        self.backend, self.degree, self.stride = backend, degree, stride
-        shapes = {name: (field.width(degree), stride) for name, field in FIELD.items()}
-        self.stored = {name: backend.array(shape, np.float32) for name, shape in shapes.items()}
-        self.cov = backend.array((6, stride), np.float32)
-        self.log2_opacity = backend.array((stride,), np.float32)
-
-    def activated(self, base: int, count: int, antialiased: bool) -> Chunk:
-        """The chunk of the rows that are stored."""
-        stored, stride = self.stored, self.stride
-        self.backend.launch(
-            "activate", (stride,), stride, int(antialiased), stored["log_scales"], stored["quats"],
-            stored["opacity_logits"], self.cov, self.log2_opacity,
-        )  # fmt: skip
-        colours = stored["sh_dc"], stored["sh_rest"]
-        return Chunk(base, count, stride, self.degree, stored["means"], self.cov, self.log2_opacity, *colours)
-
-    def release_raw(self) -> None:
-        """Free what is not needed once it is activated."""
-        for name in ("log_scales", "quats", "opacity_logits"):
-            self.stored[name].release()
-
-    def release(self) -> None:
-        """Free everything."""
-        for array in (*self.stored.values(), self.cov, self.log2_opacity):
-            array.release()
-
-
-class SourcePlanes:
-    """Fills chunks from a `SceneSource`, whose means and scales stay as they are; colours may change."""
-
-    def __init__(self, backend: Backend, source: SceneSource) -> None:
-        self.backend = backend
-        self.source = source
-        self.count, self.sh_count, self.sh_degree = source.count, source.sh_count, source.sh_degree
-        self.origin = source.origin
-        self.bounds: dict[int, ChunkBounds] = {}
-        """Of the chunks loaded so far, by their first rows."""
-
-    def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
-        """Fill arrays of the backend, [width, padded(stop - start)] by field name."""
-        with ExitStack() as maps:
-            host = {
-                name: maps.enter_context(self.backend.mapped(array))[:, : stop - start]
-                for name, array in planes.items()
-                if array.shape[0]
-            }
-            self.source.read(slice(start, stop), list(host), host)
-            if start not in self.bounds:
-                self.bounds[start] = ChunkBounds.of(host["means"], host["log_scales"])
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
-class QuantizedPlanes:
-    """Fills chunks from a quantized scene: codes and ranges are copied to the backend once and dequantized there."""
-
-    def __init__(self, backend: Backend, quantized: QuantizedScene) -> None:
-        self.backend = backend
-        self.count, self.sh_count, self.sh_degree = quantized.count, quantized.sh_count, quantized.sh_degree
-        self.origin = quantized.origin
-        self.bounds: dict[int, ChunkBounds] = {}  # every view reads all chunks
-        self._arrays: dict[str, tuple[QuantizedArray, Any, Any, Any]] = {}
-        for name, array in quantized.arrays.items():
-            # Three spare bytes: the kernel reads a code through a window of three.
-            codes = backend.array((array.planes.size + 3,), np.uint8)
-            backend.write(codes, array.planes.reshape(-1))
-            low = backend.array(array.low.shape, np.float32)
-            step = backend.array(array.step.shape, np.float32)
-            backend.write(low, array.low)
-            backend.write(step, array.step)
-            self._arrays[name] = (array, codes, low, step)
-
-    def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
-        """Fill arrays of the backend, [width, padded(stop - start)] by field name."""
-        rows = stop - start
-        for name, plane in planes.items():
-            width, stride = plane.shape
-            if width == 0:
-                continue
-            array, codes, low, step = self._arrays[name]
-            size = (-(-rows // DEQUANTIZE_ROWS), width)
-            self.backend.launch(
-                "dequantize", size, array.count, array.groups, array.bits, array.planes.shape[1], start, rows, stride,
-                codes, low, step, plane,
-            )  # fmt: skip
-
-    def close(self) -> None:
-        """Free codes and ranges."""
-        for _, *arrays in self._arrays.values():
-            for array in arrays:
-                array.release()
-        self._arrays = {}
+    start: int
+    arrays: ChunkArrays
+    stays: bool
+    future: Future[None]
 
 
 class DeviceScene:
@@ -201,6 +78,8 @@ class DeviceScene:
         Bytes a row that sums over its views will take on the backend: left free.
     targets : bool
         Views will be compared with targets on the backend: room for these is taken with the view's.
+    view_sums : int
+        Planes of sums that a view has at most.
     """
 
     def __init__(
@@ -211,6 +90,7 @@ class DeviceScene:
         antialiased: bool = False,
         sum_bytes: int = SUM_BYTES,
         targets: bool = False,
+        view_sums: int = MOST_SUMS,
     ) -> None:
         self.backend = backend
         self.count = planes.count
@@ -221,11 +101,16 @@ class DeviceScene:
         self.resident, self._streamed = False, False
         self.targets = targets
         self.sum_bytes = sum_bytes
+        self.view_sums = view_sums
         self.shown: int | None = None
         """Rows that a compact view has room for; None while views have room for all."""
         self._planes = planes
         self._budget = budget
         self._resident: list[Chunk] = []
+        self._pinned: dict[int, Chunk] = {}
+        """Chunks of a compact scene that stay, by their first rows."""
+        self._drawn = -1
+        """First row of the one that is being used."""
         self._rows = 0
         self._chunk_row_bytes = streamed_bytes(planes.sh_degree)
         self._least_rows = min(MIN_CHUNK_ROWS, max(self.count, 1))
@@ -261,12 +146,13 @@ class DeviceScene:
     @property
     def shown_bytes(self) -> int:
         """Bytes that each row which a compact view shows takes of the sums of one view: all but what is added up over views."""
-        return 0 if self.statistics else min(self.sum_bytes, sum_bytes(MOST_SUMS))
+        return 0 if self.statistics else min(self.sum_bytes, sum_bytes(self.view_sums))
 
     @property
     def held_bytes(self) -> int:
         """Bytes that the loaded scene takes."""
-        return sum(array.nbytes for chunk in self._resident for array in chunk.arrays)
+        held = (*self._resident, *self._pinned.values())
+        return sum(array.nbytes for chunk in held for array in chunk.arrays)
 
     def fingerprint(self) -> bytes | None:
         """Digest of all that views are drawn from; None while that is not on the backend."""
@@ -283,6 +169,8 @@ class DeviceScene:
         """From now on views have room for the rows that they show alone, for so many at first; the scene is streamed."""
         self.evict()
         self.shown = shown
+        if self._unpin not in self._budget.reclaimers:
+            self._budget.reclaimers.insert(0, self._unpin)  # before what had to be drawn
 
     def drop_statistics(self) -> None:
         """Free the sums of a view."""
@@ -312,9 +200,23 @@ class DeviceScene:
 
     def evict(self) -> None:
         """Give the memory of a loaded scene back; the next view decides again."""
-        for chunk in self._resident:
+        for chunk in (*self._resident, *self._pinned.values()):
             chunk.release()
-        self._resident, self.resident, self._streamed = [], False, False
+        self._resident, self._pinned, self.resident, self._streamed = [], {}, False, False
+
+    def _unpin(self, size: int) -> None:
+        """Give back `size` bytes of the chunks that stay, as far as there are any that are not being used."""
+        for base in sorted(self._pinned.keys() - {self._drawn}, reverse=True):
+            if size <= 0:
+                return
+            chunk = self._pinned.pop(base)
+            size -= sum(array.nbytes for array in chunk.arrays)
+            chunk.release()
+
+    def _may_stay(self, rows: int) -> bool:
+        """Whether memory has room for one more chunk of a compact scene."""
+        size = padded(rows) * self._chunk_row_bytes // 2
+        return self.shown is not None and self._budget.free - size >= self._budget.limit // SPARE_SHARE
 
     def _spans(self) -> Iterator[tuple[int, int, int]]:
         """(start, stop, degree): rows with SH first, then the block without."""
@@ -333,7 +235,7 @@ class DeviceScene:
 
     def _load(self, start: int, stop: int, degree: int) -> Chunk:
         """A chunk that stays."""
-        arrays = _ChunkArrays(self.backend, degree, padded(stop - start))
+        arrays = ChunkArrays(self.backend, degree, padded(stop - start))
         self._planes.load(start, stop, arrays.stored)
         chunk = arrays.activated(start, stop - start, self.antialiased)
         arrays.release_raw()
@@ -351,56 +253,70 @@ class DeviceScene:
             return
         bounds = self._planes.bounds
         spans = [span for span in self._spans() if wanted is None or span[0] not in bounds or wanted(bounds[span[0]])]
-        slots: list[_ChunkArrays] = []
+        missing = (span for span in spans if span[0] not in self._pinned)
+        slots: list[ChunkArrays] = []
         # Kernels that use the chunk before the one that is asked for.
         done: Callable[[], None] = _nothing
         loader = ThreadPoolExecutor(1)
+        ahead: _Loading | None = None
         try:
-            loaded = self._load_into(slots, loader, done, *spans[0]) if spans else None
-            for place, (start, stop, _) in enumerate(spans):
-                assert loaded is not None
-                arrays = loaded.result()
-                if place + 1 < len(spans):
-                    loaded = self._load_into(slots, loader, done, *spans[place + 1])
-                yield arrays.activated(start, stop - start, self.antialiased)
+            for span in spans:
+                start, stop, _ = span
+                self._drawn = start
+                if start in self._pinned:
+                    yield self._pinned[start]
+                    continue
+                if ahead is None:
+                    ahead = self._load_into(slots, loader, done, next(missing, span))
+                if ahead.start == start:
+                    loading, following = ahead, next(missing, None)
+                    loading.future.result()
+                    ahead = following and self._load_into(slots, loader, done, following)
+                else:  # it gave its memory back since the one ahead was chosen, whose place comes after
+                    loading = self._load_into(slots, loader, done, span)
+                    slots.sort(key=lambda arrays: arrays is ahead.arrays)
+                    loading.future.result()
+                chunk = loading.arrays.activated(start, stop - start, self.antialiased)
+                if loading.stays:
+                    loading.arrays.release_raw()
+                    self._pinned[start] = chunk
+                yield chunk
                 done = self.backend.mark()
         finally:
+            self._drawn = -1
             loader.shutdown()
+            if ahead is not None and ahead.stays:
+                slots.append(ahead.arrays)
             for arrays in slots:
                 arrays.release()
 
     def _load_into(
-        self,
-        slots: list[_ChunkArrays],
-        loader: Executor,
-        done: Callable[[], None],
-        start: int,
-        stop: int,
-        degree: int,
-    ) -> Future[_ChunkArrays]:
-        """Load a chunk on another thread, in place of the older of two, which `done` waits for the kernels of."""
-        stride, arrays = padded(stop - start), None
-        if len(slots) == 2:
+        self, slots: list[ChunkArrays], loader: Executor, done: Callable[[], None], span: tuple[int, int, int]
+    ) -> _Loading:
+        """Load a chunk on another thread: to stay, or in place of the older of two, which `done` waits for the kernels of."""
+        start, stop, degree = span
+        stride, arrays, stays = padded(stop - start), None, self._may_stay(stop - start)
+        if len(slots) == 2 and not stays:
             arrays = slots.pop(0)
             if (arrays.degree, arrays.stride) != (degree, stride):
                 done()
                 arrays.release()
                 arrays = None
-        arrays = arrays or _ChunkArrays(self.backend, degree, stride)
-        slots.append(arrays)
+        arrays = arrays or ChunkArrays(self.backend, degree, stride)
+        if not stays:
+            slots.append(arrays)
 
-        def load() -> _ChunkArrays:
+        def load() -> None:
             done()
             self._planes.load(start, stop, arrays.stored)
-            return arrays
 
-        return loader.submit(load)
+        return _Loading(start, arrays, stays, loader.submit(load))
 
     def refresh(self, *fields: str) -> None:
         """Read `sh_dc` or `sh_rest` again from a source whose values have changed (streamed chunks do so anyway)."""
         if not isinstance(self._planes, SourcePlanes):
             raise TypeError("only a scene with a source can be refreshed")
-        for chunk in self._resident:
+        for chunk in (*self._resident, *self._pinned.values()):
             names = [name for name in fields if FIELD[name].width(chunk.degree)]
             host = self._planes.source.read(slice(chunk.base, chunk.base + chunk.count), names)
             for name in names:
@@ -410,6 +326,8 @@ class DeviceScene:
     def close(self) -> None:
         """Free everything."""
         self.evict()
+        if self._unpin in self._budget.reclaimers:
+            self._budget.reclaimers.remove(self._unpin)
         self.drop_statistics()
         self._planes.close()
 

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
-from flexgs_edge.constants import CULLED, DEFAULT_NEAR
+from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels import Backend
 from flexgs_edge.quantize import QuantizedScene
-from flexgs_edge.render.device_scene import SUM_BYTES, Chunk, DeviceScene, QuantizedPlanes, SourcePlanes
+from flexgs_edge.render.chunk_bounds import ChunkBounds
+from flexgs_edge.render.chunks import Chunk, QuantizedPlanes, SourcePlanes
+from flexgs_edge.render.compact import FIRST_SHARE, GROWTH, GUESS, capacity, fill_compact
+from flexgs_edge.render.device_scene import MOST_SUMS, SUM_BYTES, DeviceScene
 from flexgs_edge.render.records import Statistics, camera_record
 from flexgs_edge.render.view_buffers import (
     SORT_DIGIT_BITS,
     SORT_DIGITS,
     ViewBuffers,
-    chunk_shapes,
     target_bytes,
     view_bytes,
     view_key,
@@ -36,12 +39,6 @@ SUM_ROWS = 1 << 18
 GRADIENT_SUMS = 9
 """Planes of `Renderer.gradient_sums`."""
 EXTENTS = ("exact", "inria")
-CAPACITY_STEP = 1 << 16
-"""Compact views make room for multiples of so many rows: views of about one size then share their buffers."""
-FIRST_SHARE = 4
-"""Part of a scene's rows (one in four) that a compact view has room for until one shows more."""
-GROWTH = 1.1
-"""Room beyond what the part of a view that was seen lets expect."""
 
 
 @dataclass
@@ -105,6 +102,8 @@ class Renderer:
         self.splats_shown = 0
         self.view_rows: np.ndarray | None = None
         """[m] u32, rows of the scene that the sums of the view drawn last belong to; None: all of them."""
+        self._share = 0.0
+        """Largest part of its rows that a compact view has shown of a scene so far."""
         self._buffers: ViewBuffers | None = None
         self._aimed: Any = None
         self._words = np.empty(0, np.uint32)
@@ -128,14 +127,17 @@ class Renderer:
         assert self._buffers is not None
         return self._buffers.records
 
-    def load(self, source: SceneSource, sum_bytes: int = SUM_BYTES, targets: bool = False) -> DeviceScene:
+    def load(
+        self, source: SceneSource, sum_bytes: int = SUM_BYTES, targets: bool = False, view_sums: int = MOST_SUMS
+    ) -> DeviceScene:
         """Bring a scene to the backend (all of it, or chunk by chunk for each view when it does not fit).
 
-        `sum_bytes` a row, and room for `targets`, are left free for what is added up over the views.
+        `sum_bytes` a row, and room for `targets`, are left free for what is added up over the views, each of which has
+        `view_sums` planes at most.
         """
         self.release()
         planes = SourcePlanes(self.backend, source)
-        return DeviceScene(self.backend, planes, self.budget, self.antialiased, sum_bytes, targets)
+        return DeviceScene(self.backend, planes, self.budget, self.antialiased, sum_bytes, targets, view_sums)
 
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
         """Bring a quantized scene to the backend, dequantized there."""
@@ -276,10 +278,10 @@ class Renderer:
             scene.drop_statistics()
             held = []
         if not held:
-            shapes = (((count,), np.uint32), ((count, channels, 2), np.uint32))
+            # Hits are counted with weights alone; the other blends leave them out.
+            shapes = (((count if channels == 1 else 1,), np.uint32), ((count, channels, 2), np.uint32))
             held = scene.statistics = [self.backend.array(shape, dtype) for shape, dtype in shapes]
-        # Hits are counted with weights alone; the other blends leave them out.
-        for array in held[channels > 1 :]:
+        for array in held:
             self.backend.fill(array, 0)
         return held[0], held[1]
 
@@ -300,14 +302,14 @@ class Renderer:
     def _project(self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers) -> None:
         self.backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
         for chunk in scene.chunks():
-            self._project_chunk(scene, chunk, chunk.base, buffers, (buffers.records, buffers.keys, buffers.bounds))
+            self._project_chunk(
+                scene, buffers.camera, chunk.base, chunk, (buffers.records, buffers.keys, buffers.bounds)
+            )
 
-    def _project_chunk(
-        self, scene: DeviceScene, chunk: Chunk, base: int, buffers: ViewBuffers, out: tuple[Any, ...]
-    ) -> None:
+    def _project_chunk(self, scene: DeviceScene, camera: Any, base: int, chunk: Chunk, out: tuple[Any, ...]) -> None:
         self.backend.launch(
             "project", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, self.inria_extent,
-            int(scene.antialiased), buffers.camera, chunk.means, chunk.cov, chunk.log2_opacity, chunk.sh_dc, chunk.sh_rest,
+            int(scene.antialiased), camera, chunk.means, chunk.cov, chunk.log2_opacity, chunk.sh_dc, chunk.sh_rest,
             *out,
         )  # fmt: skip
 
@@ -319,38 +321,22 @@ class Renderer:
         When a view shows more than there is room for, the buffers are made anew for what its first part lets expect.
         """
         record = camera_record(camera, scene.origin, self.near)
+
+        def wanted(bounds: ChunkBounds) -> bool:
+            return bounds.seen(record, bool(self.inria_extent))
+
         while True:
             self.backend.write(buffers.camera, record)
-            rows, seen = self._fill_compact(scene, record, buffers)
+            project = partial(self._project_chunk, scene, buffers.camera, 0)
+            rows, seen = fill_compact(self.backend, scene, buffers, wanted, project)
             assert buffers.rows is not None
             if len(rows) <= buffers.rows:
+                self._share = max(self._share, len(rows) / max(scene.count, 1))
                 return buffers, rows
-            expected = int(GROWTH * max(len(rows) * scene.count / max(seen, 1), buffers.rows))
-            scene.shown = min(-(-expected // CAPACITY_STEP) * CAPACITY_STEP, scene.count)
+            scene.shown = capacity(scene, GROWTH * max(len(rows) / max(seen, 1), buffers.rows / scene.count))
             scene.drop_statistics()
             self.release()
             self._buffers = buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
-
-    def _fill_compact(self, scene: DeviceScene, record: np.ndarray, buffers: ViewBuffers) -> tuple[np.ndarray, int]:
-        """[m] u32, rows shown, and up to which row of the scene: where they are more than there is room for, it stops."""
-        backend = self.backend
-        assert buffers.rows is not None
-        found: list[np.ndarray] = []
-        at = 0
-        # Made once: fresh pages for every chunk took longer than the copies.
-        on_host = [np.empty(shape, dtype) for shape, dtype in chunk_shapes(buffers.chunk[0].shape[0]).values()]
-        for chunk in scene.chunks(lambda bounds: bounds.seen(record, bool(self.inria_extent))):
-            self._project_chunk(scene, chunk, 0, buffers, buffers.chunk)
-            splats, depths, counts = map(backend.read, buffers.chunk, (values[: chunk.count] for values in on_host))
-            shown = np.flatnonzero(depths != CULLED)
-            if at + len(shown) > buffers.rows:
-                return np.concatenate([*found, shown]), chunk.base + chunk.count
-            backend.write(buffers.records, splats[shown], 16 * at)
-            backend.write(buffers.keys, depths[shown], at)
-            backend.write(buffers.bounds, counts[shown], at)
-            found.append((chunk.base + shown).astype(np.uint32))
-            at += len(shown)
-        return np.concatenate(found) if found else np.zeros(0, np.uint32), scene.count
 
     def _blend(self, view: _View, blend: str, extra: tuple[Any, ...] = (), again: bool = False) -> None:
         """Blend all batches; `again`: the lists of a single batch are still there."""
@@ -368,11 +354,12 @@ class Renderer:
         if self._buffers is None or self._buffers.key != view_key(scene, camera):
             self.release()
             if scene.shown is None and self._may_be_compact(scene) and not self._fits(scene, camera):
-                first = (scene.count // FIRST_SHARE // CAPACITY_STEP + 1) * CAPACITY_STEP
-                scene.be_compact(min(first, scene.count))
+                scene.be_compact(capacity(scene, max(1 / FIRST_SHARE, GUESS * self._share)))
             try:
                 self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
             except BudgetError:
+                if scene.shown is not None:
+                    scene.shown = capacity(scene, 1 / FIRST_SHARE)
                 # A larger view than before: the scene gives up its place and is streamed from now on if need be.
                 scene.evict()
                 self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)

@@ -10,7 +10,8 @@ from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import TILE
 from flexgs_edge.kernels import Backend
-from flexgs_edge.render.device_scene import COMPACT_ROWS, DeviceScene, padded
+from flexgs_edge.render.chunks import padded
+from flexgs_edge.render.device_scene import COMPACT_ROWS, DeviceScene
 
 SORT_DIGIT_BITS = 11
 SORT_DIGITS = 1 << SORT_DIGIT_BITS
@@ -22,6 +23,8 @@ DEFAULT_PAIRS = 1 << 21
 """Pairs of a batch when memory allows: 40 MiB, one batch for most views."""
 PAIR_SHARE = 8
 """The tile lists take at most this part (one in eight) of what is free beyond the least: the scene comes next."""
+COMPACT_PAIR_SHARE = 2
+"""The same of compact views: tiles of several batches are listed anew for every blend."""
 
 
 def view_key(scene: DeviceScene, camera: Camera) -> tuple[int, int, int]:
@@ -113,7 +116,7 @@ class ViewBuffers:
             if scene.targets:
                 self.target_arrays()
                 later -= self._target_bytes
-            spare = max(budget.free - later, 0) // (PAIR_SHARE * PAIR_BYTES)
+            spare = max(budget.free - later, 0) // ((PAIR_SHARE if rows is None else COMPACT_PAIR_SHARE) * PAIR_BYTES)
             self.capacity = min(self.tiles + spare, max(DEFAULT_PAIRS, self.tiles))
             self.pairs = self._array((self.capacity, 2), np.uint32)
             self.drafts = self._array((self.capacity, 3), np.uint32)

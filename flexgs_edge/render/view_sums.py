@@ -15,7 +15,8 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 
 from flexgs_edge.cameras import Camera
-from flexgs_edge.render.device_scene import Chunk, DeviceScene
+from flexgs_edge.render.chunks import Chunk
+from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scratch import Room
 

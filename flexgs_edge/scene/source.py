@@ -10,7 +10,7 @@ import numpy as np
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
-from flexgs_edge.scratch import copy_rows
+from flexgs_edge.scratch import BLOCK_ROWS, Room, copy_all_rows, put_rows
 
 Planes = dict[str, np.ndarray]
 """Arrays by field name, each [width, n] f32."""
@@ -179,6 +179,17 @@ def as_range(rows: np.ndarray) -> slice | None:
     return None
 
 
+def read_all(source: SceneSource, room: Room) -> Planes:
+    """All values of a scene, {field: [width, N] f32}, in arrays of `room`."""
+    planes = {field: room.empty((source.width(field), source.count), np.float32) for field in FIELD}
+    if not room.spills:
+        return source.read(slice(0, source.count), list(FIELD), planes)
+    for rows in source.chunks(BLOCK_ROWS):
+        for field, values in source.read(rows, list(FIELD)).items():
+            put_rows(planes[field], rows, values)
+    return planes
+
+
 class MemorySource(SceneSource):
     """A scene whose arrays are in memory.
 
@@ -260,12 +271,11 @@ class MemorySource(SceneSource):
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`."""
         rows, planes = self.begin_read(rows, fields, out)
-        for field, plane in planes.items():
-            values = self._planes[field]
-            if isinstance(rows, slice):
-                copy_rows(values, rows, plane)
-            else:
-                plane[...] = values[:, rows]
+        if isinstance(rows, slice):
+            copy_all_rows([(self._planes[field], plane) for field, plane in planes.items()], rows)
+        else:
+            for field, plane in planes.items():
+                plane[...] = self._planes[field][:, rows]
         return planes
 
 

@@ -17,9 +17,9 @@ from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import FIXED_ERROR, FIXED_WEIGHT
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import DeviceScene, Renderer
-from flexgs_edge.render.device_scene import Chunk
+from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.view_sums import Maker, ViewSums
-from flexgs_edge.scratch import BLOCK_ROWS, MEMORY, Room, blocks
+from flexgs_edge.scratch import MEMORY, Room, blocks, put_rows, read_rows
 
 MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
 """Where the sums of moments stop (colours of some thousands in every view)."""
@@ -51,18 +51,18 @@ class RemovalCosts:
         """Costs over all poses, from sums over some of them each."""
         levels, count = parts[0].moments.shape[0], len(parts[0].removal)
         costs = cls.empty(levels, count, room)
-        read = (values for part in parts for values in (part.removal, part.weight2, part.moments))
-        for rows in blocks(count, BLOCK_ROWS, *read):
-            costs.removal[rows] = sum(part.removal[rows] for part in parts)
-            weight2 = costs.weight2[rows] = sum(part.weight2[rows] for part in parts)
-            moments = sum(part.moments[:, :, rows] for part in parts)
-            assert isinstance(weight2, np.ndarray) and isinstance(moments, np.ndarray)
+        for rows in blocks(count):
+            removal, weight2, moments = (
+                np.asarray(sum(read_rows(getattr(part, name), rows) for part in parts)) for name in PART_NAMES
+            )
             divisor = np.where(weight2 > 0, weight2, 1.0)
             # Rounding may leave a variance of nothing slightly below zero.
             variance = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
             # A sum that stopped growing must not look like no variance at all.
-            costs.sh[:, rows] = np.where(moments[:, 3] >= MOMENT_FULL, moments[:, 3], variance)
-            costs.sh_mean[:, :, rows] = (moments[:, :3] / divisor).astype(np.float32)
+            put_rows(costs.removal, rows, removal)
+            put_rows(costs.weight2, rows, weight2)
+            put_rows(costs.sh, rows, np.where(moments[:, 3] >= MOMENT_FULL, moments[:, 3], variance))
+            put_rows(costs.sh_mean, rows, (moments[:, :3] / divisor).astype(np.float32))
         return costs
 
     @classmethod
@@ -96,6 +96,10 @@ class CostParts:
 def moment_bytes(sh_degree: int) -> int:
     """Bytes a row that the moments of `cost_sums` take on the backend."""
     return 32 * sh_degree
+
+
+PART_NAMES = ("removal", "weight2", "moments")
+"""Arrays of `CostParts`."""
 
 
 class _Wide:
@@ -132,8 +136,9 @@ def cost_parts(levels: int, count: int, room: Room) -> CostParts:
 
 def put_costs(parts: CostParts, rows: slice, sums: Any) -> None:
     """Put the finished sums of a chunk (from `cost_sums`) into their rows."""
-    parts.removal[rows], parts.weight2[rows] = sums.removal.value(FIXED_ERROR), sums.weight2.value(FIXED_ERROR)
-    parts.moments[:, :, rows] = sums.moments()
+    put_rows(parts.removal, rows, sums.removal.value(FIXED_ERROR))
+    put_rows(parts.weight2, rows, sums.weight2.value(FIXED_ERROR))
+    put_rows(parts.moments, rows, sums.moments())
 
 
 def measure_costs(

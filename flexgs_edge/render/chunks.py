@@ -1,0 +1,159 @@
+"""Chunks of a scene in the backend's memory, and what fills them: values of a source, or codes that are dequantized there."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.constants import DEQUANTIZE_ROWS, LANES
+from flexgs_edge.kernels import Backend
+from flexgs_edge.quantize import QuantizedArray, QuantizedScene
+from flexgs_edge.render.chunk_bounds import ChunkBounds
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import SceneSource
+
+
+def plane_bytes(sh_degree: int) -> int:
+    """Bytes a row of an activated chunk: means, covariance (or its factor), log2 of the opacity, colour."""
+    return 4 * (3 + 6 + 1 + 3 + FIELD["sh_rest"].width(sh_degree))
+
+
+RAW_BYTES = 4 * (3 + 4 + 1)
+"""Bytes a row that loading needs on top for a moment: stored scale, rotation, opacity."""
+
+
+def streamed_bytes(sh_degree: int) -> int:
+    """Bytes a row of a streamed chunk, and of the one that is loaded while it is drawn."""
+    return 2 * (plane_bytes(sh_degree) + RAW_BYTES)
+
+
+@dataclass
+class Chunk:
+    """Planes of rows [base, base + count) of a scene, ready for `project`."""
+
+    base: int
+    count: int
+    stride: int
+    degree: int
+    means: Any
+    cov: Any
+    log2_opacity: Any
+    sh_dc: Any
+    sh_rest: Any
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """All planes."""
+        return self.means, self.cov, self.log2_opacity, self.sh_dc, self.sh_rest
+
+    def release(self) -> None:
+        """Free the planes."""
+        for array in self.arrays:
+            array.release()
+
+
+def padded(count: int) -> int:
+    """Elements of a plane that holds `count` rows."""
+    return -(-count // LANES) * LANES
+
+
+class ChunkArrays:
+    """What a chunk lies in on the backend: stored planes, and what they are activated to."""
+
+    def __init__(self, backend: Backend, degree: int, stride: int) -> None:
+        self.backend, self.degree, self.stride = backend, degree, stride
+        shapes = {name: (field.width(degree), stride) for name, field in FIELD.items()}
+        self.stored = {name: backend.array(shape, np.float32) for name, shape in shapes.items()}
+        self.cov = backend.array((6, stride), np.float32)
+        self.log2_opacity = backend.array((stride,), np.float32)
+
+    def activated(self, base: int, count: int, antialiased: bool) -> Chunk:
+        """The chunk of the rows that are stored."""
+        stored, stride = self.stored, self.stride
+        self.backend.launch(
+            "activate", (stride,), stride, int(antialiased), stored["log_scales"], stored["quats"],
+            stored["opacity_logits"], self.cov, self.log2_opacity,
+        )  # fmt: skip
+        colours = stored["sh_dc"], stored["sh_rest"]
+        return Chunk(base, count, stride, self.degree, stored["means"], self.cov, self.log2_opacity, *colours)
+
+    def release_raw(self) -> None:
+        """Free what is not needed once it is activated."""
+        for name in ("log_scales", "quats", "opacity_logits"):
+            self.stored[name].release()
+
+    def release(self) -> None:
+        """Free everything."""
+        for array in (*self.stored.values(), self.cov, self.log2_opacity):
+            array.release()
+
+
+class SourcePlanes:
+    """Fills chunks from a `SceneSource`, whose means and scales stay as they are; colours may change."""
+
+    def __init__(self, backend: Backend, source: SceneSource) -> None:
+        self.backend = backend
+        self.source = source
+        self.count, self.sh_count, self.sh_degree = source.count, source.sh_count, source.sh_degree
+        self.origin = source.origin
+        self.bounds: dict[int, ChunkBounds] = {}
+        """Of the chunks loaded so far, by their first rows."""
+
+    def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
+        """Fill arrays of the backend, [width, padded(stop - start)] by field name."""
+        with ExitStack() as maps:
+            host = {
+                name: maps.enter_context(self.backend.mapped(array))[:, : stop - start]
+                for name, array in planes.items()
+                if array.shape[0]
+            }
+            self.source.read(slice(start, stop), list(host), host)
+            if start not in self.bounds:
+                self.bounds[start] = ChunkBounds.of(host["means"], host["log_scales"])
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class QuantizedPlanes:
+    """Fills chunks from a quantized scene: codes and ranges are copied to the backend once and dequantized there."""
+
+    def __init__(self, backend: Backend, quantized: QuantizedScene) -> None:
+        self.backend = backend
+        self.count, self.sh_count, self.sh_degree = quantized.count, quantized.sh_count, quantized.sh_degree
+        self.origin = quantized.origin
+        self.bounds: dict[int, ChunkBounds] = {}  # every view reads all chunks
+        self._arrays: dict[str, tuple[QuantizedArray, Any, Any, Any]] = {}
+        for name, array in quantized.arrays.items():
+            # Three spare bytes: the kernel reads a code through a window of three.
+            codes = backend.array((array.planes.size + 3,), np.uint8)
+            backend.write(codes, array.planes.reshape(-1))
+            low = backend.array(array.low.shape, np.float32)
+            step = backend.array(array.step.shape, np.float32)
+            backend.write(low, array.low)
+            backend.write(step, array.step)
+            self._arrays[name] = (array, codes, low, step)
+
+    def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
+        """Fill arrays of the backend, [width, padded(stop - start)] by field name."""
+        rows = stop - start
+        for name, plane in planes.items():
+            width, stride = plane.shape
+            if width == 0:
+                continue
+            array, codes, low, step = self._arrays[name]
+            size = (-(-rows // DEQUANTIZE_ROWS), width)
+            self.backend.launch(
+                "dequantize", size, array.count, array.groups, array.bits, array.planes.shape[1], start, rows, stride,
+                codes, low, step, plane,
+            )  # fmt: skip
+
+    def close(self) -> None:
+        """Free codes and ranges."""
+        for _, *arrays in self._arrays.values():
+            for array in arrays:
+                array.release()
+        self._arrays = {}
