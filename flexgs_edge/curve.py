@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexgs_edge.scratch import MEMORY, Room, blocks, put_rows, read_rows, stable_order
+from flexgs_edge.mapped import blocks, put_rows, read_rows
+from flexgs_edge.scratch import MEMORY, Room, stable_order
 
 
 def morton(cells: np.ndarray) -> np.ndarray:

@@ -16,10 +16,11 @@ import numpy as np
 from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
 from flexgs_edge.curve import morton
 from flexgs_edge.errors import InputError
+from flexgs_edge.mapped import blocks, put_rows, read_ahead, read_rows
 from flexgs_edge.ordered import OrderedPlanes
 from flexgs_edge.rotations import canonical_axes
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
-from flexgs_edge.scratch import MEMORY, Room, blocks, put_rows, read_rows, stable_order
+from flexgs_edge.scratch import MEMORY, Room, stable_order
 
 POSITION_BITS = 21
 """Cells along an axis of a scene as a power of two: three of them fill a 63-bit curve index."""
@@ -214,16 +215,14 @@ def to_grid(
     scale, rotation, dc = (room.empty((3, count), np.int32) for _ in range(3))
     opacity = room.empty((count,), np.int32)
     ordered = OrderedPlanes(planes, order, room)
-    for part in blocks(count):
-        rows = order[part]
-        quats, log_scales = ordered.of("quats", part), ordered.of("log_scales", part)
+    for part, values in ordered.parts(count, "quats", "log_scales", "opacity_logits", "sh_dc"):
+        rows, (quats, log_scales, logits, colours) = order[part], values
         if rename:
             quats, log_scales = canonical_axes(quats, log_scales)
-        logits, colours = ordered.of("opacity_logits", part), ordered.of("sh_dc", part)[:, None]
         put_rows(scale, part, _codes("log_scales", log_scales, steps.scale, rows))
         put_rows(rotation, part, _codes("quats", quats[1:], steps.rotation, rows))
         put_rows(opacity, part, _codes("opacity_logits", logits, steps.opacity, rows)[0])
-        put_rows(dc, part, _colour_codes("sh_dc", colours, steps.colour(steps.dc), rows)[:, 0])
+        put_rows(dc, part, _colour_codes("sh_dc", colours[:, None], steps.colour(steps.dc), rows)[:, 0])
     degrees = degrees[order]
     grid = GridScene(
         count,
@@ -250,8 +249,8 @@ def _along_curve(means: np.ndarray, step: float, layer: np.ndarray | None, room:
     count = means.shape[1]
     codes = room.empty((3, count), np.int32)
     low, high = np.full((3, 1), CODE_LIMIT), np.full((3, 1), -CODE_LIMIT)
-    for part in blocks(count):
-        some = _codes("means", read_rows(means, part), step, np.arange(part.start, part.stop))
+    for part, (values,) in read_ahead(count, means):
+        some = _codes("means", values, step, np.arange(part.start, part.stop))
         put_rows(codes, part, some)
         low, high = (
             np.minimum(low, some.min(axis=1, keepdims=True)),
@@ -263,8 +262,8 @@ def _along_curve(means: np.ndarray, step: float, layer: np.ndarray | None, room:
             f"2^{POSITION_BITS}: take a larger step or remove far outliers"
         )
     keys = room.empty((count,), np.uint64)
-    for part in blocks(count):
-        put_rows(keys, part, morton(read_rows(codes, part) - low))
+    for part, (some,) in read_ahead(count, codes):
+        put_rows(keys, part, morton(some - low))
     layers = None if layer is None else _bytes("layer", layer, count, 255)
     order = stable_order(keys, room) if layers is None else np.lexsort((keys, layers)).astype(np.int64)
     return room.take(codes, order), order
@@ -275,8 +274,18 @@ def values_of(grid: GridScene, room: Room = MEMORY) -> dict[str, np.ndarray]:
     planes = {name: room.empty((field.width(grid.sh_degree), grid.count), np.float32) for name, field in FIELD.items()}
     names = [name for name in FIELD if name != "sh_rest"]
     first = np.zeros(grid.sh_degree, np.int64)
-    for part in blocks(grid.count):
-        for name, values in from_grid(grid, part, names).items():
+    for part, found in read_ahead(grid.count, grid.position, grid.scale, grid.rotation, grid.opacity, grid.dc):
+        position, scale, rotation, opacity, dc = found
+        some = replace(
+            grid,
+            count=part.stop - part.start,
+            position=position,
+            scale=scale,
+            rotation=rotation,
+            opacity=opacity,
+            dc=dc,
+        )
+        for name, values in from_grid(some, slice(None), names).items():
             put_rows(planes[name], part, values)
         # As `from_grid` finds them, but counted once.
         degrees = grid.sh_degrees[part]

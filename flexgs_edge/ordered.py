@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from flexgs_edge.scratch import Room, read_listed, read_rows
+from flexgs_edge.mapped import blocks, read_ahead, read_listed
+from flexgs_edge.scratch import Room
 
 
 class OrderedPlanes:
@@ -22,11 +23,14 @@ class OrderedPlanes:
             self._planes = {name: room.take(values, order) for name, values in planes.items() if name != "means"}
             self._order = None
 
-    def of(self, field: str, rows: slice) -> np.ndarray:
-        """[width, m] of some rows."""
-        values = self._planes[field]
-        values = values.reshape(-1, values.shape[-1])
-        return read_rows(values, rows) if self._order is None else values[:, self._order[rows]]
+    def parts(self, count: int, *fields: str) -> Iterator[tuple[slice, list[np.ndarray]]]:
+        """Of the first `count` rows some at a time, and [width, m] of each field."""
+        planes = [self._planes[field] for field in fields]
+        if self._order is None:
+            yield from read_ahead(count, *planes)
+            return
+        for rows in blocks(count):
+            yield rows, [values[:, self._order[rows]] for values in planes]
 
     def band(self, degree: int, rows: np.ndarray) -> np.ndarray:
         """[3, 2l + 1, m] coefficients of one SH degree of some rows."""

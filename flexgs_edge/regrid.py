@@ -11,8 +11,9 @@ import numpy as np
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import GridScene, Planes, Steps, from_grid, to_grid
+from flexgs_edge.mapped import blocks, read_rows
 from flexgs_edge.scene.fields import sh_rest_count
-from flexgs_edge.scratch import MEMORY, Room, blocks, read_rows
+from flexgs_edge.scratch import MEMORY, Room
 
 _COMMENT = "flexgs-edge grid "
 

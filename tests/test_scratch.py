@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexgs_edge import scratch
+from flexgs_edge import mapped, scratch
 from flexgs_edge.best.checkpoint import Checkpoint
 from flexgs_edge.best.path import lowest
 from flexgs_edge.errors import BudgetError, InputError
-from flexgs_edge.scratch import MEMORY, Room, Scratch, copy_rows, file_system_of, put_rows, read_rows, stable_order
+from flexgs_edge.mapped import copy_rows, put_rows, read_rows
+from flexgs_edge.scratch import MEMORY, Room, Scratch, file_system_of, stable_order
 
 COUNT = 40_000
 
@@ -59,7 +60,7 @@ def test_rows_that_are_put_are_read(
     room: Room, shape: tuple[int, ...], cached: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whether they are in the kernel's cache or not, by the accessors and through the pages."""
-    monkeypatch.setattr(scratch, "is_cached", lambda address, size: cached)
+    monkeypatch.setattr(mapped, "is_cached", lambda address, size: cached)
     expected = np.random.default_rng(3).normal(size=shape).astype(np.float32)
     held = room.copy(expected)
     for start, stop in ((0, COUNT), (5, 4097), (COUNT - 1, COUNT), (9, 9)):
@@ -82,9 +83,9 @@ def test_rows_in_any_order_are_taken(room: Room, monkeypatch: pytest.MonkeyPatch
     """From a plane that is read as a whole, where memory holds it; else rows far apart are looked up through the pages."""
     values = room.copy(np.random.default_rng(4).normal(size=(3, COUNT)))
     fetched = []
-    monkeypatch.setattr(scratch, "fetch", lambda plane, rows: fetched.append(rows))
-    for whole in (scratch.WHOLE_BYTES, 0):
-        monkeypatch.setattr(scratch, "WHOLE_BYTES", whole)
+    monkeypatch.setattr(mapped, "fetch", lambda plane, rows: fetched.append(rows))
+    for whole in (mapped.WHOLE_BYTES, 0):
+        monkeypatch.setattr(mapped, "WHOLE_BYTES", whole)
         for rows, apart in (
             (np.arange(0, COUNT, 2), False),
             (np.array([5, COUNT - 1, 7]), True),
@@ -93,32 +94,32 @@ def test_rows_in_any_order_are_taken(room: Room, monkeypatch: pytest.MonkeyPatch
             fetched.clear()
             np.testing.assert_array_equal(room.take(values, rows), values[:, rows])
             assert bool(fetched) is (apart and room.spills and not whole)
-            np.testing.assert_array_equal(scratch.read_listed(values, rows), values[:, rows])
+            np.testing.assert_array_equal(mapped.read_listed(values, rows), values[:, rows])
 
 
 def test_a_part_is_fetched_plane_by_plane(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    advise = scratch._Map.madvise
+    advise = mapped.MappedFile.madvise
 
-    def note(self: scratch._Map, *words: int) -> None:
+    def note(self: mapped.MappedFile, *words: int) -> None:
         asked.append(words)
         advise(self, *words)
 
     values = Scratch(tmp_path).empty((3, 4, 10_000), np.float32)
     numbers = values.reshape(-1)
     numbers[:] = np.arange(numbers.size)
-    monkeypatch.setattr(scratch._Map, "madvise", note)
+    monkeypatch.setattr(mapped.MappedFile, "madvise", note)
     for view in (values, values[1:, ::2, 5:], values.reshape(12, -1)[3:5], numbers):
         asked.clear()
-        scratch.fetch(view, slice(2_100, 5_000))
+        mapped.fetch(view, slice(2_100, 5_000))
         pieces = [numbers[start // 4 : (start + length) // 4] for _, start, length in asked]
         got = set(np.concatenate(pieces).astype(int).tolist())
         part = view[..., 2_100:5_000]
         assert got >= set(part.reshape(-1).astype(int).tolist())
         assert len(got) <= part.size + len(pieces) * mmap.PAGESIZE // 4
     asked.clear()
-    scratch.fetch(np.zeros((3, 4)), slice(0, 4))
-    scratch.fetch(values[:, :0], slice(0, 4))
+    mapped.fetch(np.zeros((3, 4)), slice(0, 4))
+    mapped.fetch(values[:, :0], slice(0, 4))
     assert not asked
 
 

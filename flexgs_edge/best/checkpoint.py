@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.mapped import blocks, read_rows
 from flexgs_edge.scene.atomic import DISK_FULL
-from flexgs_edge.scratch import Room, blocks, read_rows
+from flexgs_edge.scratch import Room
 
 DONE = "done"
 """File of a round that is there last: without it the round was cut short."""

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flexgs_edge.mapped import put_rows, read_ahead
 from flexgs_edge.score.removal import RemovalCosts
-from flexgs_edge.scratch import MEMORY, Room, blocks, put_rows, read_rows
+from flexgs_edge.scratch import MEMORY, Room
 
 SH_FACTOR = 2.0
 """Costs of dropped SH count this much. They are measured one Gaussian at a time, but neighbours on a surface lose the same
@@ -61,8 +62,7 @@ def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.n
     """
     top, count = len(costs.sh), len(costs.removal)
     keep, degrees = np.empty(count, bool), np.empty(count, np.uint8)
-    for rows in blocks(count):
-        removal, sh, weight2 = (read_rows(values, rows) for values in (costs.removal, costs.sh, costs.weight2))
+    for rows, (removal, sh, weight2) in read_ahead(count, costs.removal, costs.sh, costs.weight2):
         lagrangian = [SH_FACTOR * sh[level] + multiplier * bits.of_degree(level) for level in range(top)]
         lagrangian.append(np.full(len(removal), multiplier * bits.of_degree(top)))
         unseen = weight2 <= 0
@@ -94,13 +94,12 @@ def drop_bands(
     if top == 0:
         return planes
     dc, rest = (room.empty(planes[name].shape, np.float32) for name in ("sh_dc", "sh_rest"))
-    for rows in blocks(len(degrees)):
+    for rows, (means, colours, bands) in read_ahead(len(degrees), sh_mean, planes["sh_dc"], planes["sh_rest"]):
         some = degrees[rows]
         lower = np.minimum(some, top - 1).astype(np.int64)
-        mean = np.take_along_axis(read_rows(sh_mean, rows), lower[None, None], axis=0)[0]
-        moved = read_rows(planes["sh_dc"], rows) + np.where(some < top, mean, np.float32(0)) / np.float32(y0)
-        put_rows(dc, rows, moved)
-        kept = read_rows(planes["sh_rest"], rows).copy().reshape(3, (top + 1) ** 2 - 1, -1)
+        mean = np.take_along_axis(means, lower[None, None], axis=0)[0]
+        put_rows(dc, rows, colours + np.where(some < top, mean, np.float32(0)) / np.float32(y0))
+        kept = bands.copy().reshape(3, (top + 1) ** 2 - 1, -1)
         for level in range(1, top + 1):
             kept[:, level * level - 1 : (level + 1) ** 2 - 1] *= some >= level
         put_rows(rest, rows, kept.reshape(-1, len(some)))

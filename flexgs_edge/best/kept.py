@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexgs_edge.scratch import MEMORY, Room, blocks, put_rows, read_rows
+from flexgs_edge.mapped import blocks, put_rows, read_rows
+from flexgs_edge.scratch import MEMORY, Room
 
 COLOURS = ("sh_dc", "sh_rest")
 

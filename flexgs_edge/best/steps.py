@@ -16,11 +16,11 @@ import numpy as np
 from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.grid import CODE_LIMIT, POSITION_BITS, Steps
+from flexgs_edge.mapped import COPY_ROWS, blocks, put_rows, read_ahead, read_rows
 from flexgs_edge.render import Renderer
 from flexgs_edge.render.targets import to_half
 from flexgs_edge.rotations import tilted, turned
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.scratch import COPY_ROWS, blocks, put_rows, read_rows
 
 GEOMETRY = ("position", "scale", "rotation", "opacity")
 VALUES = {"position": 3, "scale": 3, "rotation": 3, "opacity": 1}
@@ -56,7 +56,7 @@ def probe_slopes(
     views = [cameras[i * len(cameras) // some] for i in range(some)]
     with renderer.load(MemorySource(planes, origin=origin)) as scene:
         reference = [to_half(renderer.render(scene, camera)) for camera in views]
-    smallest = np.concatenate([read_rows(planes["log_scales"], rows).min(axis=0) for rows in blocks(count)])
+    smallest = np.concatenate([scales.min(axis=0) for _, (scales,) in read_ahead(count, planes["log_scales"])])
     size = float(np.exp(np.median(smallest.astype(np.float64))))
     # Small enough that squared errors grow with squared steps, large enough to stand clear of half precision references.
     trial = {"position": size / 4, "scale": 0.1, "rotation": 0.03, "opacity": 0.2}
@@ -64,8 +64,8 @@ def probe_slopes(
     for kind in GEOMETRY:
         field = CHANGES[kind]
         moved = {**planes, field: renderer.room.empty(planes[field].shape, np.float32)}
-        for rows in blocks(count):
-            part = {name: read_rows(planes[name], rows) for name in CHANGES.values()}
+        for rows, found in read_ahead(count, *(planes[name] for name in CHANGES.values())):
+            part = dict(zip(CHANGES.values(), found, strict=True))
             put_rows(moved[field], rows, _on_trial_grid(part, kind, np.float32(trial[kind])))
         with renderer.load(MemorySource(moved, origin=origin)) as scene:
             error = sum(_squared_error(renderer.render(scene, c), r) for c, r in zip(views, reference, strict=True))
@@ -169,8 +169,8 @@ def reachable(steps: Steps, planes: dict[str, np.ndarray], seen: np.ndarray) -> 
         return np.ones(len(seen), bool)
     means, count = planes["means"], len(seen)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for rows in blocks(count):
-        some = read_rows(means, rows)[:, seen[rows]].astype(np.float64)
+    for rows, (part,) in read_ahead(count, means):
+        some = part[:, seen[rows]].astype(np.float64)
         low, high = (
             np.minimum(low, some.min(axis=1, initial=np.inf)),
             np.maximum(high, some.max(axis=1, initial=-np.inf)),
@@ -182,9 +182,9 @@ def reachable(steps: Steps, planes: dict[str, np.ndarray], seen: np.ndarray) -> 
         "sh_dc": CODE_LIMIT // 4 * steps.dc,
     }
     every = seen.copy()
-    for rows in blocks(count):
-        inside = np.abs(read_rows(means, rows).astype(np.float64) - (low + high)[:, None] / 2).max(axis=0) <= room / 2
-        for name, most in limits.items():
-            inside &= np.abs(read_rows(planes[name], rows)).max(axis=0) <= most
+    for rows, (part, *others) in read_ahead(count, means, *(planes[name] for name in limits)):
+        inside = np.abs(part.astype(np.float64) - (low + high)[:, None] / 2).max(axis=0) <= room / 2
+        for values, most in zip(others, limits.values(), strict=True):
+            inside &= np.abs(values).max(axis=0) <= most
         every[rows] |= inside
     return every

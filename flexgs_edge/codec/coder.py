@@ -19,7 +19,8 @@ from flexgs_edge.codec.walk import ChunkCodes, base_kinds, walk_chunk, walk_posi
 from flexgs_edge.curve import morton
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid import POSITION_BITS, GridScene
-from flexgs_edge.scratch import MEMORY, Room, blocks, put_rows, read_rows
+from flexgs_edge.mapped import blocks, put_rows, read_rows
+from flexgs_edge.scratch import MEMORY, Room
 
 CHUNK_ROWS = 65536
 SAMPLE_CHUNKS = 2

@@ -10,6 +10,7 @@ import numpy as np
 
 from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import SH_C0
+from flexgs_edge.mapped import copy_rows, put_rows, read_rows
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import Renderer, sum_bytes
 from flexgs_edge.render.chunks import Chunk
@@ -17,7 +18,6 @@ from flexgs_edge.render.targets import TargetViews
 from flexgs_edge.render.view_sums import Maker, ViewSums
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.scratch import copy_rows, put_rows, read_rows
 
 RELAX_DC = 1.0
 RELAX_SH = 0.25

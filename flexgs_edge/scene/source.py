@@ -9,8 +9,9 @@ import numpy as np
 
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
+from flexgs_edge.mapped import BLOCK_ROWS, copy_all_rows, put_rows
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
-from flexgs_edge.scratch import BLOCK_ROWS, Room, copy_all_rows, put_rows
+from flexgs_edge.scratch import Room
 
 Planes = dict[str, np.ndarray]
 """Arrays by field name, each [width, n] f32."""

@@ -15,11 +15,12 @@ import numpy as np
 
 from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import FIXED_ERROR, FIXED_WEIGHT
+from flexgs_edge.mapped import put_rows, read_ahead
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render import DeviceScene, Renderer
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.view_sums import Maker, ViewSums
-from flexgs_edge.scratch import MEMORY, Room, blocks, put_rows, read_rows
+from flexgs_edge.scratch import MEMORY, Room
 
 MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
 """Where the sums of moments stop (colours of some thousands in every view)."""
@@ -51,9 +52,9 @@ class RemovalCosts:
         """Costs over all poses, from sums over some of them each."""
         levels, count = parts[0].moments.shape[0], len(parts[0].removal)
         costs = cls.empty(levels, count, room)
-        for rows in blocks(count):
+        for rows, found in read_ahead(count, *(getattr(part, name) for name in PART_NAMES for part in parts)):
             removal, weight2, moments = (
-                np.asarray(sum(read_rows(getattr(part, name), rows) for part in parts)) for name in PART_NAMES
+                np.asarray(sum(found[at : at + len(parts)])) for at in range(0, len(found), len(parts))
             )
             divisor = np.where(weight2 > 0, weight2, 1.0)
             # Rounding may leave a variance of nothing slightly below zero.
