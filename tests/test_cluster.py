@@ -120,39 +120,67 @@ def compress(folder: Path, name: str, *words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
 
 
-def workers_of(pid: int) -> list[int]:
-    """Processes that a local cluster has started."""
-    found = []
-    for thread in Path(f"/proc/{pid}/task").iterdir():
-        for child in (thread / "children").read_text().split():
-            if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text():
-                found.append(int(child))
-    return found
+def finished(run: subprocess.Popen[str]) -> None:
+    """Wait for a run, which is to succeed."""
+    try:
+        said = run.communicate(timeout=200)
+    finally:
+        run.kill()
+    assert run.returncode == 0, said
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="looks for worker processes in /proc")
 def test_a_killed_worker_changes_nothing(distributed: None, tmp_path: Path) -> None:
+    from distributed import Client, LocalCluster
+
     write_ply(tmp_path / "point_cloud.ply", random_scene(6000, 8, 3, size=-4.0))
     write_cameras(tmp_path / "cameras.json")
-    plain = compress(tmp_path, "plain")
-    said = plain.communicate(timeout=200)
-    assert plain.returncode == 0, said
+    finished(compress(tmp_path, "plain"))
+    expected = (tmp_path / "plain.fgs").read_bytes()
 
-    drawn = compress(tmp_path, "drawn", "--cluster", "local:2")
-    try:
-        assert drawn.stderr is not None
-        while "searching" not in (line := drawn.stderr.readline()):
-            assert line, drawn.communicate()
-        time.sleep(1)  # into the first views
-        workers = workers_of(drawn.pid)
-        assert drawn.poll() is None and len(workers) == 2
-        os.kill(workers[0], signal.SIGKILL)
-        said = drawn.communicate(timeout=200)
-    finally:
-        drawn.kill()
-        drawn.communicate()
-    assert drawn.returncode == 0, said
+    words = {"n_workers": 2, "threads_per_worker": 1, "memory_limit": 0, "dashboard_address": None}
+    with LocalCluster(**words, env={"POCL_MAX_PTHREAD_COUNT": "1"}) as local, Client(local) as client:
+        before = set(client.run(os.getpid).values())
+        drawn = compress(tmp_path, "drawn", "--cluster", local.scheduler_address)
+        tasks = 0
+        while tasks < 3 and drawn.poll() is None:  # into the first views
+            time.sleep(0.01)
+            tasks = sum(client.run_on_scheduler(_tasks_done).values())
+        assert drawn.poll() is None
+        os.kill(min(before), signal.SIGKILL)
+        finished(drawn)
+        client.wait_for_workers(2)
+        assert len(before & set(client.run(os.getpid).values())) == 1
+    assert (tmp_path / "drawn.fgs").read_bytes() == expected
+
+
+def _tasks_done(dask_scheduler: object) -> dict[str, int]:
+    """Tasks that each worker has begun or finished."""
+    states = dask_scheduler.workers.values()  # type: ignore[attr-defined]
+    return {state.address: len(state.processing) + len(state.has_what) for state in states}
+
+
+def test_processes_of_this_machine(distributed: None, tmp_path: Path) -> None:
+    """Whoever draws while they start, and after: the same bytes, and no process left."""
+    write_ply(tmp_path / "point_cloud.ply", random_scene(6000, 8, 3, size=-4.0))
+    write_cameras(tmp_path / "cameras.json")
+    for name, words in (("plain", ()), ("drawn", ("--cluster", "local:2"))):
+        finished(compress(tmp_path, name, *words))
     assert (tmp_path / "drawn.fgs").read_bytes() == (tmp_path / "plain.fgs").read_bytes()
+
+
+def test_processes_join_when_they_have_started(distributed: None) -> None:
+    code = (
+        "import time\nfrom test_cluster import *\n"
+        "if __name__ == '__main__':\n"
+        "    with Cluster('local:2', DRAWING) as workers:\n"
+        "        print('at first', workers.ready)\n"
+        "        while not workers.ready: time.sleep(0.1)\n"
+        "        print('views', len(list(workers.planes(random_scene(90, 1), cameras()))))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, check=False, timeout=120
+    )
+    assert done.stdout.split("\n")[:2] == ["at first False", "views 5"], done.stderr
 
 
 def test_nobody_answers(distributed: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

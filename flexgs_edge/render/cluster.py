@@ -12,9 +12,10 @@ import uuid
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,8 @@ class Drawing:
 class Cluster:
     """Workers that draw; a context manager.
 
+    Processes of this machine take seconds to start, meanwhile whoever asks draws himself.
+
     Parameters
     ----------
     address : str
@@ -66,19 +69,32 @@ class Cluster:
         When the package is missing, the address is wrong or nobody answers, or workers have another version of this program.
     """
 
+    _starting: Future[None] | None = None
+
     def __init__(self, address: str, drawing: Drawing) -> None:
-        try:
-            import distributed
-        except ImportError as error:
-            raise InputError("--cluster needs the package distributed: pip install 'flexgs-edge[cluster]'") from error
-        self._drawing, self._lost = drawing, distributed.KilledWorker
+        if find_spec("distributed") is None:
+            raise InputError("--cluster needs the package distributed: pip install 'flexgs-edge[cluster]'")
+        self._drawing = drawing
+        self._client: Any = None
         self._local: Any = None
-        if address.startswith("local:"):
-            count = address.removeprefix("local:")
-            if not count.isdecimal() or int(count) < 1:
-                raise InputError(f"--cluster {address}: expected a number of processes above 0, such as local:2")
+        if not address.startswith("local:"):
+            self._connect(address, None)
+            return
+        count = address.removeprefix("local:")
+        if not count.isdecimal() or int(count) < 1:
+            raise InputError(f"--cluster {address}: expected a number of processes above 0, such as local:2")
+        starter = ThreadPoolExecutor(1, "cluster")
+        self._starting = starter.submit(self._connect, address, int(count))
+        starter.shutdown(wait=False)
+
+    def _connect(self, address: str, processes: int | None) -> None:
+        """Connect to the cluster, or start one of so many processes here."""
+        import distributed  # takes a second
+
+        self._lost = distributed.KilledWorker
+        if processes is not None:
             self._local = distributed.LocalCluster(
-                n_workers=int(count),
+                n_workers=processes,
                 threads_per_worker=1,
                 memory_limit=0,  # what draws has a limit of its own
                 dashboard_address=None,
@@ -86,24 +102,39 @@ class Cluster:
                 env={"POCL_MAX_PTHREAD_COUNT": "1"},
             )
         try:
-            self._client = distributed.Client(self._local or address, timeout=CONNECT_SECONDS, set_as_default=False)
-            versions = set(self._client.run(_version).values())
+            client = distributed.Client(self._local or address, timeout=CONNECT_SECONDS, set_as_default=False)
+            versions = set(client.run(_version).values())
         except (OSError, ValueError, ImportError) as error:
             raise InputError(
                 f"--cluster {address}: no cluster of workers with flexgs-edge answers ({error})"
             ) from error
+        self._client = client
         if versions != {__version__}:
-            self.close()
+            self._leave()
             raise InputError(
                 f"--cluster {address}: expected workers with flexgs-edge {__version__}, found "
                 f"{', '.join(sorted(versions)) or 'no worker'}"
             )
 
+    @property
+    def ready(self) -> bool:
+        """Whether there are workers yet; raises `InputError` when they cannot be started."""
+        if self._starting is not None:
+            if not self._starting.done():
+                return False
+            self._starting.result()
+        return True
+
     def close(self) -> None:
         """Leave the cluster; a local one ends."""
-        self._client.close()
-        if self._local is not None:
-            self._local.close()
+        if self._starting is not None:
+            self._starting.exception()  # waits; what went wrong was said where it was asked for, or does not matter any more
+        self._leave()
+
+    def _leave(self) -> None:
+        for part in (self._client, self._local):
+            if part is not None:
+                part.close()
 
     def __enter__(self) -> Cluster:
         return self

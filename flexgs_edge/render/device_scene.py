@@ -169,8 +169,8 @@ class DeviceScene:
         """From now on views have room for the rows that they show alone, for so many at first; the scene is streamed."""
         self.evict()
         self.shown = shown
-        if self._unpin not in self._budget.reclaimers:
-            self._budget.reclaimers.insert(0, self._unpin)  # before what had to be drawn
+        if self.give_way not in self._budget.reclaimers:
+            self._budget.reclaimers.insert(0, self.give_way)  # before what had to be drawn
 
     def drop_statistics(self) -> None:
         """Free the sums of a view."""
@@ -204,7 +204,7 @@ class DeviceScene:
             chunk.release()
         self._resident, self._pinned, self.resident, self._streamed = [], {}, False, False
 
-    def _unpin(self, size: int) -> None:
+    def give_way(self, size: int) -> None:
         """Give back `size` bytes of the chunks that stay, as far as there are any that are not being used."""
         for base in sorted(self._pinned.keys() - {self._drawn}, reverse=True):
             if size <= 0:
@@ -326,8 +326,8 @@ class DeviceScene:
     def close(self) -> None:
         """Free everything."""
         self.evict()
-        if self._unpin in self._budget.reclaimers:
-            self._budget.reclaimers.remove(self._unpin)
+        if self.give_way in self._budget.reclaimers:
+            self._budget.reclaimers.remove(self.give_way)
         self.drop_statistics()
         self._planes.close()
 

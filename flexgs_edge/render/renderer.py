@@ -156,7 +156,7 @@ class Renderer:
 
     def images(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
         """`render` of each view, in their order: here, or on the cluster."""
-        if self.cluster is None or scene.source is None:
+        if self.cluster is None or scene.source is None or not self.cluster.ready:
             for camera in cameras:
                 yield self.render(scene, camera)
             return

@@ -116,8 +116,13 @@ class ViewBuffers:
             if scene.targets:
                 self.target_arrays()
                 later -= self._target_bytes
-            spare = max(budget.free - later, 0) // ((PAIR_SHARE if rows is None else COMPACT_PAIR_SHARE) * PAIR_BYTES)
-            self.capacity = min(self.tiles + spare, max(DEFAULT_PAIRS, self.tiles))
+            share, most = PAIR_SHARE, max(DEFAULT_PAIRS, self.tiles)
+            if rows is not None:
+                share = COMPACT_PAIR_SHARE
+                # Chunks that stay take what is left, and the buffers of views that show more come after them.
+                scene.give_way(later + share * most * PAIR_BYTES - budget.free)
+            spare = max(budget.free - later, 0) // (share * PAIR_BYTES)
+            self.capacity = min(self.tiles + spare, most)
             self.pairs = self._array((self.capacity, 2), np.uint32)
             self.drafts = self._array((self.capacity, 3), np.uint32)
         except BaseException:

@@ -87,7 +87,7 @@ class ViewSums:
             Gives the view as `Renderer.render_planes` does; valid until the next step.
         """
         renderer, scene = self._renderer, self._scene
-        if renderer.cluster is None or scene.source is None:
+        if renderer.cluster is None or scene.source is None or not renderer.cluster.ready:
             for view, camera in enumerate(cameras):
                 self.add_view(view_sums(renderer, scene, kind, camera, targets and targets(view)), camera)
                 yield renderer.drawn_planes
