@@ -200,7 +200,7 @@ class Judge:
             self._put_away(key, image)
 
     def _put_away(self, key: tuple[str, int], image: np.ndarray) -> None:
-        """Keep an image in a scratch file, where this run has some: six million Gaussians took 4 s to draw again."""
+        """Keep an image in a scratch file, where this run has some."""
         room = self.renderer.room
         if room.spills:
             height, width, _ = image.shape
