@@ -253,24 +253,24 @@ class DeviceScene:
             return
         bounds = self._planes.bounds
         spans = [span for span in self._spans() if wanted is None or span[0] not in bounds or wanted(bounds[span[0]])]
-        missing = (span for span in spans if span[0] not in self._pinned)
         slots: list[ChunkArrays] = []
         # Kernels that use the chunk before the one that is asked for.
         done: Callable[[], None] = _nothing
         loader = ThreadPoolExecutor(1)
         ahead: _Loading | None = None
         try:
-            for span in spans:
+            for place, span in enumerate(spans):
                 start, stop, _ = span
                 self._drawn = start
                 if start in self._pinned:
                     yield self._pinned[start]
                     continue
                 if ahead is None:
-                    ahead = self._load_into(slots, loader, done, next(missing, span))
+                    ahead = self._load_into(slots, loader, done, span)
                 if ahead.start == start:
-                    loading, following = ahead, next(missing, None)
+                    loading = ahead
                     loading.future.result()
+                    following = next((later for later in spans[place + 1 :] if later[0] not in self._pinned), None)
                     ahead = following and self._load_into(slots, loader, done, following)
                 else:  # it gave its memory back since the one ahead was chosen, whose place comes after
                     loading = self._load_into(slots, loader, done, span)
