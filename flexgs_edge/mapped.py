@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
-from flexgs_edge.direct import DirectFile, is_cached
+from flexgs_edge.direct import BUFFER_BYTES, DirectFile, is_cached
 
 BLOCK_ROWS = 1 << 14
 """Rows at a time of what is done row by row: 24 MB of all fields in double precision, with the copies that NumPy makes."""
@@ -28,6 +28,8 @@ READERS = 4
 _READING = ThreadPoolExecutor(READERS, "read")
 _TAKING = ThreadPoolExecutor(2, "take")
 """Planes at a time of which rows are taken: while one is read or written, the other is looked up in."""
+READING_BYTES = (READERS + 4) * BUFFER_BYTES
+"""Buffers of these threads, and of those that take planes, load chunks or read ahead."""
 _Piece = tuple[DirectFile, int, memoryview]
 """A file, a byte of it, and what to fill from there on."""
 

@@ -11,6 +11,7 @@ from flexgs_edge.best.effort import EFFORTS
 from flexgs_edge.best.path import PARTS, sums_room
 from flexgs_edge.budget import MemoryBudget, format_size, return_freed_memory
 from flexgs_edge.cameras import Camera
+from flexgs_edge.mapped import READING_BYTES
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.refit import descent_bytes
 from flexgs_edge.render import Renderer, sum_bytes
@@ -78,9 +79,10 @@ def choose_room(
         budget.require("distilling (--effort max, --distil), which stays in memory as a whole,", size + least)
     budget.require(
         "a search by measured costs with all else in scratch files",
-        SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest),
+        READING_BYTES + SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest),
     )
     room = Scratch(folder)
+    budget.take("reading scratch files", READING_BYTES)  # as long as the process lives
     renderer.largest = largest
     spooled = SPOOL_ROW_BYTES * rows * len(scored)
     LOG.info(
