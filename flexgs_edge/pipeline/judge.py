@@ -132,10 +132,10 @@ class Judge:
     ) -> Quality:
         """Quality of `scene` over the views (LPIPS takes about 3 s a megapixel and pair).
 
-        One that reports draws nothing twice: a scene that is on the backend and the same to the bit has the same quality.
+        One that reports draws nothing twice: a scene that is the same to the bit has the same quality.
         """
-        whole = self.reports and with_ssim and lpips is None
-        drawn = scene.fingerprint() if whole else None
+        whole, elsewhere = self.reports and with_ssim and lpips is None, self.renderer.draws_elsewhere
+        drawn = scene.fingerprint(elsewhere) if whole else None
         if drawn in self._known:
             return self._known[drawn]
         found: list[ViewQuality] = []
@@ -147,7 +147,7 @@ class Judge:
             found.append(compare_view(self.cameras[i].name, image, *references, error, ssims, lpips))
         quality = Quality(tuple(found), self.base_psnr)
         if whole and drawn is None:
-            drawn = scene.fingerprint()
+            drawn = scene.fingerprint(elsewhere)
         if drawn is not None:
             self._known[drawn] = quality
         return quality

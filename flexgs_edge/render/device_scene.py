@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,7 @@ from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.constants import LANES
 from flexgs_edge.kernels import Backend
 from flexgs_edge.render.chunk_bounds import ChunkBounds
+from flexgs_edge.render.chunk_loads import ChunkLoads
 from flexgs_edge.render.chunks import (
     RAW_BYTES,
     Chunk,
@@ -34,6 +33,8 @@ COMPACT_ROWS = 1 << 16
 """Rows of a chunk of a scene whose views are compact: 33 MB with all that projecting it takes."""
 SPARE_SHARE = 4
 """Part of the limit (one in four) that chunks of a compact scene which stay leave free."""
+AHEAD_SHARE = 8
+"""The same of a second chunk that is loaded ahead, whose memory is free again when a view is projected."""
 
 
 def sum_bytes(planes: int) -> int:
@@ -44,20 +45,6 @@ def sum_bytes(planes: int) -> int:
 SUM_BYTES = sum_bytes(1)
 MOST_SUMS = 6
 """Planes of sums that a view has at most (`Renderer.residual_and_removal_sums`)."""
-
-
-def _nothing() -> None:
-    """Waits for no kernel."""
-
-
-@dataclass
-class _Loading:
-    """A chunk that another thread loads."""
-
-    start: int
-    arrays: ChunkArrays
-    stays: bool
-    future: Future[None]
 
 
 class DeviceScene:
@@ -154,8 +141,19 @@ class DeviceScene:
         held = (*self._resident, *self._pinned.values())
         return sum(array.nbytes for chunk in held for array in chunk.arrays)
 
-    def fingerprint(self) -> bytes | None:
-        """Digest of all that views are drawn from; None while that is not on the backend."""
+    def fingerprint(self, of_source: bool = False) -> bytes | None:
+        """Digest of all that views are drawn from: on the backend, or `of_source` and of streamed scenes the stored values.
+
+        None while nothing is on the backend, and where there is no source.
+        """
+        source = self.source
+        if source is not None and (of_source or self._streamed):
+            words = source.count, source.sh_count, source.sh_degree, source.origin.tolist(), self.antialiased
+            digest = hashlib.sha256(repr(words).encode())
+            for rows in source.chunks(COMPACT_ROWS):
+                for values in source.read(rows, list(FIELD)).values():
+                    digest.update(np.ascontiguousarray(values).data)
+            return digest.digest()
         if not self.resident:
             return None
         digest = hashlib.sha256(repr((self.count, self.origin.tolist(), self.antialiased)).encode())
@@ -215,8 +213,15 @@ class DeviceScene:
 
     def _may_stay(self, rows: int) -> bool:
         """Whether memory has room for one more chunk of a compact scene."""
+        return self._leaves_free(rows, SPARE_SHARE)
+
+    def _may_add(self, rows: int) -> bool:
+        """The same for the time that one view is projected."""
+        return self._leaves_free(rows, AHEAD_SHARE)
+
+    def _leaves_free(self, rows: int, share: int) -> bool:
         size = padded(rows) * self._chunk_row_bytes // 2
-        return self.shown is not None and self._budget.free - size >= self._budget.limit // SPARE_SHARE
+        return self.shown is not None and self._budget.free - size >= self._budget.limit // share
 
     def _spans(self) -> Iterator[tuple[int, int, int]]:
         """(start, stop, degree): rows with SH first, then the block without."""
@@ -253,64 +258,27 @@ class DeviceScene:
             return
         bounds = self._planes.bounds
         spans = [span for span in self._spans() if wanted is None or span[0] not in bounds or wanted(bounds[span[0]])]
-        slots: list[ChunkArrays] = []
-        # Kernels that use the chunk before the one that is asked for.
-        done: Callable[[], None] = _nothing
-        loader = ThreadPoolExecutor(1)
-        ahead: _Loading | None = None
+        loads = ChunkLoads(self.backend, self._planes, self._may_stay, self._may_add)
         try:
             for place, span in enumerate(spans):
                 start, stop, _ = span
                 self._drawn = start
-                if start in self._pinned:
+                loading = None if start in self._pinned else loads.take(span)
+                loads.go_on(later for later in spans[place + 1 :] if later[0] not in self._pinned)
+                if loading is None:
                     yield self._pinned[start]
                     continue
-                if ahead is None:
-                    ahead = self._load_into(slots, loader, done, span)
-                if ahead.start == start:
-                    loading = ahead
-                    loading.future.result()
-                    following = next((later for later in spans[place + 1 :] if later[0] not in self._pinned), None)
-                    ahead = following and self._load_into(slots, loader, done, following)
-                else:  # it gave its memory back since the one ahead was chosen, whose place comes after
-                    loading = self._load_into(slots, loader, done, span)
-                    slots.sort(key=lambda arrays: arrays is ahead.arrays)
-                    loading.future.result()
                 chunk = loading.arrays.activated(start, stop - start, self.antialiased)
                 if loading.stays:
+                    loads.keep(loading)
                     loading.arrays.release_raw()
                     self._pinned[start] = chunk
                 yield chunk
-                done = self.backend.mark()
+                if not loading.stays:
+                    loads.give_back(loading)
         finally:
             self._drawn = -1
-            loader.shutdown()
-            if ahead is not None and ahead.stays:
-                slots.append(ahead.arrays)
-            for arrays in slots:
-                arrays.release()
-
-    def _load_into(
-        self, slots: list[ChunkArrays], loader: Executor, done: Callable[[], None], span: tuple[int, int, int]
-    ) -> _Loading:
-        """Load a chunk on another thread: to stay, or in place of the older of two, which `done` waits for the kernels of."""
-        start, stop, degree = span
-        stride, arrays, stays = padded(stop - start), None, self._may_stay(stop - start)
-        if len(slots) == 2 and not stays:
-            arrays = slots.pop(0)
-            if (arrays.degree, arrays.stride) != (degree, stride):
-                done()
-                arrays.release()
-                arrays = None
-        arrays = arrays or ChunkArrays(self.backend, degree, stride)
-        if not stays:
-            slots.append(arrays)
-
-        def load() -> None:
-            done()
-            self._planes.load(start, stop, arrays.stored)
-
-        return _Loading(start, arrays, stays, loader.submit(load))
+            loads.close()
 
     def refresh(self, *fields: str) -> None:
         """Read `sh_dc` or `sh_rest` again from a source whose values have changed (streamed chunks do so anyway)."""

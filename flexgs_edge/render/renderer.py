@@ -127,6 +127,11 @@ class Renderer:
         assert self._buffers is not None
         return self._buffers.records
 
+    @property
+    def draws_elsewhere(self) -> bool:
+        """Whether there is a cluster, and it is ready."""
+        return self.cluster is not None and self.cluster.ready
+
     def load(
         self, source: SceneSource, sum_bytes: int = SUM_BYTES, targets: bool = False, view_sums: int = MOST_SUMS
     ) -> DeviceScene:
@@ -156,7 +161,7 @@ class Renderer:
 
     def images(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
         """`render` of each view, in their order: here, or on the cluster."""
-        if self.cluster is None or scene.source is None or not self.cluster.ready:
+        if self.cluster is None or scene.source is None or not self.draws_elsewhere:
             for camera in cameras:
                 yield self.render(scene, camera)
             return

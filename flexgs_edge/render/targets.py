@@ -58,7 +58,7 @@ class TargetViews:
         return views
 
     def add(self, view: int, planes: np.ndarray) -> None:
-        """Keep a view ([3, H, W] f32, as `Renderer.render_planes` gives it)."""
+        """Keep a view ([3, H, W] f32, as `Renderer.render_planes` gives it, or f16)."""
         half = to_half(planes)
         self._file.seek(self._end)
         self._file.write(half.data)
