@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flexgs_edge import mapped
 from flexgs_edge.best.choice import REMOVAL_FACTOR, SH_FACTOR, BitModel, choose, choose_one_degree, drop_bands
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.score.removal import RemovalCosts
@@ -109,8 +110,8 @@ def test_dropped_bands_leave_their_mean() -> None:
     planes = planes_of(4, 3)
     mean = np.random.default_rng(62).normal(size=(3, 3, 4)).astype(np.float32)
     degrees = np.array([0, 1, 2, 3], np.uint8)
-    found = drop_bands(planes, degrees, mean, SH_C0)
-    assert found["means"] is planes["means"]
+    found = drop_bands(planes, np.arange(4), degrees, mean, SH_C0)
+    np.testing.assert_array_equal(found["means"], planes["means"])
     for row, degree in enumerate(degrees.tolist()):
         kept = (degree + 1) ** 2 - 1
         rest, before = (p["sh_rest"].reshape(3, 15, 4)[:, :, row] for p in (found, planes))
@@ -125,14 +126,29 @@ def test_dropped_bands_leave_their_mean() -> None:
 
 def test_nothing_to_drop() -> None:
     planes = planes_of(3, 0)
-    assert drop_bands(planes, np.zeros(3, np.uint8), np.zeros((0, 3, 3), np.float32), SH_C0) is planes
-    planes = planes_of(3, 2)
-    found = drop_bands(planes, np.full(3, 2, np.uint8), np.ones((2, 3, 3), np.float32), SH_C0)
-    for name, values in planes.items():
-        np.testing.assert_array_equal(found[name], values)
-    assert drop_bands(planes_of(0, 2), np.zeros(0, np.uint8), np.zeros((2, 3, 0), np.float32), SH_C0)[
-        "sh_dc"
-    ].shape == (3, 0)
+    rows = np.array([0, 2])
+    for degree in (0, 2):
+        planes, means = planes_of(3, degree), np.ones((degree, 3, 3), np.float32)
+        found = drop_bands(planes, rows, np.full(2, degree, np.uint8), means, SH_C0)
+        assert set(found) == set(planes)
+        for name, values in planes.items():
+            np.testing.assert_array_equal(found[name], values[:, rows])
+    none = drop_bands(planes_of(0, 2), rows[:0], np.zeros(0, np.uint8), np.zeros((2, 3, 0), np.float32), SH_C0)
+    assert none["sh_dc"].shape == (3, 0)
+
+
+def test_bands_of_some_rows_in_any_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rows that stay give what they would give alone, wherever the blocks of a pass end."""
+    rng = np.random.default_rng(63)
+    planes, mean = planes_of(40, 3), rng.normal(size=(3, 3, 40)).astype(np.float32)
+    rows = np.sort(rng.permutation(40)[:25])
+    degrees = rng.integers(0, 4, 25).astype(np.uint8)
+    alone = {name: values[:, rows] for name, values in planes.items()}
+    expected = drop_bands(alone, np.arange(25), degrees, mean[..., rows], SH_C0)
+    for size in (1, 7, 40):
+        monkeypatch.setattr(mapped.blocks, "__defaults__", (size,))
+        for name, values in drop_bands(planes, rows, degrees, mean, SH_C0).items():
+            np.testing.assert_array_equal(values, expected[name])
 
 
 @settings(deadline=None)

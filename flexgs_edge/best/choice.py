@@ -87,20 +87,47 @@ def choose_one_degree(costs: RemovalCosts, bits: BitModel, multiplier: float) ->
 
 
 def drop_bands(
-    planes: dict[str, np.ndarray], degrees: np.ndarray, sh_mean: np.ndarray, y0: float, room: Room = MEMORY
+    planes: dict[str, np.ndarray],
+    rows: np.ndarray,
+    degrees: np.ndarray,
+    sh_mean: np.ndarray,
+    y0: float,
+    room: Room = MEMORY,
 ) -> dict[str, np.ndarray]:
-    """Clear SH above `degrees` ([n]) and add the cleared bands' mean colour (`sh_mean`, [D, 3, n]) to the constant."""
+    """Rows of planes, without the SH above their degrees, whose mean colour is added to the constant.
+
+    Parameters
+    ----------
+    planes : dict
+        [width, n] f32 by field; not changed.
+    rows : np.ndarray
+        [m] i64, ascending.
+    degrees : np.ndarray
+        [m] u8, the SH degree that each of them keeps.
+    sh_mean : np.ndarray
+        [D, 3, n] f32, mean colour of the bands above each lower degree.
+    y0 : float
+        The constant basis function.
+
+    Returns
+    -------
+    dict
+        [width, m] f32 by field, in arrays of `room`.
+    """
     top = len(sh_mean)
     if top == 0:
-        return planes
-    dc, rest = (room.empty(planes[name].shape, np.float32) for name in ("sh_dc", "sh_rest"))
-    for rows, (means, colours, bands) in read_ahead(len(degrees), sh_mean, planes["sh_dc"], planes["sh_rest"]):
-        some = degrees[rows]
+        return {name: room.take(values, rows) for name, values in planes.items()}
+    kept = {name: room.empty((len(planes[name]), len(rows)), np.float32) for name in ("sh_dc", "sh_rest")}
+    # Taken and cleared at once: six million within 1 GiB wrote and read 0.5 GB more for each choice.
+    for part, found in read_ahead(planes["means"].shape[1], sh_mean, planes["sh_dc"], planes["sh_rest"]):
+        here = slice(*np.searchsorted(rows, (part.start, part.stop)).tolist())
+        inside, some = rows[here] - part.start, degrees[here]
+        means, colours, bands = (values.take(inside, axis=-1) for values in found)
         lower = np.minimum(some, top - 1).astype(np.int64)
         mean = np.take_along_axis(means, lower[None, None], axis=0)[0]
-        put_rows(dc, rows, colours + np.where(some < top, mean, np.float32(0)) / np.float32(y0))
-        kept = bands.copy().reshape(3, (top + 1) ** 2 - 1, -1)
+        put_rows(kept["sh_dc"], here, colours + np.where(some < top, mean, np.float32(0)) / np.float32(y0))
+        bands = bands.reshape(3, (top + 1) ** 2 - 1, -1)
         for level in range(1, top + 1):
-            kept[:, level * level - 1 : (level + 1) ** 2 - 1] *= some >= level
-        put_rows(rest, rows, kept.reshape(-1, len(some)))
-    return {**planes, "sh_dc": dc, "sh_rest": rest}
+            bands[:, level * level - 1 : (level + 1) ** 2 - 1] *= some >= level
+        put_rows(kept["sh_rest"], here, bands.reshape(len(kept["sh_rest"]), len(some)))
+    return {name: kept[name] if name in kept else room.take(values, rows) for name, values in planes.items()}

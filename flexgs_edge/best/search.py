@@ -21,7 +21,7 @@ from flexgs_edge.adapt.line import AIM, next_point
 from flexgs_edge.best.choice import BitModel, choose, drop_bands
 from flexgs_edge.best.effort import Effort
 from flexgs_edge.best.kept import Kept, Mended
-from flexgs_edge.best.path import PrunePath, Snapshot, take_rows
+from flexgs_edge.best.path import PrunePath, Snapshot
 from flexgs_edge.best.results import (
     LARGEST_STRIDE,
     SIZE_SLOPE,
@@ -218,8 +218,7 @@ class MultiplierSearch(ABC, Generic[Product]):
         index, keep, degrees = self._snapshot(multiplier)
         snapshot = self.path.snapshots[index]
         rows, room = np.flatnonzero(keep), self.path.room
-        means = room.take(snapshot.costs.sh_mean, rows)
-        planes = drop_bands(take_rows(snapshot.planes, rows, room), degrees[rows], means, SH_C0, room)
+        planes = drop_bands(snapshot.planes, rows, degrees[rows], snapshot.costs.sh_mean, SH_C0, room)
         weight2 = room.take(snapshot.costs.weight2, rows)
         return Kept(index, room.take(snapshot.rows, rows), planes, degrees[rows], weight2)
 

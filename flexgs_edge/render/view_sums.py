@@ -8,6 +8,7 @@ of one chunk are held at a time. Both add up the same numbers in the same order.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, BinaryIO, Protocol
@@ -205,6 +206,8 @@ class _Spool:
         self._room, self._starts = room, starts
         self._record: np.dtype[Any] | None = None
         self._file: BinaryIO = room.file()
+        self._disk = ThreadPoolExecutor(1, "sums")
+        """Writes and reads it, one block at a time, while the next is gathered or the one before is added."""
         self._end = 0
         # For each view: its camera, where it begins, and how many of its rows come before each chunk.
         self._views: list[tuple[Camera, int, np.ndarray]] = []
@@ -212,16 +215,18 @@ class _Spool:
     def add(self, parts: Iterable[Part], camera: Camera) -> None:
         """Write one view."""
         start, before = self._end, np.zeros(len(self._starts), np.int64)
+        written: Future[Any] = self._disk.submit(self._file.seek, start)
         try:
-            self._file.seek(start)
             for rows, values in parts:
                 self._record = np.dtype([("row", "<u4"), ("sums", "<i8", values.shape[1:])])
                 block = np.empty(len(rows), self._record)
                 block["row"], block["sums"] = rows, values
-                self._file.write(block.data)
-                self._end += block.nbytes
                 before += np.searchsorted(rows, self._starts)
-            self._file.flush()
+                self._end += block.nbytes
+                written.result()
+                written = self._disk.submit(self._file.write, block.data)
+            written.result()
+            self._disk.submit(self._file.flush).result()
         except OSError as error:
             raise self._room.full(self._end - start, error) from error
         self._views.append((camera, start, before))
@@ -231,22 +236,34 @@ class _Spool:
         backend, place = renderer.backend, int(np.searchsorted(self._starts, chunk.base))
         if self._record is None:  # no view showed anything
             return
+        pieces = []
+        for camera, start, before in self._views:
+            low, high = before[place : place + 2].tolist()
+            if low < high:
+                pieces.append((camera, start + low * self._record.itemsize, high - low))
+        if not pieces:
+            return
+        coming = self._disk.submit(self._read, *pieces[0][1:])
         dense = _Dense(backend, (chunk.stride, *self._record["sums"].shape))
         try:
-            for camera, start, before in self._views:
-                low, high = before[place : place + 2].tolist()
-                if low == high:
-                    continue
-                block = np.empty(high - low, self._record)
-                self._file.seek(start + low * self._record.itemsize)
-                self._file.readinto(block.data.cast("B"))  # type: ignore[attr-defined]
+            for number, (camera, *_) in enumerate(pieces, start=1):
+                block = coming.result()
+                if number < len(pieces):
+                    coming = self._disk.submit(self._read, *pieces[number][1:])
                 renderer.aim(camera, scene.origin)
                 yield dense.of([(block["row"], block["sums"])], chunk.base)
         finally:
             dense.release()
 
+    def _read(self, at: int, rows: int) -> np.ndarray:
+        block = np.empty(rows, self._record)
+        self._file.seek(at)
+        self._file.readinto(block.data.cast("B"))  # type: ignore[attr-defined]
+        return block
+
     def close(self) -> None:
         """Remove the file."""
+        self._disk.shutdown()
         self._file.close()
 
 
