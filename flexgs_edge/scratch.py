@@ -14,7 +14,7 @@ import numpy as np
 
 from flexgs_edge.budget import AnonymousPeak, format_size
 from flexgs_edge.errors import BudgetError, InputError
-from flexgs_edge.mapped import COPY_ROWS, MappedFile, blocks, put_rows, read_rows, take_rows
+from flexgs_edge.mapped import COPY_ROWS, WHOLE_BYTES, WHOLE_SHARE, MappedFile, blocks, put_rows, read_rows, take_rows
 
 _SMALL = 1 << 16
 """Bytes below which an array stays in memory in any case: a file each would cost more than it saves."""
@@ -29,6 +29,8 @@ class Room:
     """Whether arrays lie in files: then memory holds no more than a few bytes of each row, and whatever else the kernel has
     room for."""
     folder: Path | None = None
+    whole_bytes: int | None = None
+    """See `take_rows`."""
     peak = 0
     """Most bytes that lay in mapped files at a time."""
 
@@ -55,7 +57,7 @@ class Room:
     def take(self, values: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """`values[..., rows]` in an array of this room, C-contiguous."""
         made = self.empty((*values.shape[:-1], len(rows)), values.dtype)
-        take_rows(values, rows, made)
+        take_rows(values, rows, made, self.whole_bytes)
         return made
 
     def file(self) -> BinaryIO:
@@ -80,6 +82,8 @@ class Scratch(Room):
     ----------
     folder : path
         On a disk.
+    limit : int
+        Bytes that the process may hold.
 
     Raises
     ------
@@ -89,8 +93,10 @@ class Scratch(Room):
 
     spills = True
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
+    def __init__(self, folder: str | os.PathLike[str], limit: int = 0) -> None:
         self.folder: Path = Path(os.path.realpath(folder))
+        if limit:
+            self.whole_bytes = max(WHOLE_BYTES, limit // WHOLE_SHARE)
         self.used = self.peak = 0
         self._watch: AnonymousPeak | None = None
         kind = file_system_of(self.folder)

@@ -88,3 +88,37 @@ def test_one_that_reports_draws_nothing_twice(judged: MakeJudge, monkeypatch: py
         planes["log_scales"][0, 5] = np.nextafter(planes["log_scales"][0, 5], np.float32(9))
         compare(planes)
         assert drawn == 4
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_scenes_that_are_not_on_the_backend_are_known_again(
+    elsewhere: bool, judged: MakeJudge, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that are streamed once they have been drawn, those that others draw at once."""
+    if elsewhere:
+        monkeypatch.setattr(Renderer, "draws_elsewhere", True)
+    else:
+        monkeypatch.setattr(Renderer, "_fits", lambda *_: False)
+    drawn = 0
+    images = Renderer.images
+
+    def counted(self: Renderer, *words: object) -> object:
+        nonlocal drawn
+        drawn += 1
+        return images(self, *words)  # type: ignore[arg-type]
+
+    with judged(reports=True) as (judge, source, renderer, _):
+        monkeypatch.setattr(Renderer, "images", counted)
+        planes = source.select(np.arange(0, COUNT, 2)).read(slice(0, COUNT // 2), list(FIELD))
+
+        def compare(planes: dict[str, np.ndarray]) -> object:
+            with renderer.load(MemorySource(planes)) as loaded:
+                if not elsewhere:
+                    renderer.render(loaded, judge.cameras[0])
+                return judge.compare(loaded, with_ssim=True)
+
+        first = compare(planes)
+        assert drawn == 1 and compare(planes) == first and drawn == 1
+        planes["sh_dc"][0, 5] = np.nextafter(planes["sh_dc"][0, 5], np.float32(9))
+        compare(planes)
+        assert drawn == 2

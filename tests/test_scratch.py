@@ -97,6 +97,15 @@ def test_rows_in_any_order_are_taken(room: Room, monkeypatch: pytest.MonkeyPatch
             np.testing.assert_array_equal(mapped.read_listed(values, rows), values[:, rows])
 
 
+def test_larger_planes_are_held_where_the_limit_is_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (scratch, mapped):
+        monkeypatch.setattr(module, "WHOLE_BYTES", 0)
+    monkeypatch.setattr(mapped, "fetch", lambda *_: pytest.fail("looked up through the pages"))
+    room = Scratch(tmp_path, 16 * 8 * COUNT)
+    values, rows = room.copy(np.random.default_rng(5).normal(size=(2, COUNT))), np.array([5, COUNT - 1, 7])
+    np.testing.assert_array_equal(room.take(values, rows), values[:, rows])
+
+
 def test_a_part_is_fetched_plane_by_plane(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     advise = mapped.MappedFile.madvise

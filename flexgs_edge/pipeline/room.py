@@ -81,7 +81,7 @@ def choose_room(
         "a search by measured costs with all else in scratch files",
         READING_BYTES + SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest),
     )
-    room = Scratch(folder)
+    room = Scratch(folder, budget.limit)
     budget.take("reading scratch files", READING_BYTES)  # as long as the process lives
     renderer.largest = largest
     spooled = SPOOL_ROW_BYTES * rows * len(scored)
