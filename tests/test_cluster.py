@@ -17,8 +17,10 @@ from flexgs_edge.cameras import Camera
 from flexgs_edge.errors import InputError
 from flexgs_edge.render import Renderer, cluster
 from flexgs_edge.render.cluster import Cluster, Drawing
+from flexgs_edge.render.view_sums import ViewSums
 from flexgs_edge.scene import write_ply
-from flexgs_edge.score.removal import measure_costs
+from flexgs_edge.score.removal import PART_NAMES, cost_parts, cost_sums, measure_costs, put_costs
+from flexgs_edge.scratch import MEMORY
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, random_scene
 from tiny_project import write_cameras
@@ -89,6 +91,26 @@ def test_sums_and_pictures_are_those_of_one_machine(monkeypatch: pytest.MonkeyPa
     for plain, drawn in zip(*found, strict=True):
         np.testing.assert_array_equal(drawn, plain)
         assert drawn.strides == plain.strides, "sums over pixels go along the memory"
+
+
+def test_a_view_of_nothing_adds_nothing() -> None:
+    """A worker with little memory sends no rows of a view that shows none."""
+    renderer = Renderer(open_form("numpy"), large_budget())
+    with renderer.load(random_scene(90, 5, 1), 100) as scene:
+        found = []
+        for drawn in (True, False):
+            sums = ViewSums(renderer, scene, [cost_sums(renderer, 1)])
+            sums.add_view(renderer.removal_sums(scene, cameras()[0]), cameras()[0])
+            if drawn:
+                sums._add_drawn([], cameras()[-1])
+            costs = cost_parts(1, scene.count, MEMORY)
+            for rows, (part,) in sums.parts():
+                put_costs(costs, rows, part)
+            found.append([getattr(costs, name) for name in PART_NAMES])
+            sums.release()
+    assert found[0][0].any()
+    for empty, plain in zip(*found, strict=True):
+        np.testing.assert_array_equal(empty, plain)
 
 
 @pytest.mark.parametrize("address", ["local:", "local:0", "local:two", "local:-1"])

@@ -123,6 +123,8 @@ class ViewSums:
         if renderer.room.spills:
             self._add_parts(parts, camera)
             return
+        if not parts:  # a compact view of nothing
+            return
         renderer.aim(camera, scene.origin)
         for chunk, held in self._chunks():
             some = [slice(*np.searchsorted(rows, (chunk.base, chunk.base + chunk.count))) for rows, _ in parts]
