@@ -19,11 +19,6 @@ AHEAD_ROWS = 1 << 15
 """Rows that are read ahead at a time."""
 COPY_ROWS = 1 << 18
 """Rows of one plane at a time: a megabyte."""
-WHOLE_BYTES = 1 << 26
-"""Bytes of a plane that is held as a whole while rows in any order are taken from it, at least: six million took 0.4 s instead of
-22, forty million would have taken 20 s for each of 59 planes."""
-WHOLE_SHARE = 16
-"""Part of the limit (one in 16) that such a plane may take where that is more."""
 DENSE = 4
 """Rows read for one that is wanted, at most: rather than page by page."""
 READERS = 4
@@ -184,10 +179,10 @@ def _planes(held: MappedFile, values: np.ndarray, rows: slice) -> Iterator[tuple
         yield first + sum(number * stride for number, stride in zip(place, values.strides, strict=False)), place
 
 
-def take_rows(values: np.ndarray, rows: np.ndarray, out: np.ndarray, whole_bytes: int | None = None) -> None:
+def take_rows(values: np.ndarray, rows: np.ndarray, out: np.ndarray, whole_bytes: int) -> None:
     """`out[...] = values[..., rows]`, rows being listed.
 
-    `whole_bytes`: of a plane that memory may hold as a whole, two of them at a time (default `WHOLE_BYTES`).
+    `whole_bytes`: of a plane that memory may hold as a whole, two of them at a time.
 
     Of files rows out of order are looked up in one plane at a time, or two, which memory holds where it cannot hold all (going
     through all planes for every part of the rows, 1 M Gaussians read 150 GB under a cap of 512 MiB).
@@ -206,7 +201,6 @@ def take_rows(values: np.ndarray, rows: np.ndarray, out: np.ndarray, whole_bytes
     def take_part(part: slice, listed: _Listed, plane: np.ndarray, taken: np.ndarray) -> None:
         put_rows(taken, part, listed.of(plane))
 
-    whole_bytes = WHOLE_BYTES if whole_bytes is None else whole_bytes
     if planes[0][0].nbytes <= whole_bytes and not _Listed(rows[:COPY_ROWS]).dense:
         for _ in each(take_whole, *zip(*planes, strict=True)):
             pass

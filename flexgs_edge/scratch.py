@@ -14,10 +14,15 @@ import numpy as np
 
 from flexgs_edge.budget import AnonymousPeak, format_size
 from flexgs_edge.errors import BudgetError, InputError
-from flexgs_edge.mapped import COPY_ROWS, WHOLE_BYTES, WHOLE_SHARE, MappedFile, blocks, put_rows, read_rows, take_rows
+from flexgs_edge.mapped import COPY_ROWS, MappedFile, blocks, put_rows, read_rows, take_rows
 
 _SMALL = 1 << 16
 """Bytes below which an array stays in memory in any case: a file each would cost more than it saves."""
+WHOLE_BYTES = 1 << 26
+"""Bytes of a plane that is held as a whole while rows in any order are taken from it, at least: six million took 0.4 s instead of
+22, and forty million, in their first minutes, went at 20 s for each of 59 planes."""
+WHOLE_SHARE = 16
+"""Part of the limit (one in 16) that such a plane may take where that is more."""
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _IN_MEMORY = {"tmpfs", "ramfs", "devtmpfs"}
 
@@ -29,7 +34,7 @@ class Room:
     """Whether arrays lie in files: then memory holds no more than a few bytes of each row, and whatever else the kernel has
     room for."""
     folder: Path | None = None
-    whole_bytes: int | None = None
+    whole_bytes = WHOLE_BYTES
     """See `take_rows`."""
     peak = 0
     """Most bytes that lay in mapped files at a time."""
@@ -95,8 +100,7 @@ class Scratch(Room):
 
     def __init__(self, folder: str | os.PathLike[str], limit: int = 0) -> None:
         self.folder: Path = Path(os.path.realpath(folder))
-        if limit:
-            self.whole_bytes = max(WHOLE_BYTES, limit // WHOLE_SHARE)
+        self.whole_bytes = max(WHOLE_BYTES, limit // WHOLE_SHARE)
         self.used = self.peak = 0
         self._watch: AnonymousPeak | None = None
         kind = file_system_of(self.folder)

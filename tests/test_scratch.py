@@ -84,8 +84,8 @@ def test_rows_in_any_order_are_taken(room: Room, monkeypatch: pytest.MonkeyPatch
     values = room.copy(np.random.default_rng(4).normal(size=(3, COUNT)))
     fetched = []
     monkeypatch.setattr(mapped, "fetch", lambda plane, rows: fetched.append(rows))
-    for whole in (mapped.WHOLE_BYTES, 0):
-        monkeypatch.setattr(mapped, "WHOLE_BYTES", whole)
+    for whole in (scratch.WHOLE_BYTES, 0):
+        monkeypatch.setattr(room, "whole_bytes", whole)
         for rows, apart in (
             (np.arange(0, COUNT, 2), False),
             (np.array([5, COUNT - 1, 7]), True),
@@ -98,8 +98,7 @@ def test_rows_in_any_order_are_taken(room: Room, monkeypatch: pytest.MonkeyPatch
 
 
 def test_larger_planes_are_held_where_the_limit_is_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (scratch, mapped):
-        monkeypatch.setattr(module, "WHOLE_BYTES", 0)
+    monkeypatch.setattr(scratch, "WHOLE_BYTES", 0)
     monkeypatch.setattr(mapped, "fetch", lambda *_: pytest.fail("looked up through the pages"))
     room = Scratch(tmp_path, 16 * 8 * COUNT)
     values, rows = room.copy(np.random.default_rng(5).normal(size=(2, COUNT))), np.array([5, COUNT - 1, 7])

@@ -134,7 +134,7 @@ class Judge:
 
         One that reports draws nothing twice: a scene that is the same to the bit has the same quality.
         """
-        whole, elsewhere = self.reports and with_ssim and lpips is None, self.renderer.draws_elsewhere
+        whole, elsewhere = self.reports and with_ssim and lpips is None, self.renderer.ready_cluster is not None
         drawn = scene.fingerprint(elsewhere) if whole else None
         if drawn in self._known:
             return self._known[drawn]

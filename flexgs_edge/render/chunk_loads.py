@@ -13,7 +13,7 @@ SLOTS = 2
 """Chunks that there is always room for: one that is drawn, and one that is loaded."""
 MOST_SLOTS = 3
 """The same where memory has room: the disk rests less between two chunks (126 views of six million within 1 GiB were projected in
-76 s instead of 80)."""
+76 s instead of 80; what the disk gives changes by as much from hour to hour)."""
 Span = tuple[int, int, int]
 """First row, row after the last, and SH degree of a chunk."""
 

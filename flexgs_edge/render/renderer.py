@@ -128,9 +128,9 @@ class Renderer:
         return self._buffers.records
 
     @property
-    def draws_elsewhere(self) -> bool:
-        """Whether there is a cluster, and it is ready."""
-        return self.cluster is not None and self.cluster.ready
+    def ready_cluster(self) -> Cluster | None:
+        """The cluster, once it has workers."""
+        return self.cluster if self.cluster is not None and self.cluster.ready else None
 
     def load(
         self, source: SceneSource, sum_bytes: int = SUM_BYTES, targets: bool = False, view_sums: int = MOST_SUMS
@@ -161,11 +161,12 @@ class Renderer:
 
     def images(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
         """`render` of each view, in their order: here, or on the cluster."""
-        if self.cluster is None or scene.source is None or not self.draws_elsewhere:
+        cluster = self.ready_cluster
+        if cluster is None or scene.source is None:
             for camera in cameras:
                 yield self.render(scene, camera)
             return
-        for camera, planes in zip(cameras, self.cluster.planes(scene.source, cameras), strict=True):
+        for camera, planes in zip(cameras, cluster.planes(scene.source, cameras), strict=True):
             yield planes[:, : camera.height, : camera.width].transpose(1, 2, 0)
 
     def render_planes(self, scene: DeviceScene, camera: Camera) -> np.ndarray:

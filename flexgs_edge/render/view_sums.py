@@ -90,13 +90,13 @@ class ViewSums:
         callable
             Gives the view for `TargetViews.add`; valid until the next step.
         """
-        renderer, scene = self._renderer, self._scene
-        if renderer.cluster is None or scene.source is None or not renderer.draws_elsewhere:
+        renderer, scene, cluster = self._renderer, self._scene, self._renderer.ready_cluster
+        if cluster is None or scene.source is None:
             for view, camera in enumerate(cameras):
                 self.add_view(view_sums(renderer, scene, kind, camera, targets and targets(view)), camera)
                 yield renderer.drawn_planes
             return
-        found = renderer.cluster.sums(scene.source, kind, cameras, targets, pictures)
+        found = cluster.sums(scene.source, kind, cameras, targets, pictures)
         for camera, drawn in zip(cameras, found, strict=True):
             self._add_drawn(drawn.parts, camera)
             yield partial(_picture, drawn)
