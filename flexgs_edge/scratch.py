@@ -37,7 +37,7 @@ class Room:
     whole_bytes = WHOLE_BYTES
     """See `take_rows`."""
     peak = 0
-    """Most bytes that lay in mapped files at a time."""
+    """Most bytes that lay in files at a time."""
 
     @property
     def peak_anonymous(self) -> int | None:
@@ -66,8 +66,11 @@ class Room:
         return made
 
     def file(self) -> BinaryIO:
-        """A file without a name that is gone when it is closed, whatever ends the process."""
+        """A file without a name that is gone when it is closed, whatever ends the process; who writes to it says how much."""
         return tempfile.TemporaryFile(dir=self.folder)
+
+    def count(self, size: int) -> None:
+        """So many bytes more lie in a `file` (less than none: it is closed)."""
 
     def full(self, size: int, error: OSError) -> Exception:
         """What to raise when `size` bytes of a scratch file cannot be had."""
@@ -141,15 +144,19 @@ class Scratch(Room):
             file.close()
             raise self.full(size, error) from error
         held.room, held.file = self, file
+        self.count(size)
         if hasattr(mmap, "MADV_RANDOM"):
             # Of one row of values the kernel may read ahead. Of planes, a part of the rows is a piece of each: a disk that reads
             # 8 MiB ahead read 180 GB for 1 M Gaussians under a cap of 512 MiB. `fetch` asks for those pieces instead.
             held.madvise(mmap.MADV_SEQUENTIAL if len(shape) == 1 else mmap.MADV_RANDOM)
-        self.used += size
-        self.peak = max(self.peak, self.used)
         values = np.frombuffer(held, dtype).reshape(shape)
         held.address = values.ctypes.data
         return values
+
+    def count(self, size: int) -> None:
+        """See `Room.count`."""
+        self.used += size
+        self.peak = max(self.peak, self.used)
 
     def full(self, size: int, error: OSError) -> Exception:
         """What to raise when `size` bytes cannot be had."""

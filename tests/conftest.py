@@ -1,4 +1,4 @@
-"""Fixtures that all tests share: where the scenes are."""
+"""Fixtures that tests share: where the scenes are, and views that take little room."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ from typing import Any
 import pytest
 
 from flexgs_edge.best.effort import EFFORTS
+from flexgs_edge.render import Renderer, device_scene
+from flexgs_edge.render import compact as compact_module
+from flexgs_edge.render import renderer as renderer_module
+from flexgs_edge.render.device_scene import DeviceScene
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -45,6 +49,16 @@ def fox_dir(scenes_dir: Path) -> Path:
     if not (folder / "point_cloud.ply").is_file():
         pytest.skip(f"no fox scene at {folder}: set FLEXGS_SCENES to a folder that has it")
     return folder
+
+
+@pytest.fixture
+def compact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views hold what they show, with room for few rows at first, in chunks of 64 rows."""
+    monkeypatch.setattr(Renderer, "_fits", lambda *_: False)
+    monkeypatch.setattr(compact_module, "CAPACITY_STEP", 32)
+    monkeypatch.setattr(renderer_module, "FIRST_SHARE", 100)
+    monkeypatch.setattr(device_scene, "COMPACT_ROWS", 64)
+    monkeypatch.setattr(DeviceScene, "_may_stay", lambda *_: False)
 
 
 @pytest.fixture(scope="module")

@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flexgs_edge.best.path import sums_room
 from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import CULLED
 from flexgs_edge.curve import near_rows
 from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.kernels import TwinBackend
 from flexgs_edge.pipeline import compress as compress_module
 from flexgs_edge.pipeline.compress import compress
 from flexgs_edge.refit import refit_colours
 from flexgs_edge.render import Renderer, Statistics, device_scene
-from flexgs_edge.render import compact as compact_module
-from flexgs_edge.render import renderer as renderer_module
 from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.chunks import SourcePlanes
 from flexgs_edge.render.device_scene import DeviceScene
@@ -50,16 +50,6 @@ def cameras() -> list[Camera]:
         views.append(make_camera(width, height, rotation=rotation, translation=translation, name=f"v{seed}"))
     rotation, _ = look_from(1)
     return [*views, make_camera(40, 30, rotation=rotation, translation=(0.0, 0.0, -50.0), name="nothing")]
-
-
-@pytest.fixture
-def compact(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Views hold what they show, with room for few rows at first, in chunks of 64 rows."""
-    monkeypatch.setattr(Renderer, "_fits", lambda *_: False)
-    monkeypatch.setattr(compact_module, "CAPACITY_STEP", 32)
-    monkeypatch.setattr(renderer_module, "FIRST_SHARE", 100)
-    monkeypatch.setattr(device_scene, "COMPACT_ROWS", 64)
-    monkeypatch.setattr(DeviceScene, "_may_stay", lambda *_: False)
 
 
 def found_by(form: str, room: Scratch | None) -> dict[str, np.ndarray]:
@@ -107,6 +97,35 @@ def test_compact_views_give_the_same_bits(
     assert plain["removal"].any() and plain["hits"].any()
     for name, values in plain.items():
         np.testing.assert_array_equal(spilled[name], values, err_msg=name)
+
+
+def test_sums_of_a_chunk_take_the_place_of_a_view(
+    compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the limit, costs are measured and colours refitted, or a view is refused before, with a limit that does."""
+    monkeypatch.setattr(device_scene, "COMPACT_ROWS", 512)
+    planes, degrees = SCENE.read(slice(0, SCENE.count), list(FIELD)), np.full(SCENE.count, 2)
+    views, drawn = cameras()[:2], list[int]()
+    budget = large_budget()
+    drawer = Renderer(TwinBackend(budget), budget)
+    drawer.room, held = Scratch(tmp_path), budget.used
+    with TargetViews() as targets:
+        with drawer.load(SCENE) as scene:
+            for view, camera in enumerate(views):
+                targets.add(view, drawer.render_planes(scene, camera))
+        drawer.release()
+        for limit in range(250_000, 750_000, 20_011):
+            budget.limit = held + limit
+            try:
+                with drawer.load(SCENE, sums_room(SCENE.sh_degree), view_sums=2) as scene:
+                    measure_costs(drawer, scene, views)
+                refit_colours(drawer, planes, degrees, SCENE.origin, views, targets, 1)
+                drawn.append(limit)
+            except BudgetError as error:
+                assert not drawn and "a view" in str(error)
+            drawer.release()
+            assert budget.used == held
+    assert drawn and drawn[0] > 250_000
 
 
 @pytest.mark.parametrize("seed", range(4))

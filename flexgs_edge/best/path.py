@@ -137,7 +137,7 @@ class PrunePath:
         room_of_sums = sum_bytes(2) + moment_bytes(source.sh_degree)
         with self.renderer.load(source, room_of_sums, view_sums=2) as scene:
             self._parts = [self._measure(scene, some, keep=True) for some in self._views]
-            for view, camera in enumerate(self.between, start=len(self.cameras)):
+            for view, camera in enumerate(self.renderer.in_turn(scene, self.between), start=len(self.cameras)):
                 self.targets.add(view, self.renderer.render_planes(scene, camera))
         costs = RemovalCosts.of(self._parts, room)
         rows = room.copy(np.arange(len(self.rows)))

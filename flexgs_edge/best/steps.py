@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -55,7 +56,7 @@ def probe_slopes(
     count, some = planes["means"].shape[1], min(most, len(cameras))
     views = [cameras[i * len(cameras) // some] for i in range(some)]
     with renderer.load(MemorySource(planes, origin=origin)) as scene:
-        reference = [to_half(renderer.render(scene, camera)) for camera in views]
+        reference = [to_half(renderer.render(scene, camera)) for camera in renderer.in_turn(scene, views)]
     smallest = np.concatenate([scales.min(axis=0) for _, (scales,) in read_ahead(count, planes["log_scales"])])
     size = float(np.exp(np.median(smallest.astype(np.float64))))
     # Small enough that squared errors grow with squared steps, large enough to stand clear of half precision references.
@@ -68,7 +69,8 @@ def probe_slopes(
             part = dict(zip(CHANGES.values(), found, strict=True))
             put_rows(moved[field], rows, _on_trial_grid(part, kind, np.float32(trial[kind])))
         with renderer.load(MemorySource(moved, origin=origin)) as scene:
-            error = sum(_squared_error(renderer.render(scene, c), r) for c, r in zip(views, reference, strict=True))
+            images = map(partial(renderer.render, scene), renderer.in_turn(scene, views))
+            error = sum(_squared_error(image, drawn) for image, drawn in zip(images, reference, strict=True))
         per_row[kind] = error * len(cameras) / len(views) / (count * trial[kind] ** 2)
     return Slopes(per_row)
 

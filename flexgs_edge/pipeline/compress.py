@@ -204,8 +204,8 @@ class _Job:
         assert self.workspace is not None and self.views is not None and plan.target is not None
         assert decide is not None and report is not None
         renderer = self.workspace.renderer
-        self._look_at_original(decide, report, None)
         if self.format is not None:
+            self._look_at_original(decide, report, None)
             if options.resume or options.scratch is not None:
                 raise InputError(
                     f"--{'resume' if options.resume else 'scratch'} works on .fgs files alone: the search for a "
@@ -214,9 +214,9 @@ class _Job:
             return self._run_files(self.format, output, None, decide, report)
         poses = scored_poses(self.views.of(self.views.train), options, renderer, self.source)
         folder = Path(options.scratch or (tempfile.gettempdir() if output is None else output.parent))
-        self.room = renderer.room = room = choose_room(
-            renderer, self.source, poses.cameras, options, self.budget, folder
-        )
+        room = choose_room(renderer, self.source, poses.cameras, options, self.budget, folder)
+        self.room = renderer.room = room
+        self._look_at_original(decide, report, None)
         kept = None
         if options.resume:
             with self.clock.stage("fingerprint"):

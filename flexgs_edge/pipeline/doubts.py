@@ -49,7 +49,7 @@ class TrainingPoses:
     def fidelity(self, scene: DeviceScene) -> float | None:
         """Fidelity of `scene`, mean over the poses; `None` when all are identical."""
         found = []
-        for view, camera in enumerate(self._cameras):
+        for view, camera in enumerate(self._renderer.in_turn(scene, self._cameras)):
             inside = (slice(None), slice(camera.height), slice(camera.width))
             planes = self._renderer.render_planes(scene, camera)
             found.append(psnr(mse(planes[inside], self._targets[view][inside])))

@@ -155,9 +155,10 @@ class Judge:
     def estimate(self, scene: DeviceScene) -> Quality:
         """`compare` at a fourth of the pixels, for a search that only has to know where to look next."""
         found = []
-        for i, camera in enumerate(self.cameras):
-            image = self.renderer.render(scene, camera.every(ESTIMATE_STEP))
-            found.append(compare_view(camera.name, image, *self._coarse(i)))
+        few = [camera.every(ESTIMATE_STEP) for camera in self.cameras]
+        for i, camera in enumerate(self.renderer.in_turn(scene, few)):
+            image = self.renderer.render(scene, camera)
+            found.append(compare_view(self.cameras[i].name, image, *self._coarse(i)))
         return Quality(tuple(found), self.base_psnr)
 
     def _coarse(self, i: int) -> tuple[np.ndarray, np.ndarray | None, float | None]:

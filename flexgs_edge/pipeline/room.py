@@ -15,6 +15,7 @@ from flexgs_edge.mapped import READING_BYTES
 from flexgs_edge.pipeline.options import CompressOptions
 from flexgs_edge.refit import descent_bytes
 from flexgs_edge.render import Renderer, sum_bytes
+from flexgs_edge.render.ahead import AHEAD, AHEAD_ROW_BYTES
 from flexgs_edge.render.chunks import padded, plane_bytes, streamed_bytes
 from flexgs_edge.render.compact import FIRST_SHARE
 from flexgs_edge.render.device_scene import COMPACT_ROWS, MIN_CHUNK_ROWS, MOST_SUMS
@@ -84,7 +85,7 @@ def choose_room(
     room = Scratch(folder, budget.limit)
     budget.take("reading scratch files", READING_BYTES)  # as long as the process lives
     renderer.largest = largest
-    spooled = SPOOL_ROW_BYTES * rows * len(scored)
+    spooled = SPOOL_ROW_BYTES * rows * len(scored) + AHEAD * AHEAD_ROW_BYTES * rows
     LOG.info(
         "%d Gaussians and the path of their search need %s in memory, %s are free: they go to scratch files in %s "
         "(at most about %s; --scratch names another folder), %d rows at a time; %d bytes of each Gaussian and views of the "

@@ -76,8 +76,8 @@ def refit_colours(
         for part in progress.track(parts, "refitting colours", len(parts)):
             normal = ViewSums(renderer, scene, [normal_sums(renderer)])
             try:
-                for view in part:
-                    normal.add_view(renderer.residual_sums(scene, cameras[view], targets[view]), cameras[view])
+                for camera, view in zip(renderer.in_turn(scene, [cameras[view] for view in part]), part, strict=True):
+                    normal.add_view(renderer.residual_sums(scene, camera, targets[view]), camera)
                 for rows, (sums,) in normal.parts():
                     step_colours(planes, degrees, rows, sums.values(), bands)
             finally:

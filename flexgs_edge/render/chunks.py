@@ -49,6 +49,15 @@ class Chunk:
         """All planes."""
         return self.means, self.cov, self.log2_opacity, self.sh_dc, self.sh_rest
 
+    def project(
+        self, backend: Backend, camera: Any, base: int, inria_extent: int, antialiased: bool, out: tuple[Any, ...]
+    ) -> None:
+        """Splats, depth keys and bounds of tiles of its rows, in arrays that begin with row `base` of it."""
+        backend.launch(
+            "project", (self.stride,), self.count, self.stride, base, self.degree, inria_extent, int(antialiased), camera,
+            *self.arrays, *out,
+        )  # fmt: skip
+
     def release(self) -> None:
         """Free the planes."""
         for array in self.arrays:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
 from flexgs_edge.constants import CULLED
 from flexgs_edge.kernels import Backend
 from flexgs_edge.render.chunk_bounds import ChunkBounds
-from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.view_buffers import ViewBuffers, chunk_shapes
 
@@ -23,48 +22,86 @@ GROWTH = 1.1
 GUESS = 1.02
 """Room beyond what views have shown so far."""
 
+Splats = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Of some rows that a view shows: records [m, 16] f32, depth keys and bounds of tiles [m] u32, rows of the scene [m] u32."""
+
 
 def capacity(scene: DeviceScene, share: float) -> int:
     """Rows that a compact view of some of a scene's rows gets room for."""
     return min((int(share * scene.count) // CAPACITY_STEP + 1) * CAPACITY_STEP, scene.count)
 
 
+class CompactView(Protocol):
+    """A view that takes what it shows, chunk by chunk, in the order of rows."""
+
+    record: np.ndarray
+    """[32] f32, from `camera_record`."""
+    camera: Any
+    """The same on the backend."""
+    count: int
+    """Rows that it shows."""
+
+    def put(self, splats: Splats) -> bool:
+        """Append the rows that it shows of a chunk; False where there is no room for them."""
+
+
+class ShownView:
+    """The view whose turn it is, in its buffers."""
+
+    def __init__(self, backend: Backend, buffers: ViewBuffers, record: np.ndarray) -> None:
+        self._backend, self._buffers = backend, buffers
+        self.record, self.camera = record, buffers.camera
+        self.count = 0
+        self._rows: list[np.ndarray] = []
+
+    def put(self, splats: Splats) -> bool:
+        """See `CompactView.put`."""
+        at, buffers = self.count, self._buffers
+        records, keys, bounds, rows = splats
+        assert buffers.rows is not None
+        self.count += len(rows)
+        if self.count > buffers.rows:
+            return False
+        self._backend.write(buffers.records, records, 16 * at)
+        self._backend.write(buffers.keys, keys, at)
+        self._backend.write(buffers.bounds, bounds, at)
+        self._rows.append(rows)
+        return True
+
+    @property
+    def rows(self) -> np.ndarray:
+        """[count] u32, rows of the scene."""
+        return np.concatenate(self._rows) if self._rows else np.zeros(0, np.uint32)
+
+
 def fill_compact(
-    backend: Backend,
-    scene: DeviceScene,
-    buffers: ViewBuffers,
-    wanted: Callable[[ChunkBounds], bool],
-    project: Callable[[Chunk, tuple[Any, ...]], None],
-) -> tuple[np.ndarray, int]:
-    """Put the splats that a view shows into its buffers, in the order of their rows.
+    backend: Backend, scene: DeviceScene, out: tuple[Any, ...], views: Sequence[CompactView], inria_extent: int
+) -> int:
+    """Put the splats that each of some views shows where they belong, in the order of their rows.
 
     Parameters
     ----------
-    wanted : callable
-        Whether a chunk with such bounds may be seen.
-    project : callable
-        Projects a chunk to `buffers.chunk`.
+    out : tuple
+        `ViewBuffers.chunk`, which a chunk is projected to for one view after the other.
 
     Returns
     -------
-    tuple
-        [m] u32, rows shown, and up to which row of the scene: where they are more than there is room for, it stops.
+    int
+        Up to which row of the scene: where one of the views has no more room, it stops.
     """
-    assert buffers.rows is not None
-    found: list[np.ndarray] = []
-    at = 0
+
+    def wanted(bounds: ChunkBounds) -> bool:
+        return any(bounds.seen(view.record, bool(inria_extent)) for view in views)
+
     # Made once: fresh pages for every chunk took longer than the copies.
-    on_host = [np.empty(shape, dtype) for shape, dtype in chunk_shapes(buffers.chunk[0].shape[0]).values()]
+    on_host = [np.empty(shape, dtype) for shape, dtype in chunk_shapes(out[0].shape[0]).values()]
     for chunk in scene.chunks(wanted):
-        project(chunk, buffers.chunk)
-        splats, depths, counts = map(backend.read, buffers.chunk, (values[: chunk.count] for values in on_host))
-        shown = np.flatnonzero(depths != CULLED)
-        if at + len(shown) > buffers.rows:
-            return np.concatenate([*found, shown]), chunk.base + chunk.count
-        # `take`: a sixth of the time of `splats[shown]`.
-        backend.write(buffers.records, splats.take(shown, axis=0), 16 * at)
-        backend.write(buffers.keys, depths.take(shown), at)
-        backend.write(buffers.bounds, counts.take(shown), at)
-        found.append((chunk.base + shown).astype(np.uint32))
-        at += len(shown)
-    return np.concatenate(found) if found else np.zeros(0, np.uint32), scene.count
+        for view in views:
+            chunk.project(backend, view.camera, 0, inria_extent, scene.antialiased, out)
+            records, keys, bounds = map(backend.read, out, (values[: chunk.count] for values in on_host))
+            shown = np.flatnonzero(keys != CULLED)
+            rows = (chunk.base + shown).astype(np.uint32)
+            # `take`: a sixth of the time of `records[shown]`.
+            if not view.put((records.take(shown, axis=0), keys.take(shown), bounds.take(shown), rows)):
+                return chunk.base + chunk.count
+    return scene.count

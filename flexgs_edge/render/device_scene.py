@@ -89,6 +89,8 @@ class DeviceScene:
         self.targets = targets
         self.sum_bytes = sum_bytes
         self.view_sums = view_sums
+        self.changes = 0
+        """Times that its values have changed."""
         self.shown: int | None = None
         """Rows that a compact view has room for; None while views have room for all."""
         self._planes = planes
@@ -167,6 +169,7 @@ class DeviceScene:
         """From now on views have room for the rows that they show alone, for so many at first; the scene is streamed."""
         self.evict()
         self.shown = shown
+        self._least_rows = min(COMPACT_ROWS, max(self.count, 1))
         if self.give_way not in self._budget.reclaimers:
             self._budget.reclaimers.insert(0, self.give_way)  # before what had to be drawn
 
@@ -180,8 +183,7 @@ class DeviceScene:
         """Load the scene if it fits, else find the rows of a streamed chunk (fixed from then on)."""
         budget, later = self._budget, self.later_bytes
         if self.shown is not None:
-            self._rows = min(COMPACT_ROWS, max(self.count, 1))
-            self._streamed = True
+            self._rows, self._streamed = self._least_rows, True
             return
         most = min(CHUNK_ROWS, max(self.count, 1))
         whole = self.whole_bytes + later
@@ -284,6 +286,7 @@ class DeviceScene:
         """Read `sh_dc` or `sh_rest` again from a source whose values have changed (streamed chunks do so anyway)."""
         if not isinstance(self._planes, SourcePlanes):
             raise TypeError("only a scene with a source can be refreshed")
+        self.changes += 1
         for chunk in (*self._resident, *self._pinned.values()):
             names = [name for name in fields if FIELD[name].width(chunk.degree)]
             host = self._planes.source.read(slice(chunk.base, chunk.base + chunk.count), names)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,9 +14,9 @@ from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels import Backend
 from flexgs_edge.quantize import QuantizedScene
-from flexgs_edge.render.chunk_bounds import ChunkBounds
-from flexgs_edge.render.chunks import Chunk, QuantizedPlanes, SourcePlanes
-from flexgs_edge.render.compact import FIRST_SHARE, GROWTH, GUESS, capacity, fill_compact
+from flexgs_edge.render.ahead import ViewsAhead
+from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes
+from flexgs_edge.render.compact import FIRST_SHARE, GROWTH, GUESS, capacity
 from flexgs_edge.render.device_scene import MOST_SUMS, SUM_BYTES, DeviceScene
 from flexgs_edge.render.records import Statistics, camera_record
 from flexgs_edge.render.view_buffers import (
@@ -104,6 +103,7 @@ class Renderer:
         """[m] u32, rows of the scene that the sums of the view drawn last belong to; None: all of them."""
         self._share = 0.0
         """Largest part of its rows that a compact view has shown of a scene so far."""
+        self._ahead = ViewsAhead(backend)
         self._buffers: ViewBuffers | None = None
         self._aimed: Any = None
         self._words = np.empty(0, np.uint32)
@@ -163,11 +163,15 @@ class Renderer:
         """`render` of each view, in their order: here, or on the cluster."""
         cluster = self.ready_cluster
         if cluster is None or scene.source is None:
-            for camera in cameras:
+            for camera in self.in_turn(scene, cameras):
                 yield self.render(scene, camera)
             return
         for camera, planes in zip(cameras, cluster.planes(scene.source, cameras), strict=True):
             yield planes[:, : camera.height, : camera.width].transpose(1, 2, 0)
+
+    def in_turn(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[Camera]:
+        """The cameras, each when its view is to be drawn: what is known of those that come next saves reading the scene again."""
+        return self._ahead.in_turn(scene, cameras)
 
     def render_planes(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
         """`render` as the kernels leave it: [3, H, W] f32, both sides rounded up to whole tiles."""
@@ -308,38 +312,26 @@ class Renderer:
     def _project(self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers) -> None:
         self.backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
         for chunk in scene.chunks():
-            self._project_chunk(
-                scene, buffers.camera, chunk.base, chunk, (buffers.records, buffers.keys, buffers.bounds)
-            )
-
-    def _project_chunk(self, scene: DeviceScene, camera: Any, base: int, chunk: Chunk, out: tuple[Any, ...]) -> None:
-        self.backend.launch(
-            "project", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, self.inria_extent,
-            int(scene.antialiased), camera, chunk.means, chunk.cov, chunk.log2_opacity, chunk.sh_dc, chunk.sh_rest,
-            *out,
-        )  # fmt: skip
+            chunk.project(
+                self.backend, buffers.camera, chunk.base, self.inria_extent, scene.antialiased,
+                (buffers.records, buffers.keys, buffers.bounds),
+            )  # fmt: skip
 
     def _project_compact(
         self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers
     ) -> tuple[ViewBuffers, np.ndarray]:
         """Project, and keep what is shown: in order of rows, so that all that follows gives the same bits.
 
-        When a view shows more than there is room for, the buffers are made anew for what its first part lets expect.
+        When a view shows more than there is room for, the buffers are made anew: for as many as were counted, or as its first
+        part lets expect.
         """
-        record = camera_record(camera, scene.origin, self.near)
-
-        def wanted(bounds: ChunkBounds) -> bool:
-            return bounds.seen(record, bool(self.inria_extent))
-
         while True:
-            self.backend.write(buffers.camera, record)
-            project = partial(self._project_chunk, scene, buffers.camera, 0)
-            rows, seen = fill_compact(self.backend, scene, buffers, wanted, project)
-            assert buffers.rows is not None
-            if len(rows) <= buffers.rows:
-                self._share = max(self._share, len(rows) / max(scene.count, 1))
+            count, seen, rows = self._ahead.fill(scene, camera, buffers, self.room, self.near, self.inria_extent)
+            if rows is not None:
+                self._share = max(self._share, count / max(scene.count, 1))
                 return buffers, rows
-            scene.shown = capacity(scene, GROWTH * max(len(rows) / max(seen, 1), buffers.rows / scene.count))
+            assert buffers.rows is not None
+            scene.shown = capacity(scene, GROWTH * max(count / max(seen, 1), buffers.rows / scene.count))
             scene.drop_statistics()
             self.release()
             self._buffers = buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)

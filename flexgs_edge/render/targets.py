@@ -50,7 +50,9 @@ class TargetViews:
         """All views of `scene` from `cameras`."""
         views = cls(scratch)
         try:
-            for view, camera in enumerate(progress.track(cameras, "rendering the original", len(cameras))):
+            for view, camera in enumerate(
+                progress.track(renderer.in_turn(scene, cameras), "rendering the original", len(cameras))
+            ):
                 views.add(view, renderer.render_planes(scene, camera))
         except BaseException:
             views.close()

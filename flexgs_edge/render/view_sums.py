@@ -17,7 +17,7 @@ import numpy as np
 
 from flexgs_edge.cameras import Camera
 from flexgs_edge.kernels import Backend
-from flexgs_edge.render.chunks import Chunk
+from flexgs_edge.render.chunks import Chunk, padded
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.targets import to_half
@@ -92,7 +92,7 @@ class ViewSums:
         """
         renderer, scene, cluster = self._renderer, self._scene, self._renderer.ready_cluster
         if cluster is None or scene.source is None:
-            for view, camera in enumerate(cameras):
+            for view, camera in enumerate(renderer.in_turn(scene, cameras)):
                 self.add_view(view_sums(renderer, scene, kind, camera, targets and targets(view)), camera)
                 yield renderer.drawn_planes
             return
@@ -153,6 +153,7 @@ class ViewSums:
             for base, (count, parts) in self._held.items():
                 yield slice(base, base + count), parts
             return
+        self._make_room()
         for chunk in self._scene.chunks():
             parts = [make(chunk) for make in self._makers]
             try:
@@ -164,6 +165,14 @@ class ViewSums:
             finally:
                 for part in parts:
                     part.release()
+
+    def _make_room(self) -> None:
+        """Give up the buffers of the last view where the sums of a chunk have no place beside them."""
+        renderer, scene = self._renderer, self._scene
+        rows = padded(int(np.diff(scene.starts).max(initial=0)))
+        if renderer.budget.free < scene.least_chunk_bytes + rows * scene.sum_bytes:
+            scene.drop_statistics()
+            renderer.release()
 
     def release(self) -> None:
         """Free what is held."""
@@ -210,7 +219,7 @@ class _Spool:
         self._file: BinaryIO = room.file()
         self._disk = ThreadPoolExecutor(1, "sums")
         """Writes and reads it, one block at a time, while the next is gathered or the one before is added."""
-        self._end = 0
+        self._end = self._counted = 0
         # For each view: its camera, where it begins, and how many of its rows come before each chunk.
         self._views: list[tuple[Camera, int, np.ndarray]] = []
 
@@ -231,6 +240,8 @@ class _Spool:
             self._disk.submit(self._file.flush).result()
         except OSError as error:
             raise self._room.full(self._end - start, error) from error
+        self._room.count(self._end - self._counted)
+        self._counted = self._end
         self._views.append((camera, start, before))
 
     def replay(self, renderer: Renderer, scene: DeviceScene, chunk: Chunk) -> Iterator[Any]:
@@ -267,6 +278,7 @@ class _Spool:
         """Remove the file."""
         self._disk.shutdown()
         self._file.close()
+        self._room.count(-self._counted)
 
 
 def view_sums(renderer: Renderer, scene: DeviceScene, kind: str, camera: Camera, target: np.ndarray | None) -> Any:

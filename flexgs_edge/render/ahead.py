@@ -1,0 +1,168 @@
+"""Views that are projected before their turn, with the chunks that the view before them reads anyway.
+
+A scene in scratch files is then read once for several views: what a later one shows waits in a file, 76 bytes a splat, where
+reading its row again takes 236 (at SH degree 3), and as much for each row that the view does not show after all.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from functools import partial
+from typing import BinaryIO
+
+import numpy as np
+
+from flexgs_edge.cameras import Camera
+from flexgs_edge.kernels import Backend
+from flexgs_edge.render.compact import ShownView, Splats, fill_compact
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.records import camera_record
+from flexgs_edge.render.view_buffers import ViewBuffers
+from flexgs_edge.scratch import Room
+
+AHEAD = 3
+"""Views that are projected with the one whose turn it is."""
+AHEAD_ROW_BYTES = 4 * (16 + 1 + 1 + 1)
+"""Bytes of the scratch file for each splat that such a view shows: its record, depth, bound of tiles and row."""
+
+
+class WaitingView:
+    """A view that has not had its turn, in a scratch file; close when done."""
+
+    def __init__(self, backend: Backend, room: Room, camera: Camera, record: np.ndarray) -> None:
+        self.of = camera
+        self.record, self.camera = record, backend.array(record.shape, np.float32)
+        backend.write(self.camera, record)
+        self.count = 0
+        self._backend, self._room = backend, room
+        self._parts: list[int] = []
+        self._file: BinaryIO = room.file()
+        self._disk = ThreadPoolExecutor(1, "ahead")
+        self._written: Future[None] | None = None
+
+    def put(self, splats: Splats) -> bool:
+        """See `CompactView.put`: written while the next chunk is projected."""
+        self._wait()
+        if len(splats[0]):
+            self._written = self._disk.submit(self._move, os.pwritev, splats, self.count * AHEAD_ROW_BYTES)
+            self._parts.append(len(splats[0]))
+            self.count += len(splats[0])
+            self._room.count(AHEAD_ROW_BYTES * len(splats[0]))
+        return True
+
+    def fill(self, buffers: ViewBuffers) -> np.ndarray:
+        """Put all of it into the buffers of a view that has room for it: [count] u32, its rows."""
+        self._wait()
+        self._backend.mark()()  # the view before may still be drawn from these buffers
+        rows, at = np.empty(self.count, np.uint32), 0
+        with ExitStack() as maps:
+            arrays = buffers.records, buffers.keys, buffers.bounds
+            held = [*(maps.enter_context(self._backend.mapped(array)) for array in arrays), rows]
+            for count in self._parts:
+                self._move(os.preadv, [values[at : at + count] for values in held], at * AHEAD_ROW_BYTES)
+                at += count
+        return rows
+
+    def _move(self, call: Callable[..., int], parts: Sequence[np.ndarray], at: int) -> None:
+        left = [part.data.cast("B") for part in parts]
+        while left:
+            try:
+                done = call(self._file.fileno(), left, at)
+            except OSError as error:
+                raise self._room.full(sum(map(len, left)), error) from error
+            if not done:
+                raise EOFError(f"a scratch file ends at byte {at}")
+            at += done
+            while left and done >= len(left[0]):
+                done -= len(left.pop(0))
+            if left:
+                left[0] = left[0][done:]
+
+    def _wait(self) -> None:
+        written, self._written = self._written, None
+        if written is not None:
+            written.result()
+
+    def close(self) -> None:
+        """Remove the file."""
+        self._disk.shutdown()
+        self._file.close()
+        self._room.count(-AHEAD_ROW_BYTES * self.count)
+        self.camera.release()
+
+
+class ViewsAhead:
+    """Projects compact views, and those that come next where reading the scene costs more than to keep them."""
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend = backend
+        self._scene: tuple[DeviceScene, int] | None = None
+        """The scene whose views are drawn in turn, and its `changes` when these began to wait."""
+        self._coming: Sequence[Camera] = ()
+        self._waiting: list[WaitingView] = []
+
+    def in_turn(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[Camera]:
+        """The cameras, each when its view is to be drawn; what waits of others is given up."""
+        try:
+            for place, camera in enumerate(cameras):
+                if self._scene != (scene, scene.changes):
+                    self.drop()
+                    self._scene = scene, scene.changes
+                self._coming = cameras[place + 1 : place + 1 + AHEAD]
+                yield camera
+        finally:
+            self.drop()
+
+    def fill(
+        self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers, room: Room, near: float, inria_extent: int
+    ) -> tuple[int, int, np.ndarray | None]:
+        """Put the splats that a view shows into its buffers.
+
+        Returns
+        -------
+        tuple
+            How many there are, up to which row of the scene, and their rows ([m] u32): None where the buffers have no room.
+        """
+        assert buffers.rows is not None
+        record = camera_record(camera, scene.origin, near)
+        self._backend.write(buffers.camera, record)
+        project = partial(fill_compact, self._backend, scene, buffers.chunk, inria_extent=inria_extent)
+        in_turn = self._scene == (scene, scene.changes)
+        waiting = next((view for view in self._waiting if view.of is camera), None) if in_turn else None
+        if waiting is None:
+            may_wait = in_turn and room.spills and scene.source is not None and hasattr(os, "pwritev")
+            coming = [self._wait(later, scene, room, near) for later in self._coming] if may_wait else []
+            shown = ShownView(self._backend, buffers, record)
+            seen = project((shown, *coming))
+            if shown.count <= buffers.rows:
+                return shown.count, seen, shown.rows
+            if not may_wait:
+                return shown.count, seen, None
+            # How many there are tells a pass that has room for all of them.
+            waiting, *coming = (self._wait(later, scene, room, near) for later in (camera, *self._coming))
+            project((waiting, *coming))
+        if waiting.count > buffers.rows:
+            return max(view.count for view in self._waiting), scene.count, None
+        self._waiting.remove(waiting)
+        try:
+            return waiting.count, scene.count, waiting.fill(buffers)
+        finally:
+            waiting.close()
+
+    def _wait(self, camera: Camera, scene: DeviceScene, room: Room, near: float) -> WaitingView:
+        """A view that waits from now on, in place of what waited of it."""
+        for view in [view for view in self._waiting if view.of is camera]:
+            self._waiting.remove(view)
+            view.close()
+        self._waiting.append(WaitingView(self._backend, room, camera, camera_record(camera, scene.origin, near)))
+        return self._waiting[-1]
+
+    def drop(self) -> None:
+        """Give up what waits."""
+        self._scene, self._coming = None, ()
+        for view in self._waiting:
+            view.close()
+        self._waiting = []
