@@ -351,8 +351,9 @@ class Renderer:
     def _view_buffers(self, scene: DeviceScene, camera: Camera) -> ViewBuffers:
         if self._buffers is None or self._buffers.key != view_key(scene, camera):
             self.release()
-            if scene.shown is None and self._may_be_compact(scene) and not self._fits(scene, camera):
-                scene.be_compact(capacity(scene, max(1 / FIRST_SHARE, GUESS * self._share)))
+            shown = capacity(scene, max(1 / FIRST_SHARE, GUESS * self._share))
+            if scene.shown is None and self._may_be_compact(scene, camera, shown) and not self._fits(scene, camera):
+                scene.be_compact(shown)
             try:
                 self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
             except BudgetError:
@@ -363,9 +364,14 @@ class Renderer:
                 self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
         return self._buffers
 
-    def _may_be_compact(self, scene: DeviceScene) -> bool:
+    def _may_be_compact(self, scene: DeviceScene, camera: Camera, shown: int) -> bool:
         """Sums over views that take more than a view's own statistics need a place, and stay where the first view put them."""
-        return not scene.statistics and (self.room.spills or scene.sum_bytes <= SUM_BYTES)
+        if scene.statistics or self.room.spills:
+            return not scene.statistics
+        # What so many rows less take must be more than what chunks of that size take.
+        saved = view_bytes(self.backend, scene.count, camera) - view_bytes(self.backend, shown, camera)
+        saved += scene.later_bytes - scene.shown_bytes * shown
+        return scene.sum_bytes <= SUM_BYTES and saved > scene.compact_chunk_bytes - scene.least_chunk_bytes
 
     def _fits(self, scene: DeviceScene, camera: Camera) -> bool:
         """Whether a view has room for all rows of the scene, beside what sums over views will take."""
