@@ -205,12 +205,12 @@ class _Job:
         assert decide is not None and report is not None
         renderer = self.workspace.renderer
         if self.format is not None:
-            self._look_at_original(decide, report, None)
             if options.resume or options.scratch is not None:
                 raise InputError(
                     f"--{'resume' if options.resume else 'scratch'} works on .fgs files alone: the search for a "
                     f"{self.format.suffix} is in memory and in one go; leave it out"
                 )
+            self._look_at_original(decide, report, None)
             return self._run_files(self.format, output, None, decide, report)
         poses = scored_poses(self.views.of(self.views.train), options, renderer, self.source)
         folder = Path(options.scratch or (tempfile.gettempdir() if output is None else output.parent))

@@ -18,14 +18,14 @@ import numpy as np
 from flexgs_edge.cameras import Camera
 from flexgs_edge.kernels import Backend
 from flexgs_edge.render.compact import ShownView, Splats, fill_compact
-from flexgs_edge.render.device_scene import SPLAT_BYTES, DeviceScene
+from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.records import camera_record
-from flexgs_edge.render.view_buffers import ViewBuffers
+from flexgs_edge.render.view_buffers import ViewBuffers, chunk_shapes, shapes_bytes
 from flexgs_edge.scratch import Room
 
 AHEAD = 3
 """Views that are projected with the one whose turn it is."""
-AHEAD_ROW_BYTES = SPLAT_BYTES + 4
+AHEAD_ROW_BYTES = shapes_bytes(chunk_shapes(1)) + 4
 """Bytes of the scratch file for each splat that such a view shows, the number of its row among them."""
 
 

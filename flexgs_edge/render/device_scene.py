@@ -37,10 +37,6 @@ AHEAD_SHARE = 8
 """The same of a second chunk that is loaded ahead, whose memory is free again when a view is projected."""
 
 
-SPLAT_BYTES = 4 * (16 + 1 + 1)
-"""Bytes a row that a chunk of a compact scene is projected to: record, depth, bound of tiles."""
-
-
 def sum_bytes(planes: int) -> int:
     """Bytes a row of so many planes of 64-bit sums, and of the hits that go with a single one."""
     return 8 * planes + 4 * (planes == 1)
@@ -124,10 +120,14 @@ class DeviceScene:
         return padded(self._least_rows) * self._chunk_row_bytes
 
     @property
+    def compact_rows(self) -> int:
+        """Rows that a chunk of it has room for once it is compact."""
+        return padded(min(COMPACT_ROWS, max(self.count, 1)))
+
+    @property
     def compact_chunk_bytes(self) -> int:
-        """Bytes of a chunk of it once it is compact, with what it is projected to."""
-        rows = padded(min(COMPACT_ROWS, max(self.count, 1)))
-        return rows * (self._chunk_row_bytes + SPLAT_BYTES)
+        """Bytes of such a chunk."""
+        return self.compact_rows * self._chunk_row_bytes
 
     @property
     def whole_bytes(self) -> int:

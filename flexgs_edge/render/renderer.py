@@ -23,6 +23,8 @@ from flexgs_edge.render.view_buffers import (
     SORT_DIGIT_BITS,
     SORT_DIGITS,
     ViewBuffers,
+    chunk_shapes,
+    shapes_bytes,
     target_bytes,
     view_bytes,
     view_key,
@@ -365,13 +367,16 @@ class Renderer:
         return self._buffers
 
     def _may_be_compact(self, scene: DeviceScene, camera: Camera, shown: int) -> bool:
-        """Sums over views that take more than a view's own statistics need a place, and stay where the first view put them."""
+        """Whether there is a place for sums over views that hold `shown` rows; in memory, whether that takes less at all.
+
+        Sums that take more than a view's own statistics need a file, and all stay where the first view put them.
+        """
         if scene.statistics or self.room.spills:
             return not scene.statistics
-        # What so many rows less take must be more than what chunks of that size take.
         saved = view_bytes(self.backend, scene.count, camera) - view_bytes(self.backend, shown, camera)
         saved += scene.later_bytes - scene.shown_bytes * shown
-        return scene.sum_bytes <= SUM_BYTES and saved > scene.compact_chunk_bytes - scene.least_chunk_bytes
+        chunks = scene.compact_chunk_bytes + shapes_bytes(chunk_shapes(scene.compact_rows)) - scene.least_chunk_bytes
+        return scene.sum_bytes <= SUM_BYTES and saved > chunks
 
     def _fits(self, scene: DeviceScene, camera: Camera) -> bool:
         """Whether a view has room for all rows of the scene, beside what sums over views will take."""

@@ -10,8 +10,7 @@ from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.cameras import Camera
 from flexgs_edge.constants import TILE
 from flexgs_edge.kernels import Backend
-from flexgs_edge.render.chunks import padded
-from flexgs_edge.render.device_scene import COMPACT_ROWS, DeviceScene
+from flexgs_edge.render.device_scene import DeviceScene
 
 SORT_DIGIT_BITS = 11
 SORT_DIGITS = 1 << SORT_DIGIT_BITS
@@ -107,7 +106,7 @@ class ViewBuffers:
             f"a view of {count} Gaussians" if rows is None else f"a view that shows {count} of {scene.count} Gaussians"
         )
         if rows is not None:
-            shapes |= chunk_shapes(padded(min(COMPACT_ROWS, scene.count)))
+            shapes |= chunk_shapes(scene.compact_rows)
             later += scene.shown_bytes * rows - scene.later_bytes
             size = shapes_bytes(shapes)
         budget.require(f"{what} at {width}x{height}", size + later)
