@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import struct
 
-from flexgs_edge.codec import container, container2
+from flexgs_edge.codec import container as v1
+from flexgs_edge.codec import container2 as v2
 from flexgs_edge.codec.grid_source import GridSource
 from flexgs_edge.codec.layout import Header, Section
 from flexgs_edge.codec.layout2 import GridHeader
@@ -21,7 +22,7 @@ def file_version(path: str | os.PathLike[str]) -> int:
             start = file.read(10)
     except OSError as error:
         raise InputError(f"{path}: cannot read it ({error.strerror})") from error
-    return 2 if start == MAGIC + struct.pack("<H", container2.VERSION) else 1
+    return 2 if start == MAGIC + struct.pack("<H", v2.VERSION) else 1
 
 
 def open_fgs(path: str | os.PathLike[str]) -> FgsSource | GridSource:
@@ -31,10 +32,10 @@ def open_fgs(path: str | os.PathLike[str]) -> FgsSource | GridSource:
 
 def read_header(path: str | os.PathLike[str]) -> Header | GridHeader:
     """The checked header of a file; no values are read."""
-    return container2.GridContainer(path).header if file_version(path) == 2 else container.read_header(path)
+    return v2.GridContainer(path).header if file_version(path) == 2 else v1.read_header(path)
 
 
 def verify(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Section]:
-    """Check every byte of a file: see `container.verify`."""
-    check = container2.verify_grid if file_version(path) == 2 else container.verify
+    """Check every byte of a file: see `v1.verify`."""
+    check = v2.verify_grid if file_version(path) == 2 else v1.verify
     return check(path, raise_errors)
