@@ -18,13 +18,17 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, backend_of, check, parse
-from flexgs_edge.codec import GridSource, channel_bytes, coded_size, verify, write_grid
-from flexgs_edge.codec.coder import encode_grid
-from flexgs_edge.grid import Steps, from_grid, to_grid
-from flexgs_edge.pipeline.decompress import decompress
-from flexgs_edge.pipeline.grid_coder import bit_model
+from flexgs_edge.codec.open_fgs import verify
+from flexgs_edge.codec.v2.container import channel_bytes, coded_size, write_grid
+from flexgs_edge.codec.v2.encode import encode_grid
+from flexgs_edge.codec.v2.grid_source import GridSource
+from flexgs_edge.commands.decompress import decompress
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.grid.values import from_grid
+from flexgs_edge.io.ply import PlySource
+from flexgs_edge.methods.best.grid_coder import bit_model
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.scene.ply import PlySource
 
 KEPT = 0.47
 """Share of the scene's rows that is taken: the largest and least transparent."""

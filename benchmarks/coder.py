@@ -15,23 +15,28 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, check
-from flexgs_edge.best.steps import CHROMA
-from flexgs_edge.budget import MemoryBudget
-from flexgs_edge.codec import GridSource, channel_bytes, write_grid
+from flexgs_edge.codec.v2.container import channel_bytes, write_grid
+from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.constants import DEFAULT_NEAR
-from flexgs_edge.grid import GridScene, Steps, from_grid, recolour, to_grid
-from flexgs_edge.kernels import open_backend
-from flexgs_edge.pipeline.companions import companions_of
-from flexgs_edge.pipeline.inputs import find_views, load_scene, resolve_drawing
-from flexgs_edge.pipeline.judge import Judge
-from flexgs_edge.pipeline.options import ViewOptions
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.to_grid import recolour, to_grid
+from flexgs_edge.grid.values import from_grid
+from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.methods.best.choose_steps import CHROMA
+from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.progress import Progress
-from flexgs_edge.refit import refit_colours
-from flexgs_edge.render import Renderer
-from flexgs_edge.render.quality import Quality
-from flexgs_edge.render.targets import TargetViews
+from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.companions import companions_of
+from flexgs_edge.run.inputs import load_scene, resolve_drawing
+from flexgs_edge.run.judge import Judge
+from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.references import TargetViews
 
 STEPS = (0.002, 0.2, 0.04, 0.3, 0.06)
 """Of position, scale, rotation, opacity and constant colour, in fox's units."""

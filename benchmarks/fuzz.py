@@ -31,11 +31,14 @@ import numpy as np
 
 from benchmarks.damage import mutate_bytes, mutate_json, mutate_sealed, mutate_text
 from benchmarks.harness import ROOT
-from flexgs_edge.budget import peak_rss
-from flexgs_edge.cameras import read_cameras
-from flexgs_edge.codec import open_fgs, read_header, verify
+from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.codec.open_fgs import open_fgs, read_header, verify
 from flexgs_edge.errors import FlexGSError, FormatError
-from flexgs_edge.scene import FIELDS, PlySource, SceneSource, check_scene
+from flexgs_edge.io.ply import PlySource
+from flexgs_edge.memory.process import peak_rss
+from flexgs_edge.scene.check import check_scene
+from flexgs_edge.scene.fields import FIELDS
+from flexgs_edge.scene.source import SceneSource
 
 SEEDS = ROOT / "tests" / "fuzz" / "seeds"
 """Small valid files that mutations start from."""

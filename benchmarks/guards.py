@@ -18,17 +18,18 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, backend_of, parse
-from flexgs_edge.cameras import Camera
+from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.made import at_distance, between
-from flexgs_edge.codec import open_fgs
-from flexgs_edge.pipeline.companions import companions_of
-from flexgs_edge.pipeline.compress import compress
-from flexgs_edge.pipeline.inputs import find_views, load_scene, resolve_drawing
-from flexgs_edge.pipeline.options import CompressOptions
-from flexgs_edge.render import Renderer
-from flexgs_edge.render.depths import visible_depths
-from flexgs_edge.render.quality import mean_psnr, mse, psnr
-from flexgs_edge.scene import SceneSource
+from flexgs_edge.codec.open_fgs import open_fgs
+from flexgs_edge.commands.compress import compress
+from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.companions import companions_of
+from flexgs_edge.run.inputs import load_scene, resolve_drawing
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.view_set import find_views
+from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.views.depths import visible_depths
 
 FACTORS = (0.25, 0.35, 0.5, 0.71, 1.0, 1.41, 2.0, 2.83, 4.0)
 

@@ -15,8 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flexgs_edge.budget import MemoryBudget, peak_rss
-from flexgs_edge.kernels import Backend, open_backend
+from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.memory.process import peak_rss
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = {

@@ -19,19 +19,20 @@ from unittest import mock
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, check
-from flexgs_edge.best.search import RateSearch, RateStep
-from flexgs_edge.cameras import Camera, read_cameras
+from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.inria import inria_json
+from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.commands.compress import compress
 from flexgs_edge.constants import DEFAULT_NEAR
-from flexgs_edge.pipeline.best import grid_search
-from flexgs_edge.pipeline.compress import compress
-from flexgs_edge.pipeline.grid_coder import GridCoder
-from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.io.ply import PlySource, write_ply
+from flexgs_edge.methods.best.candidates import RateStep
+from flexgs_edge.methods.best.grid_coder import GridCoder
+from flexgs_edge.methods.best.grid_search import RateSearch
+from flexgs_edge.methods.best.method import grid_search
 from flexgs_edge.progress import Progress
-from flexgs_edge.scene import write_ply
-from flexgs_edge.scene.ply import PlySource
+from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.study.cliffs.similarity import Similarity
+from flexgs_edge.studies.stability.moved_scene import Similarity
 
 LEAST_SAME, MOST_BYTES = 0.99, 0.02
 """Share of the kept Gaussians that must be the same, and difference of the bytes that is allowed."""
@@ -77,7 +78,7 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
 
         return recorded
 
-    with mock.patch("flexgs_edge.pipeline.compress.grid_search", recording):
+    with mock.patch("flexgs_edge.commands.compress.grid_search", recording):
         result = compress(path, output, method="best", near=near, force=True, progress=progress, **words)
     assert result.search is not None
     chosen = steps[result.search.steps.index(result.search.chosen)]

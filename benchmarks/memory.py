@@ -20,8 +20,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.harness import ROOT, check
-from flexgs_edge.budget import parse_size
-from flexgs_edge.study.charts import LineChart, Series, picture
+from flexgs_edge.report.plots import LineChart, Series, picture
+from flexgs_edge.units import parse_size
 
 CSV, PNG = ROOT / "docs" / "memory.csv", ROOT / "docs" / "images" / "memory.png"
 COLUMNS = (

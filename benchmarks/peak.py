@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, backend_of, check, parse
-from flexgs_edge.cameras import read_cameras
+from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.constants import TILE
+from flexgs_edge.io.ply import PlySource
+from flexgs_edge.kernels.cl_sources import load_source
 from flexgs_edge.kernels.opencl import OpenCLBackend
-from flexgs_edge.kernels.source import load_source
-from flexgs_edge.render import Renderer, Statistics
-from flexgs_edge.scene.ply import PlySource
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.statistics import Statistics
 
 SPLATS, BLOCKS, ROUNDS, ITEMS = 8, 8, 100_000, 16
 """Eight blocks that do not wait for each other (four or one: 2.5 and 2.1 instead of 3.0 G lanes/s), for a twentieth of a second

@@ -11,12 +11,12 @@ from collections import defaultdict
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, backend_of, check, parse
-from flexgs_edge.codec.source import QuantizedSource
-from flexgs_edge.prune import nonzero_sh
-from flexgs_edge.quantize import QuantizedScene, quantize_scene
-from flexgs_edge.render import Renderer
+from flexgs_edge.codec.v1.packed_source import QuantizedSource
+from flexgs_edge.io.ply import PlySource
+from flexgs_edge.methods.paper.prune import nonzero_sh
+from flexgs_edge.packed.quantize import QuantizedScene, quantize_scene
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.scene.ply import PlySource
 from flexgs_edge.scene.source import MemorySource
 
 LARGE = 1_000_000

@@ -20,15 +20,17 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, check
-from flexgs_edge.budget import MemoryBudget
-from flexgs_edge.cameras import Camera, read_cameras, split_views
+from flexgs_edge.cameras.camera import Camera, split_views
+from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.constants import ALPHA_MAX, ALPHA_MIN, FIXED_ERROR, TILE, TRANSMITTANCE_MIN
-from flexgs_edge.kernels import open_backend
-from flexgs_edge.kernels.source import KERNEL_DIR_VARIABLE, kernel_dir
+from flexgs_edge.io.ply import PlySource
+from flexgs_edge.kernels.cl_sources import KERNEL_DIR_VARIABLE, kernel_dir
+from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.progress import Progress
-from flexgs_edge.render import DeviceScene, Renderer
-from flexgs_edge.scene.ply import PlySource
-from flexgs_edge.score.removal import measure_costs
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.renderer import Renderer
 
 ROUNDING = 2.0**-22
 """A pixel's difference from the image without a Gaussian is off by about this times alpha / (1 - alpha): float32 rounds what

@@ -11,15 +11,17 @@ from collections import defaultdict
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, backend_of, check, parse
-from flexgs_edge.bitspec import PAPER
-from flexgs_edge.pipeline.evaluator import SceneEvaluator
-from flexgs_edge.pipeline.inputs import find_views, load_scene, resolve_drawing
-from flexgs_edge.pipeline.judge import Judge
-from flexgs_edge.pipeline.options import ViewOptions
-from flexgs_edge.prune import Choice, nonzero_sh, order_from_scores
-from flexgs_edge.quantize import quantized_bytes
-from flexgs_edge.render import Renderer
-from flexgs_edge.scene import find_companions
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.io.model_folder import find_companions
+from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
+from flexgs_edge.packed.bitspec import PAPER
+from flexgs_edge.packed.quantize import quantized_bytes
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.inputs import load_scene, resolve_drawing
+from flexgs_edge.run.judge import Judge
+from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.view_set import find_views
 
 CHOICE = Choice(400, 400)
 """Where the search begins: 40 % of the Gaussians pruned, a further 40 % without SH."""

@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, backend_of, check, parse
-from flexgs_edge.budget import MemoryBudget
-from flexgs_edge.cameras import read_cameras
-from flexgs_edge.kernels import open_backend
-from flexgs_edge.render import Renderer
-from flexgs_edge.scene.ply import PlySource
+from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.io.ply import PlySource
+from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.render.renderer import Renderer
 
 
 def main() -> None:

@@ -15,13 +15,16 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.harness import SCENES, Bench, backend_of, check, parse, run_module
-from flexgs_edge.cameras import Camera, read_cameras, split_views
-from flexgs_edge.refit.descent import Descent
-from flexgs_edge.refit.distil import rates_for
-from flexgs_edge.render import DeviceScene, Renderer, Statistics
+from flexgs_edge.cameras.camera import Camera, split_views
+from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.io.ply import PlySource
+from flexgs_edge.methods.best.refit.descent import Descent
+from flexgs_edge.methods.best.refit.distil import rates_for
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.scene.ply import PlySource
-from flexgs_edge.study.timing import STAGES
+from flexgs_edge.studies.speed.timing import STAGES
 
 VIEWS = 10
 

@@ -19,44 +19,46 @@ from typing import TYPE_CHECKING, Any
 from flexgs_edge._version import __version__
 
 if TYPE_CHECKING:
-    from flexgs_edge.cameras import Camera, read_cameras
-    from flexgs_edge.device.select import list_devices
+    from flexgs_edge.cameras.camera import Camera
+    from flexgs_edge.cameras.read import read_cameras
+    from flexgs_edge.commands.compress import compress
+    from flexgs_edge.commands.decompress import decompress
+    from flexgs_edge.commands.evaluate import evaluate
+    from flexgs_edge.commands.info import info
+    from flexgs_edge.commands.render import render_views
+    from flexgs_edge.commands.score import score_gaussians
+    from flexgs_edge.commands.synth import synth
+    from flexgs_edge.commands.trim import trim
+    from flexgs_edge.commands.verify import verify
+    from flexgs_edge.commands.worth import worth
     from flexgs_edge.errors import BudgetError, DeviceError, FlexGSError, FormatError, InputError, TargetError
-    from flexgs_edge.pipeline.compress import compress
-    from flexgs_edge.pipeline.contents import verify
-    from flexgs_edge.pipeline.decompress import decompress
-    from flexgs_edge.pipeline.evaluate import evaluate
-    from flexgs_edge.pipeline.info import info
-    from flexgs_edge.pipeline.inputs import read_scene
-    from flexgs_edge.pipeline.options import CompressOptions, ViewOptions
-    from flexgs_edge.pipeline.render import render_views
-    from flexgs_edge.pipeline.score import score_gaussians
-    from flexgs_edge.pipeline.synth import synth
-    from flexgs_edge.pipeline.trim import trim
-    from flexgs_edge.pipeline.worth import worth
+    from flexgs_edge.io.ply import write_ply
+    from flexgs_edge.kernels.choose_device import list_devices
     from flexgs_edge.progress import Progress
-    from flexgs_edge.scene import SceneSource, write_ply
+    from flexgs_edge.run.inputs import read_scene
+    from flexgs_edge.run.options import CompressOptions, ViewOptions
+    from flexgs_edge.scene.source import SceneSource
 
 _HOMES = {
-    "compress": "pipeline.compress",
-    "decompress": "pipeline.decompress",
-    "render_views": "pipeline.render",
-    "evaluate": "pipeline.evaluate",
-    "score_gaussians": "pipeline.score",
-    "info": "pipeline.info",
-    "verify": "pipeline.contents",
-    "trim": "pipeline.trim",
-    "synth": "pipeline.synth",
-    "worth": "pipeline.worth",
-    "list_devices": "device.select",
-    "read_scene": "pipeline.inputs",
-    "read_cameras": "cameras",
-    "write_ply": "scene",
-    "CompressOptions": "pipeline.options",
-    "ViewOptions": "pipeline.options",
-    "Camera": "cameras",
+    "compress": "commands.compress",
+    "decompress": "commands.decompress",
+    "render_views": "commands.render",
+    "evaluate": "commands.evaluate",
+    "score_gaussians": "commands.score",
+    "info": "commands.info",
+    "verify": "commands.verify",
+    "trim": "commands.trim",
+    "synth": "commands.synth",
+    "worth": "commands.worth",
+    "list_devices": "kernels.choose_device",
+    "read_scene": "run.inputs",
+    "read_cameras": "cameras.read",
+    "write_ply": "io.ply",
+    "CompressOptions": "run.options",
+    "ViewOptions": "run.options",
+    "Camera": "cameras.camera",
     "Progress": "progress",
-    "SceneSource": "scene",
+    "SceneSource": "scene.source",
     "FlexGSError": "errors",
     "InputError": "errors",
     "FormatError": "errors",

@@ -1,6 +1,6 @@
 """Every number that kernels, twins and formats share, once, with its reason and origin.
 
-Every number is printed into the OpenCL programs, rounded to float32 once (`flexgs_edge.kernels.source`), and a test reads the
+Every number is printed into the OpenCL programs, rounded to float32 once (`flexgs_edge.kernels.cl_sources`), and a test reads the
 values back from the device.
 """
 

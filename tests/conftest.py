@@ -10,11 +10,12 @@ from typing import Any
 
 import pytest
 
-from flexgs_edge.best.effort import EFFORTS
-from flexgs_edge.render import Renderer, device_scene
+from flexgs_edge.methods.best.effort import EFFORTS
 from flexgs_edge.render import compact as compact_module
+from flexgs_edge.render import device_scene
 from flexgs_edge.render import renderer as renderer_module
 from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.renderer import Renderer
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

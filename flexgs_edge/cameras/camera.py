@@ -147,3 +147,8 @@ def limit_width(cameras: Sequence[Camera], max_width: int) -> tuple[list[Camera]
     changed = sum(camera.width > max_width for camera in cameras)
     views = "1 view" if changed == 1 else f"{changed} views"
     return limited, f"{views} scaled down to {max_width} pixels wide" if changed else None
+
+
+def largest_of(cameras: Sequence[Camera]) -> Camera:
+    """The camera with most pixels."""
+    return max(cameras, key=lambda camera: camera.width * camera.height)

@@ -16,6 +16,7 @@ from flexgs_edge.errors import InputError
 if TYPE_CHECKING:
     from PIL import Image
 
+
 SUFFIXES = (".jpg", ".jpeg", ".png")
 _SHOWN = 5
 # What Pillow raises for damaged files, beside OSError (its base for truncated and unknown ones).

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk
 
 
-@click.command(cls=words.SectionCommand)
+@click.command(cls=shared_options.SectionCommand)
 @click.argument("input", metavar="INPUT", type=click.Path())
-@words.option(
+@shared_options.option(
     "Output", "-o", "--output", metavar="OUT", required=True, help="File to write: .ply, .spz, .sog or .compressed.ply."
 )
-@words.option(
+@shared_options.option(
     "Run",
     "--device",
     metavar="SPEC",
     help="What decodes a large .fgs of --method best: an OpenCL processor (its number, part of its name, or cpu), or numpy: the "
     "same bits, four times slower. Default: the first CPU, where there are enough Gaussians to make up for opening it.",
 )
-@words.memory_option
-@words.force_option
-@words.json_option
-@words.talk_options
+@shared_options.memory_option
+@shared_options.force_option
+@shared_options.json_option
+@shared_options.talk_options
 def command(
     input: str,
     output: str,
@@ -46,9 +46,9 @@ def command(
       flexgs-edge decompress scene.fgs -o scene.spz
       flexgs-edge decompress scene.sog -o scene.ply
     """
-    words.start(quiet, json_path, force)
-    from flexgs_edge.pipeline.decompress import decompress
+    talk.start(quiet, json_path, force)
+    from flexgs_edge.commands.decompress import decompress
     from flexgs_edge.report.summary import decompress_text
 
     result = decompress(input, output, force, memory_limit, device)
-    words.emit(decompress_text(result), result.to_json(), json_path, force)
+    talk.emit(decompress_text(result), result.to_json(), json_path, force)

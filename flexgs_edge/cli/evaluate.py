@@ -6,30 +6,30 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk
 
 
-@click.command(cls=words.SectionCommand)
-@words.scene_argument
-@words.option(
+@click.command(cls=shared_options.SectionCommand)
+@shared_options.scene_argument
+@shared_options.option(
     "Quality",
     "--against",
     metavar="REF",
     required=True,
     help="The original: any scene, such as its .ply or model folder.",
 )
-@words.option(
+@shared_options.option(
     "Quality",
     "--lpips",
     is_flag=True,
     help="Also measure LPIPS (AlexNet), about 3 s a megapixel: needs flexgs-edge[lpips] and AlexNet's weights, 244 MB.",
 )
-@words.base_psnr_option
-@words.report_option
-@words.photos_options
-@words.drawing_options
-@words.drop_invalid_option
-@words.run_options
+@shared_options.base_psnr_option
+@shared_options.report_option
+@shared_options.photos_options
+@shared_options.drawing_options
+@shared_options.drop_invalid_option
+@shared_options.run_options
 def command(
     input: str,
     against: str,
@@ -56,10 +56,10 @@ def command(
           figures and pictures in page/index.html
       flexgs-edge evaluate scene.fgs --against point_cloud.ply --lpips
     """
-    progress = words.start(quiet, json_path, force, report)
-    from flexgs_edge.pipeline.evaluate import evaluate
-    from flexgs_edge.pipeline.options import ViewOptions
+    progress = talk.start(quiet, json_path, force, report)
+    from flexgs_edge.commands.evaluate import evaluate
     from flexgs_edge.report.summary import evaluate_text
+    from flexgs_edge.run.options import ViewOptions
 
     result = evaluate(input, against, ViewOptions(**options), base_psnr, progress, report, force, lpips)
-    words.emit(evaluate_text(result), result.to_json(), json_path, force)
+    talk.emit(evaluate_text(result), result.to_json(), json_path, force)

@@ -7,29 +7,29 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk
 from flexgs_edge.errors import InputError
 
 
-@click.command(cls=words.SectionCommand)
+@click.command(cls=shared_options.SectionCommand)
 @click.argument("file", metavar="FILE", type=click.Path())
-@words.option(
+@shared_options.option(
     "Errors",
     "--errors",
     is_flag=True,
     help="Also measure what each channel and SH degree of a .fgs is worth: the bytes saved and the quality lost with one bit "
     "less of it, and without it. Takes as long as drawing the views some 15 times.",
 )
-@words.option(
+@shared_options.option(
     "Errors",
     "--picture",
     metavar="FILE",
     help="Draw what --errors measures as a .png or .svg (needs pip install 'flexgs-edge[charts]').",
 )
-@words.cameras_option
-@words.holdout_option
-@words.drawing_options
-@words.run_options
+@shared_options.cameras_option
+@shared_options.holdout_option
+@shared_options.drawing_options
+@shared_options.run_options
 def command(
     file: str, errors: bool, picture: str | None, force: bool, json_path: str | None, quiet: bool, **options: Any
 ) -> None:
@@ -49,27 +49,27 @@ def command(
       flexgs-edge info scene.fgs --errors --picture scene.png
           what each channel is worth
     """
-    progress = words.start(quiet, json_path, force)
+    progress = talk.start(quiet, json_path, force)
     if not errors:
         context = click.get_current_context()
         for name in ("picture", *options):
             if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
                 word = "--" + name.replace("_", "-")
                 raise InputError(f"{word} is for --errors: add --errors, or leave {word} out")
-        from flexgs_edge.pipeline.info import info, info_text
+        from flexgs_edge.commands.info import info, info_text
 
         found = info(file)
-        words.emit(info_text(found), found, json_path, force)
+        talk.emit(info_text(found), found, json_path, force)
         return
-    from flexgs_edge.pipeline.info import info_text
-    from flexgs_edge.pipeline.options import ViewOptions
-    from flexgs_edge.pipeline.worth import worth, worth_text
+    from flexgs_edge.commands.info import info_text
+    from flexgs_edge.commands.worth import worth, worth_text
+    from flexgs_edge.run.options import ViewOptions
 
     if picture is not None:
-        from flexgs_edge.study.channels import check_picture, write_picture
+        from flexgs_edge.report.worth_plot import check_picture, write_picture
 
         check_picture(picture, force)
     found = worth(file, ViewOptions(**options), progress)
     if picture is not None:
         write_picture(found, picture, force)
-    words.emit(info_text(found) + worth_text(found), found, json_path, force)
+    talk.emit(info_text(found) + worth_text(found), found, json_path, force)

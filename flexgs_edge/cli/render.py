@@ -6,24 +6,24 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk, value_types
 
 
-@click.command(cls=words.SectionCommand)
-@words.scene_argument
-@words.option(
+@click.command(cls=shared_options.SectionCommand)
+@shared_options.scene_argument
+@shared_options.option(
     "Output", "-o", "--output", metavar="DIR", required=True, help="Folder for the PNG files; made if missing."
 )
-@words.cameras_option
-@words.option(
+@shared_options.cameras_option
+@shared_options.option(
     "Views",
     "--views",
-    type=words.VIEWS,
+    type=value_types.VIEWS,
     help="Views to draw, counted from 0 in order of name: 0,8,16 or START:STOP:STEP such as 0:50:8. Default: all.",
 )
-@words.drawing_options
-@words.drop_invalid_option
-@words.run_options
+@shared_options.drawing_options
+@shared_options.drop_invalid_option
+@shared_options.run_options
 def command(
     input: str, output: str, views: list[int] | None, force: bool, json_path: str | None, quiet: bool, **options: Any
 ) -> None:
@@ -38,10 +38,10 @@ def command(
       flexgs-edge render point_cloud.ply -o views --views 0:50:8 --background white
       flexgs-edge render scene.fgs -o views --cameras cameras.json --views 0 --json - 2>/dev/null
     """
-    progress = words.start(quiet, json_path, force)
-    from flexgs_edge.pipeline.options import ViewOptions
-    from flexgs_edge.pipeline.render import render_views
+    progress = talk.start(quiet, json_path, force)
+    from flexgs_edge.commands.render import render_views
     from flexgs_edge.report.summary import render_text
+    from flexgs_edge.run.options import ViewOptions
 
     result = render_views(input, output, ViewOptions(**options), views, force, progress)
-    words.emit(render_text(result), result.to_json(), json_path, force)
+    talk.emit(render_text(result), result.to_json(), json_path, force)

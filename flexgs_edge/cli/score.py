@@ -6,13 +6,13 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk
 
 
-@click.command(cls=words.SectionCommand)
-@words.scene_argument
-@words.option("Output", "-o", "--output", metavar="SCORES.npy", required=True, help="NumPy file to write.")
-@words.option(
+@click.command(cls=shared_options.SectionCommand)
+@shared_options.scene_argument
+@shared_options.option("Output", "-o", "--output", metavar="SCORES.npy", required=True, help="NumPy file to write.")
+@shared_options.option(
     "Method",
     "--score",
     type=click.Choice(["gs", "meson"]),
@@ -20,10 +20,10 @@ from flexgs_edge.cli import words
     show_default=True,
     help="gs: opacity * volume^0.1 * pixels hit. meson: volume^0.1 * summed weights.",
 )
-@words.photos_options
-@words.drawing_options
-@words.drop_invalid_option
-@words.run_options
+@shared_options.photos_options
+@shared_options.drawing_options
+@shared_options.drop_invalid_option
+@shared_options.run_options
 def command(
     input: str, output: str, score: str, force: bool, json_path: str | None, quiet: bool, **options: Any
 ) -> None:
@@ -38,10 +38,10 @@ def command(
       flexgs-edge score point_cloud.ply -o scores.npy
       flexgs-edge compress point_cloud.ply -o scene.fgs --method paper --score scores.npy --max-drop 0.5
     """
-    progress = words.start(quiet, json_path, force)
-    from flexgs_edge.pipeline.options import ViewOptions
-    from flexgs_edge.pipeline.score import score_gaussians
+    progress = talk.start(quiet, json_path, force)
+    from flexgs_edge.commands.score import score_gaussians
     from flexgs_edge.report.summary import score_text
+    from flexgs_edge.run.options import ViewOptions
 
     result = score_gaussians(input, output, ViewOptions(**options), score, force, progress)
-    words.emit(score_text(result), result.to_json(), json_path, force)
+    talk.emit(score_text(result), result.to_json(), json_path, force)

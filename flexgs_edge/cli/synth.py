@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk
 
 
-@click.command(cls=words.SectionCommand)
+@click.command(cls=shared_options.SectionCommand)
 @click.argument("output", metavar="OUT.ply", type=click.Path())
-@words.option(
+@shared_options.option(
     "Scene", "--from", "input", metavar="SCENE", required=True, help="The scene to make it from: any INPUT of compress."
 )
-@words.option(
+@shared_options.option(
     "Scene",
     "--gaussians",
     metavar="N",
@@ -20,7 +20,7 @@ from flexgs_edge.cli import words
     required=True,
     help="Gaussians to write, exactly; at least as many as SCENE has.",
 )
-@words.option(
+@shared_options.option(
     "Scene",
     "--seed",
     metavar="N",
@@ -29,10 +29,10 @@ from flexgs_edge.cli import words
     show_default=True,
     help="Chooses which Gaussians get one part more than others.",
 )
-@words.memory_option
-@words.force_option
-@words.json_option
-@words.talk_options
+@shared_options.memory_option
+@shared_options.force_option
+@shared_options.json_option
+@shared_options.talk_options
 def command(
     output: str,
     input: str,
@@ -58,8 +58,8 @@ def command(
       flexgs-edge synth big/point_cloud.ply --from scene/point_cloud.ply --gaussians 1000000
       flexgs-edge synth huge/point_cloud.ply --from scene.fgs --gaussians 40000000 --memory-limit 300MiB
     """
-    words.start(quiet, json_path, force)
-    from flexgs_edge.pipeline.synth import synth, synth_text
+    talk.start(quiet, json_path, force)
+    from flexgs_edge.commands.synth import synth, synth_text
 
     found = synth(output, input, gaussians, seed, force, memory_limit)
-    words.emit(synth_text(found), found, json_path, force)
+    talk.emit(synth_text(found), found, json_path, force)

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk, value_types
 
 
-@click.command(cls=words.SectionCommand)
+@click.command(cls=shared_options.SectionCommand)
 @click.argument("input", metavar="IN.fgs", type=click.Path())
-@words.option("Output", "-o", "--output", metavar="OUT.fgs", required=True, help="File to write.")
-@words.option(
+@shared_options.option("Output", "-o", "--output", metavar="OUT.fgs", required=True, help="File to write.")
+@shared_options.option(
     "Output",
     "--max-size",
-    type=words.SIZE,
+    type=value_types.SIZE,
     required=True,
     help="Bytes that it may have, such as 800kB (10^3) or 1MiB (2^20): as many whole layers as fit are kept.",
 )
-@words.force_option
-@words.json_option
-@words.talk_options
+@shared_options.force_option
+@shared_options.json_option
+@shared_options.talk_options
 def command(input: str, output: str, max_size: int, force: bool, json_path: str | None, quiet: bool) -> None:
     """Cut a layered .fgs file to a size, at the speed of copying.
 
@@ -33,8 +33,8 @@ def command(input: str, output: str, max_size: int, force: bool, json_path: str 
 
     Exit code 3: not even the first layer fits.
     """
-    words.start(quiet, json_path, force)
-    from flexgs_edge.pipeline.trim import trim, trim_text
+    talk.start(quiet, json_path, force)
+    from flexgs_edge.commands.trim import trim, trim_text
 
     found = trim(input, output, max_size, force)
-    words.emit(trim_text(found), found, json_path, force)
+    talk.emit(trim_text(found), found, json_path, force)

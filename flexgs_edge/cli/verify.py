@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk
 from flexgs_edge.errors import FormatError
 
 
-@click.command(cls=words.SectionCommand)
+@click.command(cls=shared_options.SectionCommand)
 @click.argument("file", metavar="FILE.fgs", type=click.Path())
-@words.force_option
-@words.json_option
-@words.talk_options
+@shared_options.force_option
+@shared_options.json_option
+@shared_options.talk_options
 def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
     """Check every byte of a .fgs file against its checksums.
 
@@ -25,11 +25,11 @@ def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
 
     Exit code 0: every part is whole. 2: something is damaged.
     """
-    words.start(quiet, json_path, force)
-    from flexgs_edge.pipeline.contents import verify, verify_json, verify_text
+    talk.start(quiet, json_path, force)
+    from flexgs_edge.commands.verify import verify, verify_json, verify_text
 
     sections = verify(file)
-    words.emit(verify_text(file, sections), verify_json(file, sections), json_path, force)
+    talk.emit(verify_text(file, sections), verify_json(file, sections), json_path, force)
     damaged = [section.name for section in sections if not section.ok]
     if damaged:
         raise FormatError(f"{file}: damaged: {', '.join(damaged)}; get the file again from where it came from")

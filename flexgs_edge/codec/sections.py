@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from flexgs_edge.codec.layout import PREAMBLE_BYTES, HeaderError, Section, format_error
+from flexgs_edge.codec.header import PREAMBLE_BYTES, HeaderError, Section, format_error
 from flexgs_edge.errors import FormatError, InputError
 
 MAGIC = b"\x93FGS\r\n\x1a\n"

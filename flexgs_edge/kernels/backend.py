@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from flexgs_edge.budget import MemoryBudget
+from flexgs_edge.memory.budget import MemoryBudget
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from flexgs_edge.budget import MemoryBudget
-from flexgs_edge.device.select import DeviceInfo
-from flexgs_edge.device.session import DeviceArray, Session
 from flexgs_edge.errors import DeviceError
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS
-from flexgs_edge.kernels.source import load_source
+from flexgs_edge.kernels.choose_device import DeviceInfo
+from flexgs_edge.kernels.cl_sources import load_source
+from flexgs_edge.kernels.session import DeviceArray, Session
+from flexgs_edge.memory.budget import MemoryBudget
 
 GPU_GROUP = 64
 """Work-group of the kernels with a row a work-item on GPUs (divides the padding of planes)."""

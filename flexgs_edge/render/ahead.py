@@ -15,13 +15,14 @@ from typing import BinaryIO
 
 import numpy as np
 
-from flexgs_edge.cameras import Camera
-from flexgs_edge.kernels import Backend
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.memory.storage import Room
+from flexgs_edge.render.camera_record import camera_record
 from flexgs_edge.render.compact import ShownView, Splats, fill_compact
 from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.render.records import camera_record
-from flexgs_edge.render.view_buffers import ViewBuffers, chunk_shapes, shapes_bytes
-from flexgs_edge.scratch import Room
+from flexgs_edge.render.fit import chunk_shapes, shapes_bytes
+from flexgs_edge.render.view_buffers import ViewBuffers
 
 AHEAD = 3
 """Views that are projected with the one whose turn it is."""

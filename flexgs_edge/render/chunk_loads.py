@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
-from flexgs_edge.kernels import Backend
-from flexgs_edge.render.chunks import ChunkArrays, QuantizedPlanes, SourcePlanes, padded
+from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.render.chunks import ChunkArrays, QuantizedPlanes, SourcePlanes
+from flexgs_edge.render.fit import padded
 
 SLOTS = 2
 """Chunks that there is always room for: one that is drawn, and one that is loaded."""

@@ -8,26 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.constants import DEQUANTIZE_ROWS, LANES
-from flexgs_edge.kernels import Backend
-from flexgs_edge.quantize import QuantizedArray, QuantizedScene
+from flexgs_edge.constants import DEQUANTIZE_ROWS
+from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.packed.quantize import QuantizedArray, QuantizedScene
 from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
-
-
-def plane_bytes(sh_degree: int) -> int:
-    """Bytes a row of an activated chunk: means, covariance (or its factor), log2 of the opacity, colour."""
-    return 4 * (3 + 6 + 1 + 3 + FIELD["sh_rest"].width(sh_degree))
-
-
-RAW_BYTES = 4 * (3 + 4 + 1)
-"""Bytes a row that loading needs on top for a moment: stored scale, rotation, opacity."""
-
-
-def streamed_bytes(sh_degree: int) -> int:
-    """Bytes a row of a streamed chunk, and of the one that is loaded while it is drawn."""
-    return 2 * (plane_bytes(sh_degree) + RAW_BYTES)
 
 
 @dataclass
@@ -62,11 +48,6 @@ class Chunk:
         """Free the planes."""
         for array in self.arrays:
             array.release()
-
-
-def padded(count: int) -> int:
-    """Elements of a plane that holds `count` rows."""
-    return -(-count // LANES) * LANES
 
 
 class ChunkArrays:

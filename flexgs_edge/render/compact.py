@@ -8,27 +8,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from flexgs_edge.constants import CULLED
-from flexgs_edge.kernels import Backend
+from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.render.view_buffers import ViewBuffers, chunk_shapes
-
-CAPACITY_STEP = 1 << 16
-"""Compact views make room for multiples of so many rows: views of about one size then share their buffers."""
-FIRST_SHARE = 4
-"""Part of a scene's rows (one in four) that a compact view has room for until one shows more."""
-GROWTH = 1.1
-"""Room beyond what the part of a view that was seen lets expect."""
-GUESS = 1.02
-"""Room beyond what views have shown so far."""
+from flexgs_edge.render.fit import chunk_shapes
+from flexgs_edge.render.view_buffers import ViewBuffers
 
 Splats = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Of some rows that a view shows: records [m, 16] f32, depth keys and bounds of tiles [m] u32, rows of the scene [m] u32."""
-
-
-def capacity(scene: DeviceScene, share: float) -> int:
-    """Rows that a compact view of some of a scene's rows gets room for."""
-    return min((int(share * scene.count) // CAPACITY_STEP + 1) * CAPACITY_STEP, scene.count)
 
 
 class CompactView(Protocol):

@@ -8,43 +8,28 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.budget import MemoryBudget
 from flexgs_edge.constants import LANES
-from flexgs_edge.kernels import Backend
+from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.chunk_loads import ChunkLoads
-from flexgs_edge.render.chunks import (
+from flexgs_edge.render.chunks import Chunk, ChunkArrays, QuantizedPlanes, SourcePlanes
+from flexgs_edge.render.fit import (
+    AHEAD_SHARE,
+    CHUNK_ROWS,
+    COMPACT_ROWS,
+    MIN_CHUNK_ROWS,
+    MOST_SUMS,
     RAW_BYTES,
-    Chunk,
-    ChunkArrays,
-    QuantizedPlanes,
-    SourcePlanes,
+    SPARE_SHARE,
+    SUM_BYTES,
     padded,
     plane_bytes,
     streamed_bytes,
+    sum_bytes,
 )
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
-
-CHUNK_ROWS = 1 << 18
-"""Most rows of a chunk: 60 MB of planes at SH degree 3, large enough that launches cost nothing."""
-MIN_CHUNK_ROWS = 1 << 10
-COMPACT_ROWS = 1 << 16
-"""Rows of a chunk of a scene whose views are compact: 33 MB with all that projecting it takes."""
-SPARE_SHARE = 4
-"""Part of the limit (one in four) that chunks of a compact scene which stay leave free."""
-AHEAD_SHARE = 8
-"""The same of a second chunk that is loaded ahead, whose memory is free again when a view is projected."""
-
-
-def sum_bytes(planes: int) -> int:
-    """Bytes a row of so many planes of 64-bit sums, and of the hits that go with a single one."""
-    return 8 * planes + 4 * (planes == 1)
-
-
-SUM_BYTES = sum_bytes(1)
-MOST_SUMS = 6
-"""Planes of sums that a view has at most (`Renderer.residual_and_removal_sums`)."""
 
 
 class DeviceScene:

@@ -8,32 +8,38 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flexgs_edge.budget import MemoryBudget
-from flexgs_edge.cameras import Camera
+from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import BudgetError, InputError
-from flexgs_edge.kernels import Backend
-from flexgs_edge.quantize import QuantizedScene
+from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.packed.quantize import QuantizedScene
 from flexgs_edge.render.ahead import ViewsAhead
+from flexgs_edge.render.camera_record import camera_record
 from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes
-from flexgs_edge.render.compact import FIRST_SHARE, GROWTH, GUESS, capacity
-from flexgs_edge.render.device_scene import MOST_SUMS, SUM_BYTES, DeviceScene
-from flexgs_edge.render.records import Statistics, camera_record
-from flexgs_edge.render.view_buffers import (
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.fit import (
+    FIRST_SHARE,
+    GROWTH,
+    GUESS,
+    MOST_SUMS,
     SORT_DIGIT_BITS,
     SORT_DIGITS,
-    ViewBuffers,
+    SUM_BYTES,
+    capacity,
     chunk_shapes,
     shapes_bytes,
     target_bytes,
     view_bytes,
-    view_key,
 )
+from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.render.view_buffers import ViewBuffers, view_key
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.scratch import MEMORY, Room
 
 if TYPE_CHECKING:
-    from flexgs_edge.render.cluster import Cluster
+    from flexgs_edge.views.cluster import Cluster
+
 
 SUM_ROWS = 1 << 18
 """Rows of sums that are on the host at a time."""

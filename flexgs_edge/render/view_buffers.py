@@ -6,75 +6,26 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.budget import MemoryBudget
-from flexgs_edge.cameras import Camera
+from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import TILE
-from flexgs_edge.kernels import Backend
+from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.device_scene import DeviceScene
-
-SORT_DIGIT_BITS = 11
-SORT_DIGITS = 1 << SORT_DIGIT_BITS
-TARGET_BYTES = 6
-"""Bytes a pixel and channel of a target in half precision, and of the residual against it."""
-PAIR_BYTES = 20
-"""A pair (8) and its draft (12)."""
-DEFAULT_PAIRS = 1 << 21
-"""Pairs of a batch when memory allows: 40 MiB, one batch for most views."""
-PAIR_SHARE = 8
-"""The tile lists take at most this part (one in eight) of what is free beyond the least: the scene comes next."""
-COMPACT_PAIR_SHARE = 2
-"""The same of compact views: tiles of several batches are listed anew for every blend."""
+from flexgs_edge.render.fit import (
+    COMPACT_PAIR_SHARE,
+    DEFAULT_PAIRS,
+    PAIR_BYTES,
+    PAIR_SHARE,
+    TARGET_BYTES,
+    chunk_shapes,
+    shapes_bytes,
+    view_shapes,
+)
 
 
 def view_key(scene: DeviceScene, camera: Camera) -> tuple[int, int, int]:
     """What the sizes of a view's buffers depend on."""
     return scene.count, camera.width, camera.height
-
-
-def view_shapes(backend: Backend, count: int, width: int, height: int) -> dict[str, tuple[tuple[int, ...], Any]]:
-    """Shape and type of the buffers of a view, by name; the lists of pairs take what is left."""
-    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    return {
-        "camera": ((32,), np.float32),
-        "records": ((count, 16), np.float32),
-        "keys": ((count,), np.uint32),
-        "bounds": ((count,), np.uint32),
-        "keys_a": ((count,), np.uint32),
-        "ids_a": ((count,), np.uint32),
-        "keys_b": ((count,), np.uint32),
-        "ids_b": ((count,), np.uint32),
-        "digits": ((SORT_DIGITS * backend.sort_blocks + 1,), np.uint32),
-        "block_pairs": ((backend.sort_blocks,), np.uint64),
-        "room": ((2, backend.tile_blocks), np.uint32),
-        "ends": ((tiles_x * tiles_y * backend.tile_blocks + 1,), np.uint32),
-        "state": ((tiles_x * tiles_y, 4, TILE * TILE), np.float32),
-        "image": ((3, tiles_y * TILE, tiles_x * TILE), np.float32),
-    }
-
-
-def chunk_shapes(rows: int) -> dict[str, tuple[tuple[int, ...], Any]]:
-    """The same of what one chunk of a compact view is projected to."""
-    return {
-        "chunk_records": ((rows, 16), np.float32),
-        "chunk_keys": ((rows,), np.uint32),
-        "chunk_bounds": ((rows,), np.uint32),
-    }
-
-
-def shapes_bytes(shapes: dict[str, tuple[tuple[int, ...], Any]]) -> int:
-    """Bytes of all of `view_shapes`."""
-    return sum(int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
-
-
-def view_bytes(backend: Backend, count: int, camera: Camera) -> int:
-    """Bytes of the buffers of a view of so many rows, with the shortest lists of pairs."""
-    tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
-    return shapes_bytes(view_shapes(backend, count, camera.width, camera.height)) + PAIR_BYTES * tiles
-
-
-def target_bytes(camera: Camera) -> int:
-    """Bytes of a target of a view, and of the residual against it."""
-    return TARGET_BYTES * 3 * TILE * TILE * -(-camera.width // TILE) * -(-camera.height // TILE)
 
 
 class ViewBuffers:

@@ -1,1 +1,1 @@
-"""The result record of every job, its JSON and its text."""
+"""What a person or a program reads: records, text, JSON, pages and charts."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.adapt import Target
+from flexgs_edge.goals.target import Target
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,15 @@ from collections.abc import Iterable, Mapping
 from pathlib import PurePath
 from typing import Any
 
-from flexgs_edge.budget import format_size
-from flexgs_edge.render.quality import Quality
-from flexgs_edge.report import chart, plan, viewer
+from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.report import camera_plan, search_chart, viewer
 from flexgs_edge.report.html import Markup, page, table, text
 from flexgs_edge.report.material import Material, Shot
-from flexgs_edge.report.result import CompressResult, EvaluateResult, RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.results import CompressResult, EvaluateResult
+from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
 from flexgs_edge.report.summary import decided_words, device_words, memory_words
 from flexgs_edge.report.tones import ERROR_SCALE, css_ramp
+from flexgs_edge.units import format_size
 
 _STYLE = """
 .lead { font-size: 1.1rem; }
@@ -105,7 +106,7 @@ def _name(path: str) -> str:
 
 
 def _styles() -> str:
-    return _STYLE + viewer.STYLE + chart.STYLE + plan.STYLE
+    return _STYLE + viewer.STYLE + search_chart.STYLE + camera_plan.STYLE
 
 
 def _script(material: Material) -> str:
@@ -207,7 +208,7 @@ def _search_section(result: CompressResult, material: Material) -> list[str]:
     return [
         "<h2>Search</h2>",
         f"<p>{text(words)}</p>",
-        f'<div class="two"><div>{chart.step_chart(search.steps, search.chosen, material.target)}</div>',
+        f'<div class="two"><div>{search_chart.step_chart(search.steps, search.chosen, material.target)}</div>',
         f"<details{state}><summary>All steps</summary>{table(heads, rows, 'Steps of the search')}</details></div>",
     ]
 
@@ -228,7 +229,11 @@ def _contents_section(contents: Mapping[str, Any] | None) -> list[str]:
     rows.append(("headers and checksums", rest, [_count(rest), f"{100 * rest / size:.1f} %", "", "", ""]))
     each = f", {contents['bits_per_gaussian']:.1f} bits a Gaussian" if contents.get("bits_per_gaussian") else ""
     words = f"{_count(contents['size'])} bytes{each}, container version {contents.get('version')}."
-    return ["<h2>Bytes of the file</h2>", f"<p>{text(words)}</p>", chart.bar_table(heads, rows, "Bytes by attribute")]
+    return [
+        "<h2>Bytes of the file</h2>",
+        f"<p>{text(words)}</p>",
+        search_chart.bar_table(heads, rows, "Bytes by attribute"),
+    ]
 
 
 def _views_section(views: ViewsInfo, material: Material) -> list[str]:
@@ -238,7 +243,7 @@ def _views_section(views: ViewsInfo, material: Material) -> list[str]:
     parts = ["<h2>Cameras</h2>", _facts(facts)]
     if material.rig is not None:
         numbers = {material.rig.names[index]: number for index, number in _pictured(material)}
-        parts.append(plan.plans(material.rig, numbers))
+        parts.append(camera_plan.plans(material.rig, numbers))
     return parts
 
 
@@ -283,7 +288,7 @@ def _run_section(facts: list[tuple[str, object]], run: RunInfo) -> list[str]:
     return [
         "<h2>Run</h2>",
         _facts(facts),
-        chart.bar_table(["stage", "time"], stages, "Seconds by stage"),
+        search_chart.bar_table(["stage", "time"], stages, "Seconds by stage"),
         f"<details><summary>What the words mean</summary>{_facts(_WORDS)}</details>",
     ]
 

@@ -4,18 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from flexgs_edge.budget import format_mib, format_size
-from flexgs_edge.render.quality import Quality, ViewQuality
-from flexgs_edge.report.result import (
-    CompressResult,
-    DecompressResult,
-    EvaluateResult,
-    RenderResult,
-    RunInfo,
-    SceneInfo,
-    ScoreResult,
-    ViewsInfo,
-)
+from flexgs_edge.quality.view_quality import Quality, ViewQuality
+from flexgs_edge.report.results import CompressResult, DecompressResult, EvaluateResult, RenderResult, ScoreResult
+from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.units import format_mib, format_size
 
 
 def compress_text(result: CompressResult) -> str:

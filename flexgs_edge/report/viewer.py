@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from flexgs_edge.render.quality import Quality, ViewQuality
+from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.html import data_uri, text
 from flexgs_edge.report.material import Shot
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
-from flexgs_edge.mapped import BLOCK_ROWS, copy_all_rows, put_rows
+from flexgs_edge.memory.rows import BLOCK_ROWS, copy_all_rows, put_rows
+from flexgs_edge.memory.storage import Room
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
-from flexgs_edge.scratch import Room
 
 Planes = dict[str, np.ndarray]
 """Arrays by field name, each [width, n] f32."""
@@ -321,3 +321,35 @@ class SelectSource(SceneSource):
             for field, plane in planes.items():  # one field at a time: the copy is the widest field, not all of them
                 plane[:, order] = self.parent.read(chosen[order], [field])[field]
         return planes
+
+
+def by_chunk(rows: Rows, starts: np.ndarray) -> Iterator[tuple[int, Rows, slice]]:
+    """Cut a slice or a sorted list of rows at the chunks.
+
+    Parameters
+    ----------
+    rows : slice or np.ndarray
+        As `SceneSource.begin_read` gives them.
+    starts : np.ndarray
+        [c] i64: first row of every chunk.
+
+    Yields
+    ------
+    tuple
+        The chunk, the rows in it, and their place in the output.
+    """
+    if isinstance(rows, slice):
+        at = rows.start
+        while at < rows.stop:
+            chunk = int(np.searchsorted(starts, at, side="right")) - 1
+            stop = min(rows.stop, int(starts[chunk + 1])) if chunk + 1 < len(starts) else rows.stop
+            yield chunk, slice(at, stop), slice(at - rows.start, stop - rows.start)
+            at = stop
+        return
+    # Runs of equal chunks, not bins: a list that is not sorted only costs more reading.
+    if len(rows) == 0:
+        return
+    chunks = np.searchsorted(starts, rows, side="right") - 1
+    cuts = np.flatnonzero(np.diff(chunks, prepend=-1))
+    for start, stop in zip(cuts.tolist(), [*cuts[1:].tolist(), len(rows)], strict=True):
+        yield int(chunks[start]), rows[start:stop], slice(start, stop)

@@ -14,13 +14,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 
 from camera_files import colmap_records, write_colmap, write_inria, write_transforms
 from fgs_damage import edit_header, flip, overwrite, put, reseal_section, write_header
-from flexgs_edge.bitspec import BitSpec
-from flexgs_edge.codec import write_grid
-from flexgs_edge.codec.container import write_container
+from flexgs_edge.codec.v1.container import write_container
+from flexgs_edge.codec.v2.container import write_grid
+from flexgs_edge.packed.bitspec import BitSpec
 from grid_scenes import make_grid
 from quantized_scenes import make_scene, quantize_all
 from scene_files import edit, header, random_rows, write_rows

@@ -11,9 +11,10 @@ import pytest
 
 from benchmarks.damage import mutate_bytes, mutate_json, mutate_sealed, mutate_text
 from benchmarks.fuzz import BOUND, KINDS, SEEDS, SLOW, TABLE, Fuzzer, Kind, fuzz, read_container, read_views
-from flexgs_edge.codec import verify
+from flexgs_edge.codec.open_fgs import verify
 from flexgs_edge.errors import FlexGSError
-from flexgs_edge.scene import PlySource, check_scene
+from flexgs_edge.io.ply import PlySource
+from flexgs_edge.scene.check import check_scene
 
 CORPUS = Path(__file__).parent / "corpus"
 TRIES = {"v1 plain": 1500, "v2 plain": 1000, "v1 sealed": 300, "v2 sealed": 150}

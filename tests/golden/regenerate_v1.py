@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from flexgs_edge.bitspec import BitSpec
-from flexgs_edge.codec.container import write_container
-from flexgs_edge.codec.source import FgsSource
-from flexgs_edge.quantize import quantize_scene
+from flexgs_edge.codec.v1.container import write_container
+from flexgs_edge.codec.v1.packed_source import FgsSource
+from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.packed.quantize import quantize_scene
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import MemorySource, SceneSource
 

@@ -12,8 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from flexgs_edge.codec import GridSource, write_grid
-from flexgs_edge.grid import GridScene, Steps, to_grid
+from flexgs_edge.codec.v2.container import write_grid
+from flexgs_edge.codec.v2.grid_source import GridSource
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.scene.fields import FIELDS
 
 FOLDER = Path(__file__).parent / "v2"

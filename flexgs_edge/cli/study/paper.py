@@ -6,13 +6,13 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk
 
 
-@click.command(cls=words.SectionCommand)
+@click.command(cls=shared_options.SectionCommand)
 @click.argument("scenes", metavar="SCENE...", type=click.Path(), nargs=-1, required=True)
-@words.results_option
-@words.option(
+@shared_options.results_option
+@shared_options.option(
     "Search",
     "--max-drop",
     metavar="DB",
@@ -21,7 +21,7 @@ from flexgs_edge.cli import words
     show_default=True,
     help="Drop that the search on the plane of the rates aims at: against the photos where there are photos, else modelled.",
 )
-@words.study_options
+@shared_options.study_options
 def command(scenes: tuple[str, ...], output: str, json_path: str | None, quiet: bool, **options: Any) -> None:
     """Make the FlexGaussian paper's evaluation on your own scenes.
 
@@ -40,9 +40,9 @@ def command(scenes: tuple[str, ...], output: str, json_path: str | None, quiet: 
       flexgs-edge study paper scene.ply -o study --cameras cameras.json --images none
           without photos: the modelled drop decides
     """
-    progress = words.start(quiet, json_path, options["force"])
-    from flexgs_edge.pipeline.options import CompressOptions
-    from flexgs_edge.study.paper import study_paper
+    progress = talk.start(quiet, json_path, options["force"])
+    from flexgs_edge.run.options import CompressOptions
+    from flexgs_edge.studies.paper.study import study_paper
 
     result = study_paper(scenes, output, CompressOptions(**options), progress)
-    words.emit(result.to_text(), result.to_json(), json_path, options["force"])
+    talk.emit(result.to_text(), result.to_json(), json_path, options["force"])

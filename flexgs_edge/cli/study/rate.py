@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk
 
 
 class RatiosType(click.ParamType):
@@ -29,16 +29,16 @@ class RatiosType(click.ParamType):
 RATIOS = RatiosType()
 
 
-def effort_option(name: str, default: str, text: str) -> Callable[[words.Decorated], words.Decorated]:
+def effort_option(name: str, default: str, text: str) -> Callable[[shared_options.Decorated], shared_options.Decorated]:
     """A choice of effort."""
     efforts = click.Choice(["fast", "balanced", "thorough"])
-    return words.option("Points", name, type=efforts, default=default, show_default=True, help=text)
+    return shared_options.option("Points", name, type=efforts, default=default, show_default=True, help=text)
 
 
-@click.command(cls=words.SectionCommand)
+@click.command(cls=shared_options.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
-@words.results_option
-@words.option(
+@shared_options.results_option
+@shared_options.option(
     "Points",
     "--ratios",
     type=RATIOS,
@@ -47,7 +47,7 @@ def effort_option(name: str, default: str, text: str) -> Callable[[words.Decorat
     help="Ratios to the PLY that best and paper aim at.",
 )
 @effort_option("--effort", "balanced", "Steps of the search for these points, as for compress.")
-@words.option(
+@shared_options.option(
     "Points",
     "--ablations",
     type=RATIOS,
@@ -58,7 +58,7 @@ def effort_option(name: str, default: str, text: str) -> Callable[[words.Decorat
 @effort_option(
     "--ablation-effort", "fast", "Steps of the search without a part, and of the whole method that it is held against."
 )
-@words.option(
+@shared_options.option(
     "Points",
     "--distilled",
     type=RATIOS,
@@ -66,7 +66,7 @@ def effort_option(name: str, default: str, text: str) -> Callable[[words.Decorat
     show_default=True,
     help="Ratios at which best is measured with --effort max as well; none leaves this out.",
 )
-@words.study_options
+@shared_options.study_options
 def command(
     scene: str,
     output: str,
@@ -94,9 +94,9 @@ def command(
       flexgs-edge study rate point_cloud.ply -o rate --ratios 10,20,40 --ablations none
       flexgs-edge study rate scene.ply -o rate --effort thorough --ablation-effort balanced
     """
-    progress = words.start(quiet, json_path, options["force"])
-    from flexgs_edge.pipeline.options import CompressOptions
-    from flexgs_edge.study.rate import study_rate
+    progress = talk.start(quiet, json_path, options["force"])
+    from flexgs_edge.run.options import CompressOptions
+    from flexgs_edge.studies.rate.study import study_rate
 
     made = CompressOptions(**options)
     result = study_rate(
@@ -109,4 +109,4 @@ def command(
         ablation_effort=ablation_effort,
         distilled=distilled,
     )
-    words.emit(result.to_text(), result.to_json(), json_path, options["force"])
+    talk.emit(result.to_text(), result.to_json(), json_path, options["force"])

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk
 
 
 class PartsType(click.ParamType):
@@ -23,10 +23,10 @@ class PartsType(click.ParamType):
 PARTS = PartsType()
 
 
-@click.command(cls=words.SectionCommand)
+@click.command(cls=shared_options.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
-@words.results_option
-@words.option(
+@shared_options.results_option
+@shared_options.option(
     "Parts",
     "--parts",
     type=PARTS,
@@ -34,11 +34,13 @@ PARTS = PartsType()
     show_default=True,
     help="What to measure.",
 )
-@words.option("Parts", "--repeats", type=int, default=5, show_default=True, help="Rounds of timing; the least counts.")
-@words.option(
+@shared_options.option(
+    "Parts", "--repeats", type=int, default=5, show_default=True, help="Rounds of timing; the least counts."
+)
+@shared_options.option(
     "Parts", "--trials", type=int, default=200, show_default=True, help="Samples of tiles of every size, for sampling."
 )
-@words.option(
+@shared_options.option(
     "Parts",
     "--max-drop",
     metavar="DB",
@@ -47,7 +49,7 @@ PARTS = PartsType()
     show_default=True,
     help="Target of the whole runs, and of the paper's search that scoring and sampling build on.",
 )
-@words.study_options
+@shared_options.study_options
 def command(
     scene: str,
     output: str,
@@ -78,10 +80,10 @@ def command(
       flexgs-edge study speed point_cloud.ply -o speed --parts drawing,scaling
       flexgs-edge study speed scene.ply -o speed --max-drop 0.5 --resolution 800
     """
-    progress = words.start(quiet, json_path, options["force"])
-    from flexgs_edge.pipeline.options import CompressOptions
-    from flexgs_edge.study.speed import study_speed
+    progress = talk.start(quiet, json_path, options["force"])
+    from flexgs_edge.run.options import CompressOptions
+    from flexgs_edge.studies.speed.study import study_speed
 
     made = CompressOptions(**options)
     result = study_speed(scene, output, made, progress, parts=parts, repeats=repeats, trials=trials)
-    words.emit(result.to_text(), result.to_json(), json_path, options["force"])
+    talk.emit(result.to_text(), result.to_json(), json_path, options["force"])

@@ -6,19 +6,19 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import words
+from flexgs_edge.cli import shared_options, talk
 
 
-@click.command(cls=words.SectionCommand)
+@click.command(cls=shared_options.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
-@words.results_option
-@words.option(
+@shared_options.results_option
+@shared_options.option(
     "Points",
     "--quick",
     is_flag=True,
     help="Few points of every experiment, on views 120 pixels wide: a minute in place of a quarter of an hour.",
 )
-@words.option(
+@shared_options.option(
     "Points",
     "--max-drop",
     metavar="DB",
@@ -27,7 +27,7 @@ from flexgs_edge.cli import words
     show_default=True,
     help="Target of the results that are moved, looked at from elsewhere and compressed again.",
 )
-@words.study_options
+@shared_options.study_options
 def command(scene: str, output: str, quick: bool, json_path: str | None, quiet: bool, **options: Any) -> None:
     """Chart where methods break on a scene, and where ours stops standing.
 
@@ -51,9 +51,9 @@ def command(scene: str, output: str, quick: bool, json_path: str | None, quiet: 
       flexgs-edge study stability point_cloud.ply -o stability --quick
       flexgs-edge study stability scene.ply -o stability --max-drop 0.5
     """
-    progress = words.start(quiet, json_path, options["force"])
-    from flexgs_edge.pipeline.options import CompressOptions
-    from flexgs_edge.study.stability import study_stability
+    progress = talk.start(quiet, json_path, options["force"])
+    from flexgs_edge.run.options import CompressOptions
+    from flexgs_edge.studies.stability.study import study_stability
 
     result = study_stability(scene, output, CompressOptions(**options), progress, quick=quick)
-    words.emit(result.to_text(), result.to_json(), json_path, options["force"])
+    talk.emit(result.to_text(), result.to_json(), json_path, options["force"])

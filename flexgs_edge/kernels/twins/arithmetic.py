@@ -6,15 +6,7 @@ from typing import Any, Union
 
 import numpy as np
 
-from flexgs_edge.constants import (
-    EXP2_HIGH,
-    EXP2_LOW,
-    EXP2_MAGIC,
-    EXP2_POLY,
-    LOG2_ALPHA_MAX,
-    LOG2_PIVOT,
-    LOG2_POLY,
-)
+from flexgs_edge.constants import EXP2_HIGH, EXP2_LOW, EXP2_MAGIC, EXP2_POLY, LOG2_ALPHA_MAX, LOG2_PIVOT, LOG2_POLY
 
 f32 = np.float32
 Values = Union[np.ndarray, "np.floating[Any]"]

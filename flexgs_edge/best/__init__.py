@@ -1,1 +1,0 @@
-"""The default method: measured costs, one multiplier, one search (beyond the paper)."""

@@ -1,0 +1,68 @@
+"""One door for camera files: which kind it is, and its cameras sorted by name."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.cameras.colmap import find_model, read_colmap
+from flexgs_edge.cameras.inria import cameras_of_list
+from flexgs_edge.cameras.json_values import load_json
+from flexgs_edge.cameras.transforms import cameras_of_frames
+from flexgs_edge.errors import InputError
+
+SUPPORTED = (
+    "INRIA's cameras.json (any .json file with a list of cameras), NeRF's or nerfstudio's transforms.json, "
+    "a COLMAP model (cameras and images, .bin or .txt), or a folder that holds one of them"
+)
+
+
+def find_cameras(folder: str | os.PathLike[str]) -> Path | None:
+    """What `read_cameras` reads in a folder: cameras.json, else transforms.json, else the folder of a COLMAP model."""
+    place = Path(folder)
+    for name in ("cameras.json", "transforms.json"):
+        if (place / name).is_file():
+            return place / name
+    return find_model(place)
+
+
+def read_cameras(path: str | os.PathLike[str], ignore_distortion: bool = False) -> list[Camera]:
+    """Read cameras from a file or folder, sorted by name.
+
+    Parameters
+    ----------
+    path : path
+        INRIA's cameras.json, a transforms.json, a file of a COLMAP model, or a folder that holds one (a COLMAP model also
+        in its `sparse/0`).
+    ignore_distortion : bool, optional
+        Take the poses of distorted lenses; such cameras refuse to be compared with photos.
+
+    Raises
+    ------
+    InputError
+        When the path is missing or of an unknown kind, or a lens is distorted; `FormatError` when the file breaks its format.
+    """
+    place = Path(path)
+    if place.is_dir():
+        found = find_cameras(place)
+        if found is None:
+            raise InputError(
+                f"{path}: no cameras.json, transforms.json or COLMAP model in this folder; supported: {SUPPORTED}"
+            )
+        place = found
+    if not place.exists():
+        raise InputError(f"{path}: no such camera file; supported: {SUPPORTED}")
+    if place.is_dir():
+        cameras = read_colmap(place, ignore_distortion)
+    elif place.name in ("cameras.bin", "images.bin", "cameras.txt", "images.txt"):
+        cameras = read_colmap(place.parent, ignore_distortion)
+    elif place.suffix.lower() == ".json":
+        value = load_json(place)
+        if isinstance(value, dict) and "frames" in value:
+            cameras = cameras_of_frames(place, value, ignore_distortion)
+        else:
+            cameras = cameras_of_list(place, value)
+    else:
+        raise InputError(f"{path}: unknown kind of camera file; supported: {SUPPORTED}")
+    return sorted(cameras, key=lambda camera: camera.name)

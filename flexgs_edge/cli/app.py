@@ -1,0 +1,114 @@
+"""The command line: one group of subcommands, loaded when asked for, and one door out."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any, NoReturn
+
+import click
+
+from flexgs_edge._version import __version__
+from flexgs_edge.cli.lazy_group import LazyGroup
+from flexgs_edge.cli.talk import State
+from flexgs_edge.errors import FlexGSError, InputError
+
+COMMANDS = {
+    "compress": "Compress a scene to the fewest bytes that hold a quality, or the best quality in a size.",
+    "decompress": "Decode a .fgs file to a PLY that every viewer opens, or convert between formats.",
+    "info": "Show what a scene file holds: counts, bits and bytes of every channel, settings.",
+    "trim": "Cut a layered .fgs file to a size, at the speed of copying.",
+    "verify": "Check every byte of a .fgs file against its checksums.",
+    "render": "Draw views of a scene as PNG files, and time them.",
+    "evaluate": "Measure what a scene lost against another: PSNR, SSIM, fidelity and drop of every view.",
+    "score": "Save the importance of every Gaussian, for --method paper: other targets then need no scoring.",
+    "study": "Make the experiments of a paper on scenes of your own: tables, charts and one page.",
+    "synth": "Make a big scene from a small one, to test memory and time with.",
+    "devices": "List the OpenCL devices, whether they work, and which one is used.",
+}
+"""Subcommands and their line in the overview: spelled out here so that `--help` loads none of them."""
+
+_DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+@click.group(
+    cls=LazyGroup,
+    commands_from=("flexgs_edge.cli", COMMANDS),
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(__version__, "-V", "--version", message="flexgs-edge %(version)s")
+def command() -> None:
+    """Make trained 3D Gaussian splatting scenes more than ten times smaller, without training.
+
+    The usual way through, for a scene with its cameras.json and images/ beside it:
+
+    \b
+      flexgs-edge compress scene/point_cloud.ply -o scene.fgs
+      flexgs-edge info scene.fgs
+      flexgs-edge decompress scene.fgs -o decoded.ply
+
+    A scene (INPUT) is a .ply in INRIA's layout, a .fgs, .spz, .sog or .compressed.ply file, or the folder that the 3DGS training
+    program writes. The summary goes to stdout, everything else to stderr; --json gives the same record to programs.
+    Nothing is overwritten without -f.
+
+    Exit codes: 0 done; 2 misuse, bad input or a damaged file; 3 target not reachable; 4 no usable device; 5 memory limit
+    or disk too small; 130 interrupted; 1 a fault of this program. COMMAND --help explains each command, with examples.
+    """
+
+
+def main(argv: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line and leave with its exit code; the only place where errors become messages."""
+    state = State()
+    with suppress(ValueError):  # not the main thread: whoever runs us there has signals in hand
+        signal.signal(signal.SIGTERM, _on_terminate)
+    try:
+        code = command.main(
+            args=None if argv is None else list(argv), prog_name="flexgs-edge", standalone_mode=False, obj=state
+        )
+    except BaseException as error:
+        if state.debug and not isinstance(error, SystemExit):
+            traceback.print_exc()
+        code = _exit_code(error)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _on_terminate(number: int, frame: object) -> NoReturn:
+    """End as Ctrl-C does, so that nothing half-written is left behind."""
+    raise SystemExit(128 + number)
+
+
+def _exit_code(error: BaseException) -> int:
+    """Say what went wrong on stderr; the exit code that goes with it."""
+    if isinstance(error, SystemExit):
+        return error.code if isinstance(error.code, int) else 0
+    if isinstance(error, (KeyboardInterrupt, click.Abort)):
+        return _say("interrupted; nothing half-written was left behind", 130)
+    if isinstance(error, click.ClickException):
+        error.show()
+        return InputError.exit_code
+    if isinstance(error, FlexGSError):
+        return _say(f"error: {error}", error.exit_code)
+    if isinstance(error, MemoryError):
+        return _say(
+            "error: out of memory: set --memory-limit to less than the machine has, so that work is cut into parts", 5
+        )
+    if isinstance(error, OSError) and error.errno in _DISK_FULL:
+        return _say(f"error: the disk is full ({error}); free some space or write elsewhere", 5)
+    if isinstance(error, OSError) and error.filename is not None:
+        return _say(f"error: {error.filename}: {error.strerror}", InputError.exit_code)
+    name = type(error).__name__
+    return _say(
+        f"internal error: {name}: {error}; this is a fault of flexgs-edge: please report it with the output of --debug",
+        1,
+    )
+
+
+def _say(text: Any, code: int) -> int:
+    logging.shutdown()
+    click.echo(f"flexgs-edge: {text}", err=True)
+    return code

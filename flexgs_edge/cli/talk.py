@@ -1,0 +1,60 @@
+"""How a command speaks: the summary to stdout, everything else to stderr."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.progress import Progress
+
+
+@dataclass
+class State:
+    """What `main` must know after a command has failed."""
+
+    debug: bool = False
+
+
+def _set_debug(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    if value and isinstance(ctx.obj, State):
+        ctx.obj.debug = True
+
+
+def start(quiet: bool, json_path: str | None = None, force: bool = False, report: str | None = None) -> Progress:
+    """Set up the log on stderr and check the JSON file before any work; progress bars for the job."""
+    log = logging.getLogger("flexgs_edge")
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("flexgs-edge: %(message)s"))
+    log.handlers = [handler]
+    log.setLevel(logging.WARNING if quiet else logging.INFO)
+    log.propagate = False
+    if json_path not in (None, "-"):
+        from flexgs_edge.files import check_writable
+
+        if report is not None and Path(str(json_path)).resolve() == (Path(report) / "result.json").resolve():
+            raise InputError(f"--json {json_path}: --report {report} writes this file already; leave --json out")
+        check_writable(str(json_path), force)
+    return Progress(enabled=False if quiet else None)
+
+
+def emit(text: str, record: dict[str, Any], json_path: str | None, force: bool = False) -> None:
+    """The summary to stdout; with `--json -` the JSON takes its place and the summary goes to stderr."""
+    click.echo(text, nl=False, err=json_path == "-")
+    if json_path is None:
+        return
+    from flexgs_edge.report.as_json import json_text
+
+    words = json_text(record)
+    if json_path == "-":
+        click.echo(words, nl=False)
+        return
+    from flexgs_edge.files import atomic_write
+
+    with atomic_write(json_path, force) as file:
+        file.write(words.encode())

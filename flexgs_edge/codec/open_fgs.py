@@ -1,0 +1,42 @@
+"""One door for `.fgs` files of every version."""
+
+from __future__ import annotations
+
+import os
+import struct
+
+from flexgs_edge.codec.header import Section
+from flexgs_edge.codec.sections import MAGIC
+from flexgs_edge.codec.v1 import container as v1
+from flexgs_edge.codec.v1.header import Header
+from flexgs_edge.codec.v1.packed_source import FgsSource
+from flexgs_edge.codec.v2 import container as v2
+from flexgs_edge.codec.v2.grid_source import GridSource
+from flexgs_edge.codec.v2.header import GridHeader
+from flexgs_edge.errors import InputError
+
+
+def file_version(path: str | os.PathLike[str]) -> int:
+    """2 for files of version 2; anything else counts as 1, whose reader explains what is wrong with it."""
+    try:
+        with open(path, "rb") as file:
+            start = file.read(10)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read it ({error.strerror})") from error
+    return 2 if start == MAGIC + struct.pack("<H", v2.VERSION) else 1
+
+
+def open_fgs(path: str | os.PathLike[str]) -> FgsSource | GridSource:
+    """A `.fgs` file as a source."""
+    return GridSource(path) if file_version(path) == 2 else FgsSource(path)
+
+
+def read_header(path: str | os.PathLike[str]) -> Header | GridHeader:
+    """The checked header of a file; no values are read."""
+    return v2.GridContainer(path).header if file_version(path) == 2 else v1.read_header(path)
+
+
+def verify(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Section]:
+    """Check every byte of a file: see `v1.verify`."""
+    check = v2.verify_grid if file_version(path) == 2 else v1.verify
+    return check(path, raise_errors)

@@ -1,0 +1,1 @@
+"""Container version 1: bit-packed codes of the method `paper`."""

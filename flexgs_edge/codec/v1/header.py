@@ -1,0 +1,209 @@
+"""Where everything lies in a `.fgs` file of version 1: the header, its checks, and the arithmetic of sizes (docs/format.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from flexgs_edge.codec.header import (
+    MAX_COUNT,
+    PREAMBLE_BYTES,
+    HeaderError,
+    Section,
+    _integer,
+    _origin,
+    _parse,
+    _short,
+    canonical_json,
+)
+from flexgs_edge.constants import MAX_SH_DEGREE
+from flexgs_edge.errors import InputError
+from flexgs_edge.packed.bitpack import plane_bytes
+from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.packed.quantize import QuantizedScene, group_count
+from flexgs_edge.scene.fields import FIELD, FIELDS
+
+CHUNK_ROWS = 65536
+"""Rows of a chunk: a multiple of 8, so that every plane is cut at a byte whatever its bits."""
+HEADER_STEP = 1024
+"""Headers are padded to a multiple of this many bytes."""
+HEADER_MIN = 2048
+"""A normal header fits in this, so that the file's size does not depend on the digits of the figures in it."""
+HEADER_MAX = 1 << 20
+HEADER_OWN = 512
+"""Bytes that the header needs at most beside the settings (counts of 10 digits, numbers of 24)."""
+_KEYS = ("bits", "count", "groups", "origin", "settings", "sh_count", "sh_degree")
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the header of a container says.
+
+    Parameters
+    ----------
+    count, sh_count, sh_degree : int
+        As in `QuantizedScene`.
+    origin : tuple of float
+        World position that the means are relative to.
+    bits : BitSpec
+        Bits per code.
+    groups : dict
+        Groups per channel, by the attribute names of `BitSpec`.
+    settings : dict
+        How the file was made (JSON values).
+    block : int
+        Bytes of the padded header in the file.
+    """
+
+    count: int
+    sh_count: int
+    sh_degree: int
+    origin: tuple[float, float, float]
+    bits: BitSpec
+    groups: dict[str, int]
+    settings: dict[str, Any]
+    block: int = HEADER_MIN
+
+    @classmethod
+    def of_scene(cls, scene: QuantizedScene, settings: Mapping[str, Any]) -> Header:
+        """The header of a quantized scene; raises `InputError` for settings that JSON cannot hold."""
+        groups = {FIELD[name].bits: array.groups for name, array in scene.arrays.items()}
+        x, y, z = (float(value) for value in scene.origin)
+        counts = (scene.count, scene.sh_count, scene.sh_degree)
+        return cls(*counts, (x, y, z), scene.bits, groups, dict(settings), header_block(settings))
+
+    def rows(self, field: str) -> int:
+        """Rows that the array of `field` covers."""
+        return self.sh_count if field == "sh_rest" else self.count
+
+    def width(self, field: str) -> int:
+        """Channels of `field`."""
+        return FIELD[field].width(self.sh_degree)
+
+    @property
+    def tables(self) -> Section:
+        """The range tables (checksum included)."""
+        pairs = sum(self.width(field.name) * self.groups[field.bits] for field in FIELDS)
+        return Section("ranges", PREAMBLE_BYTES + self.block, 8 * pairs + 4)
+
+    @property
+    def chunk_count(self) -> int:
+        """Row chunks."""
+        return -(-self.count // CHUNK_ROWS)
+
+    def chunk_rows(self, chunk: int, field: str) -> int:
+        """Rows of `field` in a chunk."""
+        return min(max(self.rows(field) - chunk * CHUNK_ROWS, 0), CHUNK_ROWS)
+
+    def chunk_bytes(self, chunk: int) -> int:
+        """Bytes of a chunk's planes."""
+        return sum(
+            self.width(field.name) * plane_bytes(self.chunk_rows(chunk, field.name), self.bits.of(field.name))
+            for field in FIELDS
+        )
+
+    def planes(self, chunk: int) -> Iterator[tuple[str, int, int]]:
+        """(field, channel, bytes) of every plane of a chunk in the order of the file."""
+        for field in FIELDS:
+            length = plane_bytes(self.chunk_rows(chunk, field.name), self.bits.of(field.name))
+            for channel in range(self.width(field.name)):
+                yield field.name, channel, length
+
+    def chunks(self) -> Iterator[Section]:
+        """The row chunks in order."""
+        offset = self.tables.offset + self.tables.length
+        for chunk in range(self.chunk_count):
+            length = self.chunk_bytes(chunk)
+            yield Section(f"chunk {chunk}", offset, length)
+            offset += length
+
+    @property
+    def payload(self) -> int:
+        """Bytes of all chunks: a sum over fields, no walk over the chunks (a claimed count may be absurd)."""
+        return sum(self.width(f.name) * plane_bytes(self.rows(f.name), self.bits.of(f.name)) for f in FIELDS)
+
+    @property
+    def chunk_table(self) -> Section:
+        """Lengths and checksums of the chunks (own checksum included)."""
+        offset = self.tables.offset + self.tables.length + self.payload
+        return Section("chunk table", offset, 8 * self.chunk_count + 4)
+
+    @property
+    def file_size(self) -> int:
+        """Bytes of the whole file."""
+        return self.chunk_table.offset + self.chunk_table.length
+
+
+def container_size(
+    count: int,
+    sh_count: int,
+    sh_degree: int,
+    bits: BitSpec,
+    groups: int | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> int:
+    """Exact size of a container in bytes, before anything is quantized.
+
+    Parameters
+    ----------
+    count, sh_count : int
+        Rows, and rows with SH.
+    sh_degree : int
+        The scene's; counts as 0 when `sh_count` is 0.
+    bits : BitSpec
+        Bits per code.
+    groups : int, optional
+        As for `quantize_scene`.
+    settings : mapping, optional
+        Only needed when their JSON is longer than `HEADER_MIN - HEADER_OWN` bytes.
+    """
+    if sh_degree == 0 or sh_count == 0:
+        sh_degree = sh_count = 0
+    per_field = {field.bits: group_count(sh_count if field.name == "sh_rest" else count, groups) for field in FIELDS}
+    block = header_block(settings or {})
+    return Header(count, sh_count, sh_degree, (0.0, 0.0, 0.0), bits, per_field, {}, block).file_size
+
+
+def header_block(settings: Mapping[str, Any]) -> int:
+    """Bytes of the padded header: it depends on the length of the settings alone."""
+    wanted = len(canonical_json(dict(settings))) + HEADER_OWN
+    block = max(HEADER_MIN, -(-wanted // HEADER_STEP) * HEADER_STEP)
+    if block > HEADER_MAX:
+        raise InputError(f"settings: {wanted} bytes of JSON, expected at most {HEADER_MAX - HEADER_OWN}")
+    return block
+
+
+def encode_header(header: Header) -> bytes:
+    """The padded header of the file."""
+    record = asdict(header)
+    del record["block"]  # known from the preamble
+    return canonical_json(record).ljust(header.block)
+
+
+def decode_header(block: bytes) -> Header:
+    """Read and check a padded header; raises `HeaderError` for anything but what `encode_header` can write."""
+    record = _parse(block)
+    if not isinstance(record, dict) or tuple(sorted(record)) != _KEYS:
+        raise HeaderError(f"wanted an object with the keys {', '.join(_KEYS)}, got {_short(record)}")
+    count = _integer("count", record["count"], 0, MAX_COUNT)
+    sh_count = _integer("sh_count", record["sh_count"], 0, count)
+    lowest, highest = (1, MAX_SH_DEGREE) if sh_count else (0, 0)
+    sh_degree = _integer("sh_degree", record["sh_degree"], lowest, highest)
+    bits = BitSpec(**{name: _integer(f"bits.{name}", v, 1, 16) for name, v in _attributes("bits", record["bits"])})
+    groups = {}
+    for field in FIELDS:
+        rows = sh_count if field.name == "sh_rest" else count
+        value = dict(_attributes("groups", record["groups"]))[field.bits]
+        groups[field.bits] = _integer(f"groups.{field.bits}", value, min(rows, 1), rows)
+    settings = record["settings"]
+    if not isinstance(settings, dict):
+        raise HeaderError(f"settings: wanted an object, got {_short(settings)}")
+    return Header(count, sh_count, sh_degree, _origin(record["origin"]), bits, groups, settings, len(block))
+
+
+def _attributes(name: str, value: object) -> list[tuple[str, object]]:
+    names = sorted(field.bits for field in FIELDS)
+    if not isinstance(value, dict) or sorted(value) != names:
+        raise HeaderError(f"{name}: wanted an object with the keys {', '.join(names)}, got {_short(value)}")
+    return list(value.items())

@@ -1,0 +1,152 @@
+"""Quantized scenes as sources: from memory, and from a `.fgs` file by row range."""
+
+from __future__ import annotations
+
+import os
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.codec.v1.container import Container
+from flexgs_edge.codec.v1.header import CHUNK_ROWS
+from flexgs_edge.packed.bitpack import plane_bytes
+from flexgs_edge.packed.quantize import QuantizedArray, QuantizedScene, dequantize_part
+from flexgs_edge.scene.fields import FIELDS
+from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
+
+
+class CodedSource(SceneSource):
+    """A scene whose values are dequantized where they are read."""
+
+    @abstractmethod
+    def quantized(self) -> QuantizedScene:
+        """The codes and ranges of the whole scene."""
+
+    @abstractmethod
+    def _chunk(self, chunk: int) -> tuple[int, dict[str, QuantizedArray]]:
+        """The arrays that hold a chunk's rows, and the row at which their planes start."""
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`; a chunk whose rows are sparse is dequantized from the first to the last of them."""
+        rows, planes = self.begin_read(rows, fields, out)
+        for chunk, wanted, place in by_chunk(rows, np.arange(0, self.count, CHUNK_ROWS)):
+            first, arrays = self._chunk(chunk)
+            for field, plane in planes.items():
+                _fill(arrays[field], first, wanted, plane[:, place])
+        return planes
+
+
+class QuantizedSource(CodedSource):
+    """A quantized scene in memory.
+
+    Parameters
+    ----------
+    scene : QuantizedScene
+        Not copied.
+    name : str, optional
+        For messages.
+    """
+
+    def __init__(self, scene: QuantizedScene, name: str = "quantized scene") -> None:
+        self.name, self.notes = name, ()
+        self.count, self.sh_degree, self.sh_count = scene.count, scene.sh_degree, scene.sh_count
+        self.origin = scene.origin
+        self._scene = scene
+
+    def quantized(self) -> QuantizedScene:
+        """See `CodedSource.quantized`: the scene given."""
+        return self._scene
+
+    def _chunk(self, chunk: int) -> tuple[int, dict[str, QuantizedArray]]:
+        return 0, self._scene.arrays
+
+
+class FgsSource(CodedSource):
+    """A `.fgs` file as a scene. The ranges are held; chunks are read when touched, checked, and the last one is kept.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Attributes
+    ----------
+    settings : dict
+        How the file was made.
+
+    Raises
+    ------
+    FormatError
+        When the file differs from the format, here or when a damaged chunk is read.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.container = Container(path)
+        header = self.container.header
+        self.name, self.notes = str(path), ()
+        self.count, self.sh_degree, self.sh_count = header.count, header.sh_degree, header.sh_count
+        self.origin = np.array(header.origin, np.float64)
+        self.settings: dict[str, Any] = header.settings
+        self._ranges = self.container.read_ranges()
+        self._table = self.container.read_chunk_table()
+        self._last: tuple[int, dict[str, QuantizedArray]] | None = None
+
+    def quantized(self) -> QuantizedScene:
+        """See `CodedSource.quantized`; reads and checks every chunk of the file."""
+        header = self.container.header
+        arrays = {
+            field.name: self._array(
+                field.name,
+                np.empty(
+                    (self.width(field.name), plane_bytes(header.rows(field.name), header.bits.of(field.name))), np.uint8
+                ),
+            )
+            for field in FIELDS
+        }
+        for chunk, entry in enumerate(self._table):
+            for name, part in self._cut(chunk, self.container.read_chunk(entry)).items():
+                start = chunk * (CHUNK_ROWS // 8) * part.bits
+                arrays[name].planes[:, start : start + part.planes.shape[1]] = part.planes
+        return QuantizedScene(self.count, self.sh_count, self.sh_degree, self.origin, arrays)
+
+    def _chunk(self, chunk: int) -> tuple[int, dict[str, QuantizedArray]]:
+        if self._last is None or self._last[0] != chunk:
+            self._last = None  # before the next one is read, not after: one chunk in memory, not two
+            self._last = (chunk, self._cut(chunk, self.container.read_chunk(self._table[chunk])))
+        return chunk * CHUNK_ROWS, self._last[1]
+
+    def _cut(self, chunk: int, data: bytes) -> dict[str, QuantizedArray]:
+        """The six arrays of a chunk's bytes (views, not copies)."""
+        header = self.container.header
+        packed = np.frombuffer(data, np.uint8)
+        arrays = {}
+        at = 0
+        for field in FIELDS:
+            rows, channels = header.chunk_rows(chunk, field.name), self.width(field.name)
+            length = plane_bytes(rows, header.bits.of(field.name))
+            planes = packed[at : at + channels * length].reshape(channels, length)
+            arrays[field.name] = self._array(field.name, planes)
+            at += channels * length
+        return arrays
+
+    def _array(self, field: str, planes: np.ndarray) -> QuantizedArray:
+        header = self.container.header
+        low, step = self._ranges[field]
+        return QuantizedArray(header.bits.of(field), header.rows(field), self.width(field), low, step, planes)
+
+
+def _fill(array: QuantizedArray, first: int, rows: Rows, out: np.ndarray) -> None:
+    """Dequantize `rows` into `out` [c, n]; rows beyond the array (SH of rows that have none) are zero."""
+    if isinstance(rows, slice):
+        here = slice(min(rows.start, array.count), min(rows.stop, array.count))
+        dequantize_part(array, first, here, out[:, : here.stop - here.start])
+        out[:, here.stop - here.start :] = 0
+        return
+    inside = rows < array.count
+    out[:, ~inside] = 0
+    if inside.any():
+        chosen = rows[inside]
+        start = int(chosen.min())
+        out[:, inside] = dequantize_part(array, first, slice(start, int(chosen.max()) + 1))[:, chosen - start]

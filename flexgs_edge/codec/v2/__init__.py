@@ -1,0 +1,1 @@
+"""Container version 2: entropy-coded grids of the method `best`."""

@@ -1,0 +1,39 @@
+"""Where the chunks of a coded scene begin and end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flexgs_edge.codec.v2.rans import StreamError
+
+CHUNK_ROWS = 65536
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Rows [start, stop) of a scene, all of one layer."""
+
+    layer: int
+    start: int
+    stop: int
+
+
+def plan_chunks(layers: list[int], chunk_rows: int = CHUNK_ROWS) -> list[Chunk]:
+    """The chunks of a scene whose layers have these numbers of rows."""
+    chunks, at = [], 0
+    for layer, count in enumerate(layers):
+        for start in range(at, at + count, chunk_rows):
+            chunks.append(Chunk(layer, start, min(start + chunk_rows, at + count)))
+        at += count
+    return chunks
+
+
+def least_bytes(rows: int) -> int:
+    """Smallest size of the chunk of so many rows: even, and a bit a row."""
+    return -(-rows // 16) * 2
+
+
+def check_end(data: bytes, rows: int, used: int) -> None:
+    """Raise `StreamError` unless `used` bytes are the whole stream, or zeros fill it up to the least bytes of a chunk."""
+    if any(data[used:]) or (len(data) > used and len(data) != least_bytes(rows)):
+        raise StreamError(f"stream: wanted {used} bytes, got {len(data)}")

@@ -1,0 +1,302 @@
+"""Writing, opening, cutting and verifying `.fgs` files, version 2 (docs/format.md)."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, BinaryIO, TypeVar
+
+import numpy as np
+
+from flexgs_edge.codec.header import PREAMBLE_BYTES, Section, format_error
+from flexgs_edge.codec.sections import ChunkEntry, SectionFile, Verification, checked, preamble
+from flexgs_edge.codec.v2.channels import Channels
+from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes
+from flexgs_edge.codec.v2.decode import decode_chunk
+from flexgs_edge.codec.v2.device.launch import Device
+from flexgs_edge.codec.v2.encode import Encoded, encode_grid
+from flexgs_edge.codec.v2.header import HEADER_MOST, GridHeader, decode_header, encode_header
+from flexgs_edge.codec.v2.model import Model
+from flexgs_edge.codec.v2.octree import TooManyNodes
+from flexgs_edge.codec.v2.rans import StreamError
+from flexgs_edge.codec.v2.walk import ChunkCodes
+from flexgs_edge.errors import InputError, TargetError
+from flexgs_edge.files import atomic_write
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.memory.storage import MEMORY, Room
+
+VERSION = 2
+
+Result = TypeVar("Result")
+
+
+def write_grid(
+    path: str | os.PathLike[str],
+    grid: GridScene,
+    settings: Mapping[str, Any],
+    *,
+    force: bool = False,
+    chunk_rows: int = CHUNK_ROWS,
+    device: Device | None = None,
+    encoded: Encoded | None = None,
+    room: Room = MEMORY,
+) -> int:
+    """Encode a grid scene into a file, which appears under its name only when it is complete.
+
+    Parameters
+    ----------
+    path : path
+        Usually ends in `.fgs`.
+    grid : GridScene
+        From `to_grid`.
+    settings : mapping
+        JSON values that say how the file was made: nothing that differs between runs or machines.
+    force : bool, optional
+        Replace a file that exists.
+    chunk_rows : int, optional
+        Rows of a chunk, at most 65536.
+    device : Device, optional
+        Counts symbols, with the same result.
+    encoded : Encoded, optional
+        `encode_grid(grid, chunk_rows)`, where it is known already.
+    room : Room, optional
+        Where symbols lie until they are written.
+
+    Returns
+    -------
+    int
+        Bytes of the file, as `coded_size` predicts.
+    """
+    encoded = encoded or encode_grid(grid, chunk_rows, device, room)
+    model = encoded.model.to_bytes()
+    header = _header(grid, encoded, len(model), settings, chunk_rows)
+    with atomic_write(path, force) as file:
+        file.seek(PREAMBLE_BYTES)
+        file.write(encode_header(header))
+        file.write(checked(model))
+        entries = []
+        for stream in encoded.streams():
+            entries.append((len(stream), zlib.crc32(stream)))
+            file.write(stream)
+        return _finish(file, header, entries)
+
+
+def coded_size(
+    grid: GridScene,
+    settings: Mapping[str, Any],
+    chunk_rows: int = CHUNK_ROWS,
+    device: Device | None = None,
+    encoded: Encoded | None = None,
+    room: Room = MEMORY,
+) -> int:
+    """Exact bytes of the file that `write_grid` makes of these arguments."""
+    encoded = encoded or encode_grid(grid, chunk_rows, device, room)
+    header = _header(grid, encoded, len(encoded.model.to_bytes()), settings, chunk_rows)
+    return header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes
+
+
+def trim_container(
+    source: str | os.PathLike[str], path: str | os.PathLike[str], max_size: int, force: bool = False
+) -> int:
+    """Copy as many whole layers as fit into `max_size` bytes; returns the bytes of the new file.
+
+    Raises
+    ------
+    TargetError
+        When not even the first layer fits.
+    """
+    container = GridContainer(source)
+    if os.path.realpath(source) == os.path.realpath(path):
+        raise InputError(f"{path}: expected another file than the one to cut")
+    entries = container.read_table()
+    for layers in range(len(container.header.layers), 0, -1):
+        header = container.header
+        kept = [entry for entry, chunk in zip(entries, header.chunks(), strict=True) if chunk.layer < layers]
+        if layers < len(header.layers):
+            header = header.cut(layers, container.size)
+        payload = sum(entry.section.length for entry in kept)
+        size = header.model.offset + header.model.length + payload + header.table_bytes
+        if size <= max_size:
+            break
+    else:
+        raise TargetError(f"{source}: its first layer needs {size} bytes, {max_size} are allowed")
+    with container.open() as old, atomic_write(path, force) as file:
+        file.seek(PREAMBLE_BYTES)
+        file.write(encode_header(header))
+        file.write(checked(container.read_section(old, container.header.model)))
+        for entry in kept:
+            container.copy_chunk(old, entry, file)
+        return _finish(file, header, [(entry.section.length, entry.checksum) for entry in kept])
+
+
+def _header(
+    grid: GridScene, encoded: Encoded, model_bytes: int, settings: Mapping[str, Any], chunk_rows: int
+) -> GridHeader:
+    low = encoded.low.tolist()
+    channels = Channels.of(_by_alphabet(encoded.model, encoded.bits), [band.shape[1] for band in grid.sh])
+    return GridHeader.of_grid(
+        grid, encoded.layers, low, encoded.model.depth, chunk_rows, model_bytes, settings, channels
+    )
+
+
+def _by_alphabet(model: Model, bits: np.ndarray) -> dict[str, float]:
+    """Bytes by the names of alphabets."""
+    names = ["position", "repeats", *(group.kind.name for group in model.groups)]
+    return dict(zip(names, (bits / 8).tolist(), strict=True))
+
+
+def _finish(file: BinaryIO, header: GridHeader, entries: Sequence[tuple[int, int]]) -> int:
+    """Write the chunk table and, last, the preamble; returns the size of the file."""
+    file.write(checked(np.array(entries, "<u4").tobytes()))
+    size = file.tell()
+    block = encode_header(header)
+    file.seek(0)
+    file.write(preamble(VERSION, size, block))
+    return size
+
+
+class GridContainer(SectionFile):
+    """A version 2 file whose header has been checked against the file's size.
+
+    Parameters
+    ----------
+    path : path
+        The file; opened for each read, never held.
+
+    Raises
+    ------
+    FormatError
+        When anything differs from the format; names the byte, what was wanted and what was found.
+    InputError
+        When the file cannot be read at all.
+    """
+
+    version = VERSION
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        super().__init__(path)
+        with self.open() as file:
+            size = self.size = os.fstat(file.fileno()).st_size
+
+            def wrong_size(header: GridHeader) -> str:
+                least = header.least_size
+                return "" if least <= size else f"its counts make a file of at least {least}"
+
+            self.header = self._read_header(file, size, _wrong_length, decode_header, wrong_size)
+
+    def read_model(self) -> Model:
+        """The model, checked."""
+        header = self.header
+        with self.open() as file:
+            data = self.read_section(file, header.model)
+        try:
+            return Model.from_bytes(data, header.sh_degree, header.depth)
+        except StreamError as error:
+            raise format_error(self.path, header.model.offset, f"model: {error}") from None
+
+    def read_table(self) -> list[ChunkEntry]:
+        """Place and checksum of every chunk, checked: they must fill the file."""
+        section = self.header.table(self.size)
+        with self.open() as file:
+            table = np.frombuffer(self.read_section(file, section), "<u4").reshape(-1, 2)
+        entries = []
+        offset = self.header.model.offset + self.header.model.length
+        for i, (chunk, (length, checksum)) in enumerate(zip(self.header.chunks(), table.tolist(), strict=True)):
+            least = least_bytes(chunk.stop - chunk.start)
+            if length < least or length % 2:
+                raise format_error(
+                    self.path,
+                    section.offset + 8 * i,
+                    f"chunk {i}: length: wanted an even {least} or more, got {length}",
+                )
+            entries.append(ChunkEntry(Section(f"chunk {i}", offset, length), checksum))
+            offset += length
+        if offset != section.offset:
+            raise format_error(
+                self.path, section.offset, f"chunk table: wanted chunks that end at {section.offset}, got {offset}"
+            )
+        return entries
+
+    def decode(self, model: Model, chunk: Chunk, entry: ChunkEntry, base_only: bool = False) -> ChunkCodes:
+        """The codes of a chunk, checked."""
+        return self._decode(model, chunk, entry, base_only, None)
+
+    def decode_on(
+        self,
+        decode: Callable[[list[tuple[int, bytes]]], Sequence[Result | ValueError]],
+        chunks: Sequence[tuple[Chunk, ChunkEntry]],
+    ) -> list[Result]:
+        """What `decode` makes of the rows and bytes of some chunks; an error of a chunk is raised in its name."""
+        jobs = [(chunk.stop - chunk.start, self.read_chunk(entry)) for chunk, entry in chunks]
+        results: list[Result] = []
+        for (_, entry), result in zip(chunks, decode(jobs), strict=True):
+            if isinstance(result, ValueError):
+                raise format_error(self.path, entry.section.offset, f"{entry.section.name}: {result}")
+            results.append(result)
+        return results
+
+    def cost(self, model: Model, chunk: Chunk, entry: ChunkEntry, cost: np.ndarray) -> ChunkCodes:
+        """Decode a chunk, and add the bits of every alphabet in it to `cost`."""
+        return self._decode(model, chunk, entry, False, cost)
+
+    def _decode(
+        self, model: Model, chunk: Chunk, entry: ChunkEntry, base_only: bool, cost: np.ndarray | None
+    ) -> ChunkCodes:
+        section = entry.section
+        data = self.read_chunk(entry)
+        try:
+            return decode_chunk(model, chunk.stop - chunk.start, data, base_only, cost)
+        except (StreamError, TooManyNodes) as error:
+            raise format_error(self.path, section.offset, f"{section.name}: {error}") from None
+
+
+def verify_grid(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Section]:
+    """Check every byte of a version 2 file, reading it in pieces; see `container.verify`."""
+    container = GridContainer(path)
+    header = container.header
+    found = Verification(header.block, raise_errors)
+    found.check(header.model, container.read_model)
+    # Without the table nothing says where a chunk ends.
+    table = header.table(container.size)
+    start = header.model.offset + header.model.length
+    chunks = [Section("chunks", start, table.offset - start)]
+    return found.check_chunks(container, table, container.read_table, chunks)
+
+
+def _wrong_length(length: int, room: int) -> str:
+    most = min(HEADER_MOST, room)
+    return "" if length <= most else f"wanted at most {most}"
+
+
+def channel_bytes(
+    path: str | os.PathLike[str], look: Callable[[Chunk, ChunkEntry, ChunkCodes], None] | None = None
+) -> dict[str, float]:
+    """Bytes that each channel costs in a version 2 file, by name; the rest of the file by section.
+
+    All chunks are decoded for this; `look` sees each in turn.
+    """
+    container = GridContainer(path)
+    model = container.read_model()
+    cost = np.zeros(len(model.tables))
+    entries = container.read_table()
+    for chunk, entry in zip(container.header.chunks(), entries, strict=True):
+        codes = container.cost(model, chunk, entry, cost)
+        if look is not None:
+            look(chunk, entry, codes)
+    table = _by_alphabet(model, cost)
+    payload = sum(entry.section.length for entry in entries)
+    table["lanes"] = payload - float(cost.sum()) / 8
+    table["model"] = float(container.header.model.length)
+    table["header"] = float(container.size - payload) - table["model"]
+    return table
+
+
+__all__ = [
+    "GridContainer",
+    "channel_bytes",
+    "coded_size",
+    "trim_container",
+    "verify_grid",
+    "write_grid",
+]

@@ -1,0 +1,131 @@
+"""What is known of a row before it is decoded: rows near it on the curve, and its own earlier channels.
+
+Rows are coded in dyadic passes: first those at multiples of 2^top, then the odd multiples of 2^(top-1), and so on; every
+row has decoded rows on both sides, and a pass is one vector operation. All numbers are integers that float32 (features
+of one row) or float64 (weighted sums) hold exactly, so that decoders agree to the bit; neighbour weights take single
+float32 operations in a written order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexgs_edge.codec.v2.features import Features
+from flexgs_edge.constants import COARSE_ROWS, VALUE_LIMIT
+
+REACH = (4, 2)
+"""Neighbours on each side for the base channels, and for SH: they are many, and half the reach costs 1 % of their bits."""
+ONE = 256
+"""Features count in 1/256 of a code."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """Some rows of one pass and where their neighbours lie.
+
+    Parameters
+    ----------
+    rows : slice
+        The rows, with a step.
+    known : slice
+        The rows decoded before.
+    weights : np.ndarray or None
+        [2 * reach, m] f32 weights of the neighbours, about 256 in all; None for the first pass.
+    stride : int
+        1, or so many rows of the pass for each one of `rows`.
+    """
+
+    rows: slice
+    known: slice
+    weights: np.ndarray | None
+    stride: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """All passes, and for each row 256 * bits of the squared distance to its nearest neighbour (0 in the first pass)."""
+
+    passes: list[Pass]
+    near: Features
+
+
+def plan_passes(position: np.ndarray, reach: int, stride: int = 1) -> Plan:
+    """The passes over rows at `position` ([3, n] integer cells).
+
+    Parameters
+    ----------
+    position : np.ndarray
+        [3, n].
+    reach : int
+        Neighbours on each side.
+    stride : int, optional
+        One row in so many of every pass is wanted: a sample.
+    """
+    count = position.shape[1]
+    near = Features(1, count)
+    if count == 0:
+        return Plan([], near)
+    top = max((count - 1) // COARSE_ROWS, 0).bit_length()
+    points = np.ascontiguousarray(position, np.float32)
+    passes = [Pass(slice(0, count, stride << top), slice(0, 0), None, stride)]
+    for k in range(top - 1, -1, -1):
+        rows, known = slice(1 << k, count, (2 << k) * stride), slice(0, count, 2 << k)
+        here = points[:, rows]
+        squares = np.zeros((2 * reach, here.shape[1]), np.float32)
+        for axis in range(3):
+            away = _neighbours(points[axis, known], here.shape[1], reach, stride) - here[axis]
+            away *= away
+            squares += away
+        bits = np.frexp(squares.min(axis=0) + np.float32(1))[1]
+        near.values[0, rows] = bits * np.float32(ONE)
+        squares += np.float32(1)
+        np.divide(np.float32(1), squares, out=squares)
+        total = squares[0].copy()
+        for square in squares[1:]:
+            total += square
+        squares *= np.float32(ONE) / total
+        passes.append(Pass(rows, known, np.rint(squares, out=squares), stride))
+    near.seal()
+    return Plan(passes, near)
+
+
+def _neighbours(known: np.ndarray, count: int, reach: int, stride: int) -> np.ndarray:
+    """[2 * reach, count] of both sides of `count` rows: row j lies between `known` j and j + 1; ends are repeated."""
+    padded = np.concatenate([np.repeat(known[:1], reach - 1), known, np.repeat(known[-1:], reach)])
+    # Overlapping views of one array (as_strided takes ten times as long to make them).
+    step = padded.itemsize
+    return np.ndarray((2 * reach, count), padded.dtype, padded, 0, (step, stride * step))
+
+
+def neighbour_features(values: np.ndarray, step: Pass) -> tuple[np.ndarray, ...]:
+    """Weighted mean and spread of the neighbours of a pass, each [m] f32 in 1/256; nothing in the first pass.
+
+    Parameters
+    ----------
+    values : np.ndarray
+        [n] f32 values of the channel, of which those at `step.known` are decoded.
+    step : Pass
+        The pass.
+    """
+    if step.weights is None:
+        return ()
+    reach, count = len(step.weights) // 2, step.weights.shape[1]
+    there = _neighbours(values[step.known], count, reach, step.stride)
+    # All products and sums are integers that float32 holds: their order does not matter.
+    parts = step.weights * there
+    mean = np.add.reduce(parts, axis=0)
+    middle = mean * np.float32(1 / ONE)
+    middle += np.float32(0.5)
+    np.floor(middle, middle)
+    np.subtract(there, middle, parts)
+    np.abs(parts, parts)
+    parts *= step.weights
+    return mean, np.add.reduce(parts, axis=0)
+
+
+def limited(values: np.ndarray) -> np.ndarray:
+    """Values [n] as f32 that predictions may use."""
+    kept: np.ndarray = values.astype(np.float32)
+    return np.clip(kept, np.float32(-VALUE_LIMIT), np.float32(VALUE_LIMIT), out=kept)

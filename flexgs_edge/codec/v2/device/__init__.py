@@ -1,0 +1,1 @@
+"""Version 2 coded and decoded by kernels."""

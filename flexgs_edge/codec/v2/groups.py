@@ -1,0 +1,273 @@
+"""Groups of channels that share one prediction and one set of tables: the fitted half of the format."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexgs_edge.codec.v2.features import Sums, Term, add_own, add_terms, constant
+from flexgs_edge.codec.v2.rans import StreamError
+from flexgs_edge.codec.v2.tables import CONTEXTS_MOST, SYMBOLS_MOST
+
+_HEAD = struct.Struct("<iBiHBBB")
+MEAN_BUCKETS = 12
+SPREAD_BUCKETS = 5
+"""Contexts of symbols that are values: 12 times 5 (8 x 4 costs 0.1 bits a Gaussian more, 16 x 8 gains 0.05 before its
+tables)."""
+RESIDUAL_BUCKETS = 12
+"""Contexts of symbols that are residuals: 12 times the side of the rounding."""
+SYMBOL_ROOM = 192
+"""Symbols of an alphabet that are fitted to the values: a finer step gives raw low bits, not a longer table."""
+_RARE = 2000
+"""One in so many values may lie outside the alphabet at either end: an escape costs 32 bits more."""
+_RARE_FEW = 8
+"""And as many as this (in 50 each) where values are few, so that one outlier does not stretch the alphabet."""
+_FAR = 4
+"""Samples with a number beyond so many times all but the rare ones are not fitted to: one would outweigh the rest."""
+
+
+@dataclass(frozen=True)
+class GroupKind:
+    """What the format fixes for a group.
+
+    Parameters
+    ----------
+    name : str
+        For reports.
+    features : int
+        Numbers that its prediction takes.
+    residual : bool
+        Whether symbols are differences from the prediction, or values.
+    sh : bool
+        Whether a scene without SH has none of it.
+    """
+
+    name: str
+    features: int
+    residual: bool
+    sh: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """The fitted numbers of a group.
+
+    Parameters
+    ----------
+    centre : int
+        Added to every prediction.
+    low : int
+        Code of symbol 0.
+    shift : int
+        Low bits that are coded raw.
+    symbols : int
+        Size of the alphabet; the last symbol is the escape, unless nothing was escaped.
+    weights : np.ndarray
+        [2, features + 1] i16, in 1/256: of the value, and of the size of the error; the constant last.
+    cuts : tuple of np.ndarray
+        Thresholds [<= 15] i32, ascending: of the predicted value in 1/16 (residual groups: none, the side of the
+        rounding is taken), and of the predicted error in 1/64.
+    """
+
+    kind: GroupKind
+    centre: int
+    low: int
+    shift: int
+    symbols: int
+    weights: np.ndarray
+    cuts: tuple[np.ndarray, np.ndarray]
+
+    @property
+    def contexts(self) -> int:
+        """Number of contexts."""
+        means = 2 if self.kind.residual else len(self.cuts[0]) + 1
+        return means * (len(self.cuts[1]) + 1)
+
+    @property
+    def start(self) -> int:
+        """What is added to every symbol: the code of symbol 0, and in groups of residuals the centre."""
+        return self.centre * self.kind.residual + self.low
+
+    def known(self, terms: Sequence[Term], count: int, before: Sums | None = None) -> Sums:
+        """The part of the prediction of `count` rows that features known for all of them make, added to a part before."""
+        weights = self.weights.astype(np.float64)
+        return add_terms(constant(256 * weights[:, -1], count) if before is None else before, weights, terms)
+
+    def predict(self, known: Sums, rows: slice, own: Sequence[np.ndarray]) -> tuple[np.ndarray | float, np.ndarray]:
+        """What to subtract from the codes ([m] f32 or f64, or one number), and contexts [m] u8.
+
+        Parameters
+        ----------
+        known : Sums
+            From `known`, of all rows.
+        rows : slice
+            The rows.
+        own : sequence of np.ndarray
+            Mean and spread of their neighbours, [m] f32 each; none in the first pass.
+        """
+        mean, error = add_own(known, rows, self.weights[:, :2].astype(np.float64), own)
+        # A threshold that float32 rounds lies beyond every sum that it holds.
+        spread = _bucket(error, [1024.0 * cut for cut in self.cuts[1].tolist()])
+        levels = np.uint8(len(self.cuts[1]) + 1)
+        start = float(self.start)
+        if not self.kind.residual:
+            place = _bucket(mean, [4096.0 * cut for cut in self.cuts[0].tolist()])
+            place *= levels
+            place += spread
+            return start, place
+        whole = mean * mean.dtype.type(1 / 65536)
+        whole += mean.dtype.type(0.5)
+        np.floor(whole, whole)
+        side = (mean >= whole * mean.dtype.type(65536)).view(np.uint8)
+        side *= levels
+        side += spread
+        return whole.astype(np.float64) + start, side
+
+    def to_bytes(self) -> bytes:
+        """The record of the file."""
+        head = _HEAD.pack(
+            self.centre, self.shift, self.low, self.symbols, *(len(cut) for cut in self.cuts), bool(self.weights.any())
+        )
+        weights = self.weights.astype("<i2").tobytes() if self.weights.any() else b""
+        return head + weights + b"".join(cut.astype("<i4").tobytes() for cut in self.cuts)
+
+    @classmethod
+    def read(cls, kind: GroupKind, data: bytes, at: int) -> tuple[Group, int]:
+        """A group's record at byte `at`, and the byte behind it."""
+        if len(data) < at + _HEAD.size:
+            raise StreamError(f"group {kind.name}: wanted {_HEAD.size} bytes, got {len(data) - at}")
+        centre, shift, low, symbols, *lengths, weighted = _HEAD.unpack_from(data, at)
+        at += _HEAD.size
+        size = 4 * (kind.features + 1) if weighted else 0
+        end = at + size + 4 * sum(lengths)
+        if weighted > 1 or shift > 24 or not 1 <= symbols <= SYMBOLS_MOST or max(lengths) > 15 or end > len(data):
+            raise StreamError(
+                f"group {kind.name}: wanted a record within its limits, got {data[at - _HEAD.size : at]!r}"
+            )
+        weights = np.zeros((2, kind.features + 1), np.int16)
+        if weighted:
+            weights[:] = np.frombuffer(data, "<i2", size // 2, at).reshape(2, -1)
+        cuts = np.frombuffer(data, "<i4", sum(lengths), at + size)
+        group = cls(kind, centre, low, shift, symbols, weights, (cuts[: lengths[0]], cuts[lengths[0] :]))
+        if group.contexts > CONTEXTS_MOST:
+            raise StreamError(f"group {kind.name}: wanted at most {CONTEXTS_MOST} contexts, got {group.contexts}")
+        return group, end
+
+
+def _bucket(values: np.ndarray, cuts: Sequence[float]) -> np.ndarray:
+    """[m] u8: how many of the cuts are at most the value."""
+    result, beyond = np.zeros(len(values), np.uint8), np.empty(len(values), bool)
+    for cut in cuts:
+        np.greater_equal(values, values.dtype.type(cut), beyond)
+        result += beyond.view(np.uint8)
+    return result
+
+
+def fit_group(kind: GroupKind, batches: list[tuple[list[np.ndarray], np.ndarray]]) -> Group:
+    """Least-squares weights, thresholds at quantiles and the alphabet, from samples (features, codes)."""
+    empty = np.zeros(0, np.int32)
+    codes = np.concatenate([code for _, code in batches]) if batches else np.zeros(0, np.int64)
+    if codes.size == 0 or codes.min() == codes.max():
+        value = int(codes[0]) if codes.size else 0
+        return Group(
+            kind, value, 0 if kind.residual else value, 0, 2, np.zeros((2, kind.features + 1), np.int16), (empty, empty)
+        )
+    centre = int(np.sort(codes)[len(codes) // 2])
+    matrix = np.empty((kind.features + 1, len(codes)))
+    matrix[-1], at = 256, 0
+    for features, _ in batches:
+        end = at + len(features[0])
+        for row, feature in zip(matrix, features, strict=False):
+            row[at:end] = feature
+        at = end
+    target = (codes - centre) * 256.0
+    usual = _usual(target)
+    for row in matrix[:-1]:
+        usual &= _usual(row)
+    solve = _LeastSquares(matrix[:, usual])
+    mean = solve(target[usual])
+    guess = mean.astype(np.float64) @ matrix
+    error = solve(np.abs(np.rint(target - guess / 256))[usual])
+    size = error.astype(np.float64) @ matrix
+    cuts = (
+        empty if kind.residual else _quantiles(np.floor(guess / 4096), MEAN_BUCKETS),
+        _quantiles(np.floor(size / 1024), RESIDUAL_BUCKETS if kind.residual else SPREAD_BUCKETS),
+    )
+    symbols = codes - (np.floor(guess / 65536 + 0.5).astype(np.int64) + centre if kind.residual else 0)
+    low, shift, count = _alphabet(symbols)
+    return Group(kind, centre, low, shift, count, np.stack([mean, error]), cuts)
+
+
+def _rare(count: int) -> int:
+    """How many of `count` numbers may be outliers, at either end."""
+    return max(count // _RARE, min(_RARE_FEW, count // 50))
+
+
+def _usual(values: np.ndarray) -> np.ndarray:
+    """[m] bool: which values are no outliers."""
+    sizes = np.abs(values)
+    last = len(sizes) - 1 - _rare(len(sizes))
+    usual: np.ndarray = sizes <= _FAR * np.partition(sizes, last)[last] + _FAR * 256
+    return usual
+
+
+def _alphabet(symbols: np.ndarray) -> tuple[int, int, int]:
+    """Lowest code, raw low bits and size of an alphabet, with room for an escape at its end."""
+    ordered = np.sort(symbols)
+    rare = _rare(len(ordered))
+    low, high = int(ordered[rare]), int(ordered[-1 - rare])
+    span = high - low + 1
+    # A short range need not be cut: a symbol costs less than an escape.
+    if int(ordered[-1]) - int(ordered[0]) < SYMBOL_ROOM:
+        low, span = int(ordered[0]), int(ordered[-1]) - int(ordered[0]) + 1
+    shift = max((span - 1) // SYMBOL_ROOM, 0).bit_length()
+    return low, shift, ((span + (1 << shift) - 1) >> shift) + 1
+
+
+def _quantiles(values: np.ndarray, count: int) -> np.ndarray:
+    ordered = np.sort(values)
+    cuts = ordered[len(ordered) * np.arange(1, count) // count]
+    cuts = np.unique(cuts[cuts > ordered[0]])
+    kept: np.ndarray = np.clip(cuts, -(2**31), 2**31 - 1).astype(np.int32)
+    return kept
+
+
+class _LeastSquares:
+    """[f] i16 weights in 1/256 for target ~ weights . features, all in 1/256.
+
+    Features [f, m] are scaled to 13 bits, so that their products add up exactly and every machine finds the same weights.
+    """
+
+    def __init__(self, features: np.ndarray) -> None:
+        self.scales = np.array([_scale(row) for row in features])
+        self.small = np.rint(features * self.scales[:, None])
+        self.normal = self.small @ self.small.T
+        # A little of the mean square on the diagonal: constant and repeated features get small weights, not large ones.
+        self.normal[np.diag_indices_from(self.normal)] += features.shape[1]
+
+    def __call__(self, target: np.ndarray) -> np.ndarray:
+        scale = _scale(target)
+        weights = _solve(self.normal, self.small @ np.rint(target * scale)) * self.scales / scale
+        rounded: np.ndarray = np.clip(np.rint(weights * 256), -32767, 32767).astype(np.int16)
+        return rounded
+
+
+def _scale(values: np.ndarray) -> float:
+    """The power of two that brings values to 13 bits."""
+    largest: int = int(np.abs(values).max())
+    return float(2.0 ** -max(largest.bit_length() - 13, 0))
+
+
+def _solve(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solution of a positive definite system by elimination in a fixed order (a library's order may differ)."""
+    rows = np.append(normal, right[:, None], axis=1)
+    size = len(right)
+    for i in range(size):
+        rows[i] /= rows[i, i]
+        for j in range(size):
+            if j != i:
+                rows[j] -= rows[i] * rows[j, i]
+    return rows[:, -1]

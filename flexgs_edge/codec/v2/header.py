@@ -1,0 +1,260 @@
+"""The header of a `.fgs` file of version 2, its checks, and where everything lies (docs/format.md)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from flexgs_edge.codec.header import (
+    MAX_COUNT,
+    PREAMBLE_BYTES,
+    HeaderError,
+    Section,
+    _integer,
+    _origin,
+    _parse,
+    _short,
+    canonical_json,
+)
+from flexgs_edge.codec.v2.channels import COUNT_MOST, Channels, channel_parts
+from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes, plan_chunks
+from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
+from flexgs_edge.errors import InputError
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.step_sizes import POSITION_BITS, Steps
+
+HEADER_MOST = 1 << 20
+MODEL_MOST = 1 << 20
+"""Bytes of the model: 59 alphabets of 256 symbols and 64 tables stay below."""
+LAYERS_MOST = 256
+
+_KEYS = (
+    "chunk_rows",
+    "count",
+    "cut_from",
+    "depth",
+    "layers",
+    "low",
+    "model_bytes",
+    "origin",
+    "settings",
+    "sh_degree",
+    "steps",
+)
+_OPTIONAL = "channels"
+
+
+@dataclass(frozen=True)
+class GridHeader:
+    """What the header of a version 2 file says.
+
+    Parameters
+    ----------
+    count, sh_degree : int
+        As in `GridScene`.
+    origin : tuple of float
+        World position that positions are relative to.
+    steps : dict
+        `Steps.to_json`.
+    layers : tuple of int
+        Rows of each layer.
+    chunk_rows : int
+        Rows of a chunk; the last of a layer may have fewer.
+    depth : int
+        Levels of the octrees.
+    low : tuple of int
+        Position code of the octrees' first cell.
+    model_bytes : int
+        Bytes of the model.
+    settings : dict
+        How the file was made.
+    cut_from : dict or None
+        `bytes`, `count` and `layers` of the file that this one was cut from.
+    channels : Channels or None
+        What is known without decoding; not of a file that was cut, nor of one that an early writer made.
+    """
+
+    count: int
+    sh_degree: int
+    origin: tuple[float, float, float]
+    steps: dict[str, Any]
+    layers: tuple[int, ...]
+    chunk_rows: int
+    depth: int
+    low: tuple[int, int, int]
+    model_bytes: int
+    settings: dict[str, Any]
+    cut_from: dict[str, int] | None = None
+    channels: Channels | None = None
+    block: int = 0
+    version: int = 2
+
+    @classmethod
+    def of_grid(
+        cls,
+        grid: GridScene,
+        layers: Sequence[int],
+        low: Sequence[int],
+        depth: int,
+        chunk_rows: int,
+        model_bytes: int,
+        settings: Mapping[str, Any],
+        channels: Channels | None = None,
+    ) -> GridHeader:
+        """The header of a scene; raises `InputError` for settings that JSON cannot hold."""
+        x, y, z = (float(value) for value in grid.origin)
+        a, b, c = (int(value) for value in low)
+        header = cls(
+            grid.count,
+            grid.sh_degree,
+            (x, y, z),
+            grid.steps.to_json(),
+            tuple(int(rows) for rows in layers),
+            chunk_rows,
+            depth,
+            (a, b, c),
+            model_bytes,
+            dict(settings),
+            channels=channels,
+        )
+        return header.sealed()
+
+    def sealed(self) -> GridHeader:
+        """The header with its own length."""
+        length = len(encode_header(self))
+        if length > HEADER_MOST:
+            raise InputError(f"settings: the header has {length} bytes of JSON, expected at most {HEADER_MOST}")
+        return replace(self, block=length)
+
+    def cut(self, layers: int, size: int) -> GridHeader:
+        """The header of the first `layers` layers of this file of `size` bytes."""
+        source = self.cut_from or {"bytes": size, "count": self.count, "layers": len(self.layers)}
+        kept = self.layers[:layers]
+        return replace(self, count=sum(kept), layers=kept, cut_from=source, channels=None).sealed()
+
+    @property
+    def grid_steps(self) -> Steps:
+        """The steps."""
+        return Steps.from_json(self.steps)
+
+    @property
+    def chunk_count(self) -> int:
+        """Chunks of all layers."""
+        return sum(-(-rows // self.chunk_rows) for rows in self.layers)
+
+    def chunks(self) -> list[Chunk]:
+        """The chunks in order."""
+        return plan_chunks(list(self.layers), self.chunk_rows)
+
+    @property
+    def model(self) -> Section:
+        """The model (checksum included)."""
+        return Section("model", PREAMBLE_BYTES + self.block, self.model_bytes + 4)
+
+    @property
+    def table_bytes(self) -> int:
+        """Bytes of the chunk table (own checksum included)."""
+        return 8 * self.chunk_count + 4
+
+    def table(self, size: int) -> Section:
+        """The chunk table: the last part of a file of `size` bytes."""
+        return Section("chunk table", size - self.table_bytes, self.table_bytes)
+
+    @property
+    def least_size(self) -> int:
+        """Bytes of the smallest file with this header: chunks have at least a bit a row."""
+        return self.model.offset + self.model.length + self.table_bytes + self.count // 8
+
+
+def encode_header(header: GridHeader) -> bytes:
+    """The header's bytes."""
+    record = asdict(header)
+    del record["block"], record["version"]  # known from the preamble
+    if header.channels is None:
+        del record[_OPTIONAL]
+    return canonical_json(record)
+
+
+def decode_header(block: bytes) -> GridHeader:
+    """Read and check a header; raises `HeaderError` for anything but what `encode_header` can write."""
+    record = _parse(block)
+    if not isinstance(record, dict) or tuple(sorted(record.keys() - {_OPTIONAL})) != _KEYS:
+        raise HeaderError(
+            f"wanted an object with the keys {', '.join(_KEYS)} and perhaps {_OPTIONAL}, got {_short(record)}"
+        )
+    count = _integer("count", record["count"], 0, MAX_COUNT)
+    layers = _integers("layers", record["layers"], 0, MAX_COUNT)
+    if not 1 <= len(layers) <= LAYERS_MOST or sum(layers) != count:
+        raise HeaderError(
+            f"layers: wanted 1 to {LAYERS_MOST} counts that add up to {count}, got {_short(list(layers))}"
+        )
+    low = _integers("low", record["low"], -CODE_LIMIT, CODE_LIMIT)
+    if len(low) != 3:
+        raise HeaderError(f"low: wanted three integers, got {_short(list(low))}")
+    if not isinstance(record["settings"], dict):
+        raise HeaderError(f"settings: wanted an object, got {_short(record['settings'])}")
+    sh_degree = _integer("sh_degree", record["sh_degree"], 0, MAX_SH_DEGREE)
+    return GridHeader(
+        count,
+        sh_degree,
+        _origin(record["origin"]),
+        _steps(record["steps"], sh_degree),
+        layers,
+        _integer("chunk_rows", record["chunk_rows"], 1, CHUNK_ROWS),
+        _integer("depth", record["depth"], 0, POSITION_BITS),
+        (low[0], low[1], low[2]),
+        _integer("model_bytes", record["model_bytes"], 0, MODEL_MOST),
+        record["settings"],
+        _cut_from(record["cut_from"]),
+        _channels(record[_OPTIONAL], count, sh_degree) if _OPTIONAL in record else None,
+        len(block),
+    )
+
+
+def _steps(value: object, sh_degree: int) -> dict[str, Any]:
+    names = ("chroma", "dc", "opacity", "position", "rotation", "scale", "sh")
+    if not isinstance(value, dict) or tuple(sorted(value)) != names:
+        raise HeaderError(f"steps: wanted an object with the keys {', '.join(names)}, got {_short(value)}")
+    numbers = [value[name] for name in names[:-1]]
+    if not isinstance(value["sh"], list) or len(value["sh"]) != sh_degree:
+        raise HeaderError(f"steps.sh: wanted {sh_degree} numbers, got {_short(value['sh'])}")
+    numbers += value["sh"]
+    if not all(type(number) is float and math.isfinite(number) for number in numbers):
+        raise HeaderError(f"steps: wanted finite numbers with a decimal point, got {_short(value)}")
+    try:
+        steps = Steps.from_json(value).to_json()
+    except (InputError, OverflowError) as error:
+        raise HeaderError(f"steps: {error}") from None
+    if steps != value:
+        raise HeaderError(f"steps: wanted float32 numbers, got {_short(value)}")
+    return steps
+
+
+def _cut_from(value: object) -> dict[str, int] | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict) or tuple(sorted(value)) != ("bytes", "count", "layers"):
+        raise HeaderError(f"cut_from: wanted null or an object with bytes, count and layers, got {_short(value)}")
+    return {name: _integer(f"cut_from.{name}", value[name], 0, 2**63 - 1) for name in sorted(value)}
+
+
+def _channels(value: object, count: int, sh_degree: int) -> Channels:
+    if not isinstance(value, dict) or tuple(sorted(value)) != ("bytes", "rows"):
+        raise HeaderError(f"channels: wanted an object with bytes and rows, got {_short(value)}")
+    taken = _integers("channels.bytes", value["bytes"], 0, COUNT_MOST)
+    rows = _integers("channels.rows", value["rows"], 0, count)
+    kinds = len(channel_parts(sh_degree))
+    if len(taken) != kinds or len(rows) != sh_degree:
+        raise HeaderError(f"channels: wanted {kinds} bytes and {sh_degree} rows, got {_short(value)}")
+    return Channels(taken, rows)
+
+
+def _integers(name: str, value: object, lowest: int, highest: int) -> tuple[int, ...]:
+    if not isinstance(value, list):
+        raise HeaderError(f"{name}: wanted a list of integers, got {_short(value)}")
+    return tuple(_integer(name, number, lowest, highest) for number in value)
+
+
+__all__ = ["GridHeader", "decode_header", "encode_header", "least_bytes"]

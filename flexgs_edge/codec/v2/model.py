@@ -1,0 +1,83 @@
+"""Everything that chunks are decoded with, as the file's model section holds it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from flexgs_edge.codec.v2 import octree
+from flexgs_edge.codec.v2.groups import Group, GroupKind
+from flexgs_edge.codec.v2.rans import Tables
+from flexgs_edge.codec.v2.tables import decode_tables, encode_tables, from_levels
+from flexgs_edge.codec.v2.walk import base_kinds, sh_kinds
+from flexgs_edge.constants import RANS_PRECISION as PRECISION
+
+REPEATS_MOST = 16
+"""Symbols of the repeats; the last is the escape."""
+SHARED = 2
+"""Alphabets before those of the groups: of the octree, and of the repeats."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Everything that chunks are decoded with.
+
+    Parameters
+    ----------
+    sh_degree, depth : int
+        Of the scene and of its octree.
+    groups : list of Group
+        Base channels, then SH.
+    mappings : list of np.ndarray
+        The table of every context: of the octree, the repeats, then of the groups.
+    levels : list of np.ndarray
+        Levels of the tables, in the same order.
+    tables : list of Tables
+        The tables.
+    """
+
+    sh_degree: int
+    depth: int
+    groups: list[Group]
+    mappings: list[np.ndarray]
+    levels: list[np.ndarray]
+    tables: list[Tables]
+
+    @cached_property
+    def slots(self) -> list[np.ndarray]:
+        """First slot of the table of every context, as `Decoder.get_at` takes it."""
+        return [mapping.astype(np.intp) << PRECISION for mapping in self.mappings]
+
+    def to_bytes(self, with_sh: bool = True) -> bytes:
+        """The model section of a file; without SH only to compare sizes."""
+        chosen = [i for i, group in enumerate(self.groups) if with_sh or not group.kind.sh]
+        records = b"".join(self.groups[i].to_bytes() for i in chosen)
+        alphabets = [0, 1, *(i + SHARED for i in chosen)]
+        return records + encode_tables([self.mappings[i] for i in alphabets], [self.levels[i] for i in alphabets])
+
+    @classmethod
+    def from_bytes(cls, data: bytes, sh_degree: int, depth: int) -> Model:
+        """Inverse of `to_bytes`; raises `StreamError`."""
+        groups, at = [], 0
+        for kind in group_kinds(sh_degree):
+            group, at = Group.read(kind, data, at)
+            groups.append(group)
+        shapes = [(octree.CONTEXTS, 256), (1, REPEATS_MOST), *((g.contexts, g.symbols) for g in groups)]
+        pairs = decode_tables(data[at:], shapes)
+        levels = [level for _, level in pairs]
+        return cls(sh_degree, depth, groups, [mapping for mapping, _ in pairs], levels, list(map(tables_of, levels)))
+
+
+def group_kinds(sh_degree: int) -> list[GroupKind]:
+    """All groups of a scene of this degree."""
+    return base_kinds() + sh_kinds(sh_degree)
+
+
+def tables_of(levels: np.ndarray) -> Tables:
+    """Tables of an alphabet; one that nothing was counted for gets its first symbol, which costs nothing."""
+    if not levels.any(axis=1).all():
+        levels = levels.copy()
+        levels[~levels.any(axis=1), 0] = 1
+    return from_levels(levels)

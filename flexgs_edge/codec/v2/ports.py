@@ -1,0 +1,208 @@
+"""The three ports of the walk over a chunk: one collects samples to fit to, one counts symbols, one decodes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexgs_edge.codec.v2 import octree
+from flexgs_edge.codec.v2.features import Sums, Term
+from flexgs_edge.codec.v2.groups import Group, GroupKind
+from flexgs_edge.codec.v2.model import REPEATS_MOST, SHARED, Model
+from flexgs_edge.codec.v2.rans import Decoder, StreamError, Tables
+from flexgs_edge.constants import CODE_LIMIT
+from flexgs_edge.constants import RANS_TOTAL as TOTAL
+
+UNIFORM = [Tables(np.full((1, 1 << bits), TOTAL >> bits)) for bits in range(9)]
+"""Numbers of so many bits that are all equally likely."""
+
+Raw = tuple[int, np.ndarray]
+Batch = tuple[int, np.ndarray, np.ndarray, list[Raw]]
+"""Alphabet, contexts, symbols, and raw batches behind them."""
+
+
+def split(codes: np.ndarray, group: Group, base: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Symbols [m] u8, offsets [m] from the alphabet's lowest code in f64, and where symbols are escapes."""
+    offset = codes - np.float64(base) if isinstance(base, float) else codes - base
+    symbols = np.floor(offset * 2.0**-group.shift) if group.shift else offset
+    last = group.symbols - 1
+    if len(codes) and symbols.min() >= 0 and symbols.max() < last:
+        return symbols.astype(np.uint8), offset, np.zeros(0, np.intp)
+    escaped = (symbols < 0) | (symbols >= last)
+    return np.where(escaped, last, symbols).astype(np.uint8), offset, np.flatnonzero(escaped)
+
+
+class FitPort:
+    """Collects samples."""
+
+    def __init__(self, groups: list[GroupKind], stride: int) -> None:
+        self.kinds = groups
+        self.stride = stride
+        self.samples: list[list[tuple[list[np.ndarray], np.ndarray]]] = [[] for _ in groups]
+
+    def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
+        assert symbols is not None
+        return symbols
+
+    def repeats(self, codes: np.ndarray | None, cells: int, rows: int) -> np.ndarray:
+        assert codes is not None
+        return codes
+
+    def known(self, group: int, count: int, terms: list[Term], before: list[Term] | None = None) -> list[Term]:
+        return terms if before is None else before + terms
+
+    def channel(
+        self, group: int, known: list[Term], rows: slice, own: tuple[np.ndarray, ...], codes: np.ndarray | None
+    ) -> np.ndarray:
+        assert codes is not None
+        features = np.zeros((self.kinds[group].features, len(codes)), np.float32)
+        for place, feature in enumerate(own):
+            features[place] = feature
+        for term in known:
+            features[list(term.places)] = term.values[:, rows]
+        # Of every pass the same share: the weights are to fit the last ones, which have most rows.
+        self.samples[group].append((list(features), codes.copy()))
+        return codes
+
+
+class CountPort:
+    """Counts symbols by context, and keeps the batches."""
+
+    stride = 1
+
+    def __init__(self, groups: list[Group]) -> None:
+        self.groups = groups
+        shapes = [(octree.CONTEXTS, 256), (1, REPEATS_MOST), *((g.contexts, g.symbols) for g in groups)]
+        self.counts = [np.zeros(shape, np.int64) for shape in shapes]
+        self.raw = np.zeros(len(shapes))
+        self.batches: list[Batch] = []
+
+    def add(self, other: CountPort) -> None:
+        """Add another port's counts (whole numbers, so in any order)."""
+        for counts, more in zip(self.counts, other.counts, strict=True):
+            counts += more
+        self.raw += other.raw
+
+    def _add(self, alphabet: int, contexts: np.ndarray, symbols: np.ndarray, raw: list[Raw]) -> None:
+        counts = self.counts[alphabet]
+        place = contexts.astype(np.intp)
+        place *= counts.shape[1]
+        place += symbols
+        counts += np.bincount(place, minlength=counts.size).reshape(counts.shape)
+        self.raw[alphabet] += sum(bits * len(values) for bits, values in raw)
+        self.batches.append(
+            (alphabet, contexts.astype(np.uint8, copy=False), symbols.astype(np.uint8, copy=False), raw)
+        )
+
+    def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
+        assert symbols is not None
+        self._add(0, contexts, symbols, [])
+        return symbols
+
+    def repeats(self, codes: np.ndarray | None, cells: int, rows: int) -> np.ndarray:
+        assert codes is not None
+        symbols = np.minimum(codes, REPEATS_MOST - 1)
+        raw = _raw(codes[symbols == REPEATS_MOST - 1], 32)
+        self._add(1, np.zeros(cells, np.uint8), symbols, raw)
+        return codes
+
+    def known(self, group: int, count: int, terms: list[Term], before: Sums | None = None) -> Sums:
+        return self.groups[group].known(terms, count, before)
+
+    def channel(
+        self, group: int, known: Sums, rows: slice, own: tuple[np.ndarray, ...], codes: np.ndarray | None
+    ) -> np.ndarray:
+        assert codes is not None
+        fitted = self.groups[group]
+        base, contexts = fitted.predict(known, rows, own)
+        symbols, offset, escaped = split(codes, fitted, base)
+        raw = _raw(offset[escaped], 32)
+        if fitted.shift:
+            raw = _raw(np.delete(offset, escaped), fitted.shift) + raw
+        self._add(group + SHARED, contexts, symbols, raw)
+        return codes
+
+
+def _raw(values: np.ndarray, bits: int) -> list[Raw]:
+    """The low `bits` of integers [m], at most 8 a batch, lowest first."""
+    if len(values) == 0 or bits == 0:
+        return []
+    values = values.astype(np.int64)
+    return [
+        (min(bits - at, 8), (values >> at & (1 << min(bits - at, 8)) - 1).astype(np.uint8)) for at in range(0, bits, 8)
+    ]
+
+
+class DecodePort:
+    """Decodes batches, counting what each alphabet costs if asked."""
+
+    stride = 1
+
+    def __init__(self, model: Model, stream: Decoder, cost: np.ndarray | None = None) -> None:
+        self.model = model
+        self.stream = stream
+        self.cost = cost
+
+    def _get(self, alphabet: int, contexts: np.ndarray) -> np.ndarray:
+        symbols = self.stream.get_at(self.model.tables[alphabet], self.model.slots[alphabet].take(contexts))
+        if self.cost is not None:
+            rows = self.model.mappings[alphabet][contexts]
+            self.cost[alphabet] += self.model.tables[alphabet].bits(rows, symbols)
+        return symbols
+
+    def _raw(self, alphabet: int, count: int, bits: int) -> np.ndarray:
+        values = np.zeros(count, np.int64)
+        if count == 0:
+            return values
+        for at in range(0, bits, 8):
+            part = self.stream.get(UNIFORM[min(bits - at, 8)], np.zeros(count, np.uint8))
+            values |= part.astype(np.int64) << at
+        if self.cost is not None:
+            self.cost[alphabet] += bits * count
+        return values
+
+    def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
+        occupied = self._get(0, contexts)
+        if not occupied.all():
+            raise StreamError("octree: wanted nodes with children, got one without")
+        return occupied
+
+    def repeats(self, codes: np.ndarray | None, cells: int, rows: int) -> np.ndarray:
+        symbols = self._get(1, np.zeros(cells, np.uint8)).astype(np.int64)
+        escaped = symbols == REPEATS_MOST - 1
+        symbols[escaped] = self._raw(1, int(escaped.sum()), 32)
+        if int(symbols.sum()) + cells != rows:
+            raise StreamError(f"repeats: wanted {rows - cells} in all, got {int(symbols.sum())}")
+        return symbols
+
+    def known(self, group: int, count: int, terms: list[Term], before: Sums | None = None) -> Sums:
+        return self.model.groups[group].known(terms, count, before)
+
+    def channel(
+        self, group: int, known: Sums, rows: slice, own: tuple[np.ndarray, ...], codes: np.ndarray | None
+    ) -> np.ndarray:
+        fitted = self.model.groups[group]
+        base, contexts = fitted.predict(known, rows, own)
+        symbols = self._get(group + SHARED, contexts)
+        last = fitted.symbols - 1
+        if (
+            isinstance(base, float)
+            and not fitted.shift
+            and abs(base) + last <= CODE_LIMIT
+            and not (symbols == last).any()
+        ):
+            # Values of a short alphabet, which most symbols are: no rounding to think of.
+            return symbols.astype(np.int32) + np.int32(base)
+        offset = symbols.astype(np.float64)
+        if fitted.shift:
+            offset *= float(1 << fitted.shift)
+        escaped = np.flatnonzero(symbols == fitted.symbols - 1)
+        count = len(escaped)
+        if fitted.shift:
+            plain = np.delete(np.arange(len(symbols)), escaped)
+            offset[plain] += self._raw(group + SHARED, len(plain), fitted.shift)
+        if count:
+            offset[escaped] = self._raw(group + SHARED, count, 32).astype(np.uint32).astype(np.int32)
+        offset += base
+        if len(offset) and not -CODE_LIMIT <= offset.min() <= offset.max() <= CODE_LIMIT:
+            raise StreamError(f"{fitted.kind.name}: wanted codes within {CODE_LIMIT}")
+        return offset

@@ -1,0 +1,249 @@
+"""The one walk over a chunk that fitting, encoding and decoding share: what is coded when, and from what it is predicted.
+
+A port codes the batches. Encoding ports are given the codes; a decoding port gives them back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from flexgs_edge.codec.v2.contexts import ONE, REACH, Plan, limited, neighbour_features, plan_passes
+from flexgs_edge.codec.v2.features import Features, Term
+from flexgs_edge.codec.v2.groups import GroupKind
+from flexgs_edge.codec.v2.octree import unmorton, walk_octree
+from flexgs_edge.codec.v2.rans import StreamError
+from flexgs_edge.constants import VALUE_LIMIT
+
+AXES = ("x", "y", "z")
+COLOURS = ("Y", "Co", "Cg")
+_OWN = 3
+"""Features from the channel's own neighbours: mean, spread, distance."""
+_NEAR = (2,)
+"""Place of the distance among the weights."""
+
+_SCALES = ("scale x", "scale y", "scale z")
+_EARLIER: dict[str, tuple[str, ...]] = {
+    "scale x": (),
+    "scale y": ("scale x",),
+    "scale z": ("scale x", "scale y"),
+    "opacity": _SCALES,
+    "dc Y": ("opacity", *_SCALES),
+    "dc Co": ("dc Y", "opacity"),
+    "dc Cg": ("dc Y", "dc Co"),
+    "sh degree": ("opacity", "dc Y", "dc Co", "dc Cg"),
+    "rotation x": _SCALES,
+    "rotation y": _SCALES,
+    "rotation z": _SCALES,
+}
+"""Base channels in order, and the earlier channels that each is predicted from. Each pays at least 0.01 bits."""
+_SOURCES = ("scale x", "scale y", "scale z", "opacity", "dc Y", "dc Co", "dc Cg")
+"""Channels that others are predicted from: three features each (value, neighbours' mean, distance), in this order."""
+_SH_SOURCES = ("opacity", *_SCALES)
+"""Rotations say little of the SH; opacity and colour say how much a row's light changes."""
+_SH_BEFORE = ((3,), (11, 3, 9, 10), (3, 13, 14, 9, 10, 11, 12))
+"""Places of the weights of |sums| of Cg, Y, Co before, and Y, |Y|, Co, |Co| of this coefficient; of Y, Co and Cg, which
+begin at the second, second and first of them."""
+_RESIDUAL = ("scale", "opacity", "dc")
+"""Channels whose symbols are residuals: predictable and without edges. The others gain from tables of their values."""
+
+
+def base_kinds() -> list[GroupKind]:
+    """Groups of the base channels."""
+    return [
+        GroupKind(name, _OWN + 3 * len(earlier), name.startswith(_RESIDUAL), name == "sh degree")
+        for name, earlier in _EARLIER.items()
+    ]
+
+
+def sh_kinds(sh_degree: int) -> list[GroupKind]:
+    """Groups of SH: one for each degree and colour plane."""
+    return [
+        GroupKind(f"sh {degree} {colour}", _OWN + 6 + 3 * plane, False, True)
+        for degree in range(1, sh_degree + 1)
+        for plane, colour in enumerate(COLOURS)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class ChunkCodes:
+    """The codes of a chunk's rows, as in `GridScene`; position is relative to the scene's lowest cell."""
+
+    cells: np.ndarray  # [r] u64, Morton index of every row's cell
+    base: dict[str, np.ndarray]  # each [r]
+    sh: tuple[np.ndarray, ...]
+    coordinates: np.ndarray | None = None
+    """[3, r] i32 of the cells, where a decoder made them on its way."""
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3, r] i32: coordinates of the rows' cells."""
+        return unmorton(self.cells) if self.coordinates is None else self.coordinates
+
+
+class Port(Protocol):
+    """Codes batches; `codes` are None when decoding. What `known` gives is the port's own."""
+
+    stride: int
+    """One row in so many of each pass is coded."""
+
+    def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
+        """Octree bytes."""
+
+    def repeats(self, codes: np.ndarray | None, cells: int, rows: int) -> np.ndarray:
+        """Rows beyond the first in every cell."""
+
+    def known(self, group: int, count: int, terms: list[Term], before: Any = None) -> Any:
+        """Take features of a group that are known for all `count` rows, beside those of `before`."""
+
+    def channel(
+        self, group: int, known: Any, rows: slice, own: tuple[np.ndarray, ...], codes: np.ndarray | None
+    ) -> np.ndarray:
+        """Codes [m] of some rows, predicted from what is known and from `own`: mean and spread of their neighbours."""
+
+
+def walk_chunk(
+    rows: int, depth: int, sh_degree: int, port: Port, codes: ChunkCodes | None, base_only: bool
+) -> ChunkCodes:
+    """Code a chunk.
+
+    Parameters
+    ----------
+    rows : int
+        Rows of the chunk.
+    depth : int
+        Of the octree.
+    sh_degree : int
+        Of the scene.
+    port : Port
+        Codes the batches.
+    codes : ChunkCodes, optional
+        What to encode; None when decoding.
+    base_only : bool
+        Stop before the SH.
+
+    Returns
+    -------
+    ChunkCodes
+        The codes; without SH if `base_only`.
+    """
+    cells = walk_positions(rows, depth, port, codes)
+    position = unmorton(cells)
+    plan = plan_passes(position, REACH[0], port.stride)
+    features = Features(3 * len(_SOURCES), rows)
+    base: dict[str, np.ndarray] = {}
+    for group, (name, earlier) in enumerate(_EARLIER.items()):
+        if name == "sh degree" and sh_degree == 0:
+            base[name] = np.zeros(rows, np.int32)
+            continue
+        terms = [Term(_NEAR, plan.near)]
+        if earlier:
+            first = min(map(_SOURCES.index, earlier))
+            order = sorted(earlier, key=_SOURCES.index)
+            places = [_OWN + 3 * earlier.index(e) + part for e in order for part in range(3)]
+            terms.append(Term(places, features, 3 * first))
+        mean = features.values[3 * _SOURCES.index(name) + 1] if name in _SOURCES else None
+        known = port.known(group, rows, terms)
+        source = None if codes is None else codes.base[name]
+        result, values = _walk_channel(group, known, port, plan, rows, source, mean)
+        if name == "sh degree" and (result.min(initial=0) < 0 or result.max(initial=0) > sh_degree):
+            raise StreamError(f"sh degree: wanted 0 to {sh_degree}, got {result.min()} to {result.max()}")
+        base[name] = result
+        if mean is not None:
+            at = 3 * _SOURCES.index(name)
+            value, _, away = features.values[at : at + 3]
+            np.multiply(values, np.float32(ONE), value)
+            np.abs(np.subtract(value, mean, away), away)
+            features.seal(at, at + 3)
+    if base_only:
+        return ChunkCodes(cells, base, ())
+    return ChunkCodes(cells, base, tuple(_walk_sh(position, base, features, sh_degree, port, codes)))
+
+
+def _walk_channel(
+    group: int,
+    known: Any,
+    port: Port,
+    plan: Plan,
+    rows: int,
+    source: np.ndarray | None,
+    mean: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Codes [rows] i32 and values [rows] f32 of one channel; the neighbours' means are written into `mean`."""
+    if source is None:
+        result, values = np.empty(rows, np.int32), np.empty(rows, np.float32)
+    else:
+        result, values = source, limited(source)
+    for step in plan.passes:
+        own = neighbour_features(values, step)
+        batch = port.channel(group, known, step.rows, own, None if source is None else source[step.rows])
+        if source is None:
+            result[step.rows] = batch
+            values[step.rows] = limited(batch)
+        if mean is not None:
+            # The first pass has no neighbours: as a feature of later channels its mean is its value.
+            mean[step.rows] = own[0] if own else values[step.rows] * np.float32(ONE)
+    return result, values
+
+
+def walk_positions(rows: int, depth: int, port: Port, codes: ChunkCodes | None) -> np.ndarray:
+    """[r] u64 cells of all rows: the octree, then how often each cell is taken again."""
+    if codes is None:
+        unique = walk_octree(depth, rows, port.occupancy)
+        return np.repeat(unique, port.repeats(None, len(unique), rows) + 1)
+    first = np.flatnonzero(np.diff(codes.cells, prepend=~codes.cells[:1]))
+    walk_octree(depth, rows, port.occupancy, codes.cells[first])
+    port.repeats(np.diff(first, append=rows) - 1, len(first), rows)
+    return codes.cells
+
+
+def _walk_sh(
+    position: np.ndarray,
+    base: dict[str, np.ndarray],
+    features: Features,
+    sh_degree: int,
+    port: Port,
+    codes: ChunkCodes | None,
+) -> Iterator[np.ndarray]:
+    """[3 * (2l + 1), rows] i32 for every degree l from 1."""
+    degrees = base["sh degree"]
+    rows = np.arange(len(degrees))
+    below = np.zeros((3, len(rows)), np.float32)
+    group = len(_EARLIER)
+    plan = Plan([], Features(1, 0))
+    sources = [3 * _SOURCES.index(name) for name in _SH_SOURCES]
+    for degree in range(1, sh_degree + 1):
+        keep = degrees[rows] >= degree
+        below, rows = below[:, keep], rows[keep]
+        if degree == 1 or not keep.all():
+            plan = plan_passes(position[:, rows], REACH[1], port.stride)
+        # The same for all coefficients of the degree.
+        steady = Features(3 + len(sources), len(rows))
+        steady.values[:3], steady.values[3:] = below, features.values[sources][:, rows]
+        steady.seal()
+        extra = [Term(_NEAR, plan.near), Term((5, 6, 7, 8), steady, 3)]
+        fixed = [port.known(group + plane, len(rows), [*extra, Term((4,), steady, plane)]) for plane in range(3)]
+        band = np.zeros((3, 2 * degree + 1, len(rows)), np.int32)
+        # Sums of Cg, Y, Co so far; then Y, |Y|, Co, |Co| of this coefficient.
+        before = Features(7, len(rows))
+        for k in range(2 * degree + 1):
+            last = np.zeros(0, np.float32)
+            for plane in range(3):
+                term = Term(_SH_BEFORE[plane], before, 0 if plane == 2 else 1)
+                known = port.known(group + plane, len(rows), [term], fixed[plane])
+                source = None if codes is None else codes.sh[degree - 1][plane * (2 * degree + 1) + k]
+                band[plane, k], last = _walk_channel(group + plane, known, port, plan, len(rows), source)
+                last *= np.float32(ONE)
+                if plane < 2:
+                    before.values[3 + 2 * plane] = last
+                    np.abs(last, before.values[4 + 2 * plane])
+                    before.seal(3 + 2 * plane, 5 + 2 * plane)
+            before.values[0] += np.abs(last, last)
+            before.values[1:3] += before.values[4::2]
+            before.seal(0, 3)
+        below = np.minimum(before.values[[1, 2, 0]], np.float32(VALUE_LIMIT * ONE))
+        group += 3
+        yield band.reshape(6 * degree + 3, len(rows))

@@ -1,0 +1,73 @@
+"""`decompress`: a scene to a PLY that every viewer opens, or to another program's format."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.files import check_writable
+from flexgs_edge.io.converter import check_converter, converter_bytes
+from flexgs_edge.io.exchange import write_foreign
+from flexgs_edge.io.formats import FORMATS, format_of
+from flexgs_edge.io.ply import inria_dtype, write_ply
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.report.results import DecompressResult
+from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.run.decoding import ahead, decoder
+from flexgs_edge.run.inputs import load_scene, scene_info
+from flexgs_edge.run.open_bench import run_info
+
+WRITE_COPIES = 3
+"""Times a chunk's rows that decoding and writing hold at once: codes, planes, rows of the PLY."""
+ANTIALIASED_NOTE = "an antialiased model: the file does not say so; viewers must be told, and here --antialiased"
+
+
+def decompress(
+    input: str | Path,
+    output: str | Path,
+    force: bool = False,
+    memory_limit: int | None = None,
+    device: str | None = None,
+) -> DecompressResult:
+    """Decode a scene to a PLY in INRIA's layout (little endian, zero normals), chunk by chunk, or convert it.
+
+    Parameters
+    ----------
+    input : path
+        Any scene: a `.fgs`, a `.ply`, a file of another program's format, or a model folder.
+    output : path
+        The `.ply`, `.spz`, `.sog` or `.compressed.ply` to write.
+    force : bool
+        Overwrite `output` if it exists.
+    memory_limit : int, optional
+        Bytes for the whole process.
+    device : str, optional
+        What decodes: see `decoder`.
+    """
+    format = format_of(output)
+    if format is None and Path(output).suffix.lower() != ".ply":
+        raise InputError(f"-o {output}: expected a name that ends in .ply, {', '.join(FORMATS)}")
+    if format is not None:
+        check_converter(output)
+    check_writable(output, force)
+    clock = Stopwatch()
+    budget = MemoryBudget.from_limit(memory_limit)
+    with clock.stage("open"):
+        scene = load_scene(input)
+    backend = None
+    if format is None:
+        backend = decoder(device, scene.source, budget, clock)
+    with clock.stage("write"):
+        if format is not None:
+            budget.require("the converter", converter_bytes(format, scene.source.count))
+            notes = write_foreign(output, scene.source, force=force)
+        else:
+            row = inria_dtype(scene.source.sh_degree).itemsize
+            rows = budget.rows("decoding", WRITE_COPIES * row, minimum=min(scene.source.count, 1024), most=65536)
+            with ahead(scene.source, budget, backend):
+                notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
+        if scene.settings.get("antialiased") is True:
+            notes = (*notes, ANTIALIASED_NOTE)
+    size = os.stat(output).st_size
+    return DecompressResult(scene_info(scene), os.fspath(output), size, run_info(budget, clock, backend), notes)

@@ -1,0 +1,138 @@
+"""`render`: views of a scene as PNG files, timed."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.files import atomic_write, check_writable
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.report.results import RenderResult
+from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.run.companions import companions_of
+from flexgs_edge.run.inputs import load_scene, resolve_drawing, scene_info
+from flexgs_edge.run.open_bench import Workspace
+from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.view_set import WITHOUT_VIEWS, find_views, views_info
+
+LOG = logging.getLogger("flexgs_edge")
+
+
+def render_views(
+    input: str | Path,
+    output: str | Path,
+    options: ViewOptions | None = None,
+    views: Sequence[int] | None = None,
+    force: bool = False,
+    progress: Progress = SILENT,
+    **words: Any,
+) -> RenderResult:
+    """Draw views of a scene into a folder, `<view name>.png`, 8 bits a channel.
+
+    Parameters
+    ----------
+    input : path
+        A scene file or a model folder.
+    output : path
+        Folder; made if it is missing.
+    options : ViewOptions, optional
+        What the command line would say.
+    views : sequence of int, optional
+        Views to draw, as indices in order of name. Default: all.
+    force : bool
+        Overwrite files that exist.
+    **words
+        Single options by the names of `ViewOptions`.
+    """
+    options = replace(options or ViewOptions(), **words)
+    clock = Stopwatch()
+    budget = MemoryBudget.from_limit(options.memory_limit)
+    with clock.stage("open"):
+        companions = companions_of(input)
+        scene = load_scene(input, options.drop_invalid)
+        options = resolve_drawing(options, scene, companions)
+        found = find_views(options, companions, scene.source, with_photos=False)
+        if found is None:
+            raise InputError(WITHOUT_VIEWS)
+        chosen = _choose(views, len(found.cameras))
+        places = _places(Path(output), [found.cameras[i].name for i in chosen], force)
+    seconds = []
+    with Workspace(options, budget, clock) as workspace:
+        renderer = workspace.renderer
+        with clock.stage("load"):
+            device_scene = renderer.load(scene.source)
+        with device_scene:
+            started = time.perf_counter()
+            with clock.stage("warm up"):
+                # The first view builds kernels and lists; timed views should not.
+                renderer.render(device_scene, found.cameras[chosen[0]])
+            warm_up = time.perf_counter() - started
+            for i, place in zip(progress.track(chosen, "rendering", len(chosen)), places, strict=True):
+                started = time.perf_counter()
+                with clock.stage("render"):
+                    image = renderer.render(device_scene, found.cameras[i])
+                seconds.append(time.perf_counter() - started)
+                with clock.stage("write"):
+                    write_png(place, image, force)
+        LOG.info("wrote %d PNG files to %s", len(places), output)
+        return RenderResult(
+            scene=scene_info(scene),
+            views=views_info(found),
+            files=tuple(os.fspath(place) for place in places),
+            view_seconds=tuple(seconds),
+            warm_up_seconds=warm_up,
+            run=workspace.run_info(),
+        )
+
+
+def write_png(path: Path, image: np.ndarray, force: bool = False) -> None:
+    """Write [H, W, 3] f32 as PNG: clamped to [0, 1], rounded to 8 bits."""
+    from PIL import Image
+
+    pixels = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+    with atomic_write(path, force) as file:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(file, format="PNG")
+
+
+def _choose(views: Sequence[int] | None, count: int) -> list[int]:
+    if views is None:
+        return list(range(count))
+    bad = [i for i in views if not 0 <= i < count]
+    if bad:
+        raise InputError(f"--views: no view {bad[0]}; the {count} views are 0 to {count - 1} in order of name")
+    if not views:
+        raise InputError("--views: no view chosen")
+    return list(dict.fromkeys(views))
+
+
+def _places(folder: Path, names: Sequence[str], force: bool) -> list[Path]:
+    """A file a view, all checked before anything is drawn."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"-o {folder}: expected a folder, found a file")
+    places = [folder / f"{_file_name(name)}.png" for name in names]
+    twice = {place for place in places if places.count(place) > 1}
+    if twice:
+        raise InputError(f"view names: more than one would be written to {sorted(twice)[0]}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"-o {folder}: cannot make the folder ({error.strerror})") from error
+    for place in places:
+        check_writable(place, force)
+    return places
+
+
+def _file_name(name: str) -> str:
+    """A view's name as a plain file name: folders in it become part of the name."""
+    stem = re.sub(r"\.(jpe?g|png)$", "", name, flags=re.IGNORECASE)
+    return re.sub(r"[^\w.-]+", "_", stem).lstrip(".") or "view"

@@ -1,0 +1,86 @@
+"""`score`: importance of every Gaussian, kept in a file so that other targets need no scoring."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.files import check_writable
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.methods.paper.score_files import save_scores
+from flexgs_edge.methods.paper.scores import SCORES, score_scene
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.report.results import ScoreResult
+from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.run.companions import companions_of
+from flexgs_edge.run.inputs import load_scene, resolve_drawing, scene_info
+from flexgs_edge.run.open_bench import Workspace
+from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.view_set import WITHOUT_VIEWS, find_views, views_info
+
+
+def score_gaussians(
+    input: str | Path,
+    output: str | Path,
+    options: ViewOptions | None = None,
+    score: str = "gs",
+    force: bool = False,
+    progress: Progress = SILENT,
+    **words: Any,
+) -> ScoreResult:
+    """Score every Gaussian over the training poses and save the scores.
+
+    Parameters
+    ----------
+    input : path
+        A scene file or a model folder.
+    output : path
+        The `.npy` file to write: [N] f64, logarithms of the scores, -inf for Gaussians that no pose sees.
+    options : ViewOptions, optional
+        What the command line would say.
+    score : {"gs", "meson"}
+        Which score.
+    force : bool
+        Overwrite `output` if it exists.
+    **words
+        Single options by the names of `ViewOptions`.
+    """
+    options = replace(options or ViewOptions(), **words)
+    if score not in SCORES:
+        raise InputError(f"--score {score!r}: expected one of {', '.join(SCORES)}")
+    if Path(output).suffix.lower() != ".npy":
+        raise InputError(f"-o {output}: expected a name that ends in .npy")
+    check_writable(output, force)
+    clock = Stopwatch()
+    budget = MemoryBudget.from_limit(options.memory_limit)
+    with clock.stage("open"):
+        companions = companions_of(input)
+        scene = load_scene(input, options.drop_invalid)
+        options = resolve_drawing(options, scene, companions)
+        # Photos decide at which size poses are drawn, and with it the hits: the same scores as in `compress`.
+        views = find_views(options, companions, scene.source)
+        if views is None:
+            raise InputError(WITHOUT_VIEWS)
+        if not views.train:
+            raise InputError(f"{views.cameras_from}: every view is held out: give more views, or --holdout 0")
+    with Workspace(options, budget, clock) as workspace:
+        renderer = workspace.renderer
+        with clock.stage("load"):
+            device_scene = renderer.load(scene.source)
+        with device_scene, clock.stage("score"):
+            scores = score_scene(renderer, device_scene, scene.source, views.of(views.train), score, progress)
+        save_scores(output, scores, force)
+        return ScoreResult(
+            scene=scene_info(scene),
+            views=views_info(views),
+            output=os.fspath(output),
+            score=score,
+            scored_views=len(views.train),
+            unseen=int(np.isneginf(scores).sum()),
+            run=workspace.run_info(),
+        )

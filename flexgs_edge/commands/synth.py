@@ -1,0 +1,219 @@
+"""`synth`: a big scene from a small one, for tests of memory and time, written as it is made."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge._version import __version__
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.cameras.inria import inria_json
+from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.commands.decompress import ANTIALIASED_NOTE
+from flexgs_edge.errors import InputError
+from flexgs_edge.files import atomic_write, check_writable
+from flexgs_edge.io.ply import inria_dtype, write_ply
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.run.companions import companions_of
+from flexgs_edge.run.inputs import load_scene
+from flexgs_edge.run.open_bench import run_info
+from flexgs_edge.scene.parts import MOST_PARTS, PartsSource
+from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.units import format_mib, format_size
+
+LOG = logging.getLogger("flexgs_edge")
+
+ROW_COPIES = 3
+"""Times a row of the PLY that making and writing one holds: the parent's values, planes, the table."""
+WORK_BYTES = 800
+"""Bytes a row beside that: float64 of means, scales, rotations and their products, numbers of rows."""
+CHUNK_ROWS = 16384
+"""Rows at a time, memory allowing: 25 MB; more is slower (float64 planes leave the cache)."""
+_SAMPLE_ROWS = 65536
+_CORE = (0.01, 0.99)
+"""Quantiles of the positions between which a tile lies: the far background of a scene overlaps its neighbours."""
+_GAP = 1.05
+"""Distance of tiles in their own widths."""
+
+
+def synth(
+    output: str | Path,
+    input: str | Path,
+    gaussians: int,
+    seed: int = 0,
+    force: bool = False,
+    memory_limit: int | None = None,
+) -> dict[str, Any]:
+    """Write a scene of `gaussians` Gaussians made from a smaller one, and cameras for it.
+
+    Up to `MOST_PARTS` times the scene's count every Gaussian becomes parts that look like it together; beyond that there are
+    tiles, copies of the scene side by side. Memory does not grow with `gaussians`, and the bytes depend on nothing but the
+    scene, `gaussians` and `seed`.
+
+    Parameters
+    ----------
+    output : path
+        The `.ply` to write. If the scene has cameras, `cameras.json` is written beside it.
+    input : path
+        A scene file or a model folder.
+    gaussians : int
+        Exactly so many.
+    seed : int
+        Chooses which Gaussians get one part more than others.
+    force : bool
+        Overwrite files that exist.
+    memory_limit : int, optional
+        Bytes for the whole process.
+
+    Returns
+    -------
+    dict
+        JSON values (`synth_text` makes the text from them).
+
+    Raises
+    ------
+    InputError
+        When the scene has more Gaussians than are asked for, or a file is in the way.
+    BudgetError
+        When the memory limit is too small for any chunk, or the disk is full.
+    """
+    if Path(output).suffix.lower() != ".ply" or str(output).lower().endswith(".compressed.ply"):
+        raise InputError(f"{output}: expected a name that ends in .ply (and not in .compressed.ply)")
+    if seed < 0:
+        raise InputError(f"--seed {seed}: expected 0 or more")
+    target = check_writable(output, force)
+    clock = Stopwatch()
+    budget = MemoryBudget.from_limit(memory_limit)
+    with clock.stage("open"):
+        companions = companions_of(input)
+        scene = load_scene(input)
+        source = scene.source
+        if not source.count <= gaussians < 2**31:
+            raise InputError(
+                f"--gaussians {gaussians}: expected at least the {source.count} of {input}, and less than {2**31}; "
+                "to make a scene smaller, use compress"
+            )
+        tiles = -(-gaussians // (MOST_PARTS * source.count))
+        shifts = tile_shifts(source, tiles)
+        made = PartsSource(source, gaussians, shifts, seed)
+        notes: tuple[str, ...] = ()
+        cameras: list[Camera] = []
+        if companions.cameras is not None:
+            cameras = read_cameras(companions.cameras, ignore_distortion=True)
+            notes = _camera_notes(cameras)
+            cameras = tiled_cameras(cameras, shifts)
+        beside = target.with_name("cameras.json")
+        if cameras and companions.cameras is not None:
+            _check_cameras(beside, companions.cameras, force)
+        row = ROW_COPIES * inria_dtype(source.sh_degree).itemsize + WORK_BYTES
+        rows = budget.rows("making Gaussians", row, minimum=min(gaussians, 1024), most=CHUNK_ROWS)
+    with clock.stage("write"):
+        LOG.info("writing %d Gaussians, %d at a time", gaussians, rows)
+        if cameras:
+            # The cameras take their name when the scene has taken its own.
+            with atomic_write(beside, force) as file:
+                file.write(inria_json(cameras).encode())
+                notes = (*write_ply(target, made, force=force, chunk_rows=rows), *notes)
+        else:
+            notes = (*write_ply(target, made, force=force, chunk_rows=rows), *notes)
+    if scene.settings.get("antialiased") is True:
+        notes = (*notes, ANTIALIASED_NOTE)
+    run = run_info(budget, clock)
+    return {
+        "program": f"flexgs-edge {__version__}",
+        "command": "synth",
+        "input": os.fspath(input),
+        "input_count": source.count,
+        "sh_degree": source.sh_degree,
+        "output": os.fspath(output),
+        "count": gaussians,
+        "size": os.stat(target).st_size,
+        "seed": seed,
+        "tiles": tiles,
+        "parts": [gaussians // (tiles * source.count), -(-gaussians // (tiles * source.count))],
+        "cameras": os.fspath(beside) if cameras else None,
+        "views": len(cameras),
+        "notes": [*source.notes, *notes],
+        "seconds": run.seconds,
+        "memory_limit": run.memory_limit,
+        "peak_memory": run.peak_memory,
+    }
+
+
+def tile_shifts(source: SceneSource, tiles: int) -> np.ndarray:
+    """Where copies of a scene stand side by side: [tiles, 3] f64, scene units, the first at zero.
+
+    They fill a grid, as square as can be, in the plane of the two axes along which the scene is widest.
+    """
+    shifts = np.zeros((tiles, 3))
+    if tiles == 1:
+        return shifts
+    step = -(-source.count // _SAMPLE_ROWS)
+    sample = source.read(np.arange(0, source.count, step), ["means"])["means"].astype(np.float64)
+    low, high = np.quantile(sample, _CORE, axis=1)
+    width = high - low
+    axes = np.sort(np.argsort(-width, kind="stable")[:2])
+    # A scene that is a point or a line: copies in one place would be no tiles.
+    pitch = _GAP * np.where(width[axes] > 0, width[axes], max(width.max(), 1.0))
+    columns = int(np.ceil(np.sqrt(tiles)))
+    number = np.arange(tiles)
+    shifts[:, axes[0]] = number % columns * pitch[0]
+    shifts[:, axes[1]] = number // columns * pitch[1]
+    return shifts
+
+
+def tiled_cameras(cameras: list[Camera], shifts: np.ndarray) -> list[Camera]:
+    """Cameras for tiles: those given for one tile; for more, as many as there are cameras or tiles, each in the next tile.
+
+    So every tile is looked at from inside, every pose is used, and a pass over all views costs little more than with one tile.
+    """
+    if len(shifts) == 1:
+        return cameras
+    views = []
+    for number in range(max(len(cameras), len(shifts))):
+        camera, tile = cameras[number % len(cameras)], number % len(shifts)
+        name = f"tile_{tile:05d}_{number // len(shifts):05d}_{camera.name}"
+        views.append(replace(camera.moved(-shifts[tile]), name=name))
+    return views
+
+
+def _camera_notes(cameras: list[Camera]) -> tuple[str, ...]:
+    """What INRIA's cameras.json cannot say of these cameras."""
+    notes = []
+    if any(camera.distortion is not None for camera in cameras):
+        notes.append("lens distortion left out of cameras.json: only poses and focal lengths are kept")
+    off = max(max(abs(c.cx - (c.width - 1) / 2), abs(c.cy - (c.height - 1) / 2)) for c in cameras)
+    if off > 0.5:
+        notes.append(f"principal points up to {off:.1f} pixels off the middle left out of cameras.json, which has none")
+    return tuple(notes)
+
+
+def _check_cameras(beside: Path, cameras: Path, force: bool) -> None:
+    if beside.exists() and cameras.exists() and beside.samefile(cameras):
+        raise InputError(f"{beside}: these are the scene's own cameras, and would be replaced: write to another folder")
+    check_writable(beside, force)
+
+
+def synth_text(found: dict[str, Any]) -> str:
+    """The text of what `synth` did."""
+    few, many = found["parts"]
+    parts = f"{few}" if few == many else f"{few} or {many}"
+    tiles = "" if found["tiles"] == 1 else f", in {found['tiles']} copies side by side"
+    lines = [
+        f"{found['input']}: {found['input_count']} Gaussians of SH degree {found['sh_degree']}",
+        f"wrote {found['output']}, {found['count']} Gaussians, {found['size']} bytes ({format_size(found['size'])})",
+        f"made    each Gaussian in {parts} part{'' if many == 1 else 's'}{tiles}; seed {found['seed']}",
+    ]
+    if found["cameras"] is not None:
+        lines.append(f"cameras {found['cameras']}, {found['views']} views")
+    lines += [f"note    {note}" for note in found["notes"]]
+    lines.append(
+        f"run     {found['seconds']:.1f} s, peak memory {format_mib(found['peak_memory'])} of {format_mib(found['memory_limit'])}"
+    )
+    return "\n".join(lines) + "\n"

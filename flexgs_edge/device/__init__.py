@@ -1,1 +1,0 @@
-"""OpenCL devices: choice, self-test, and the session that owns everything on one of them."""

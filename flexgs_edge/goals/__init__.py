@@ -1,0 +1,1 @@
+"""What is asked and what a search has seen: targets, steps and choices, without arrays."""

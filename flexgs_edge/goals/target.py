@@ -1,0 +1,210 @@
+"""What a search aims at: a loss of quality that may not be passed, or a size that must be kept.
+
+A target answers one question about a measured point: by how much does it miss (`excess`)? Zero or less holds. The excess
+rises smoothly with compression, so the search may interpolate in it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.units import format_size
+
+Judge = Literal["drop", "modelled drop", "fidelity"]
+"""Which figure decides: the drop against photos, the modelled drop, or the PSNR against the original's renders."""
+
+IDENTICAL_DB = 200.0
+"""Stands for the fidelity of identical renders where numbers are compared (never reported)."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Quality of one point of the search, means over the decision views, in dB.
+
+    Parameters
+    ----------
+    drop : float or None
+        Drop against the photos; `None` without photos.
+    fidelity : float or None
+        PSNR against the original's renders; `None` when identical.
+    modelled_drop : float
+        Drop modelled from the error against the original's renders.
+    worst : Measurement or None
+        The same of the worst view alone.
+    """
+
+    drop: float | None
+    fidelity: float | None
+    modelled_drop: float
+    worst: Measurement | None = None
+
+    def figure(self, judge: Judge) -> float | None:
+        """The figure that `judge` names, dB (`None`: identical, or no photos)."""
+        return {"drop": self.drop, "modelled drop": self.modelled_drop, "fidelity": self.fidelity}[judge]
+
+    def loss(self, judge: Judge) -> float:
+        """The same figure as a number that grows as quality falls."""
+        if judge == "fidelity":
+            return -IDENTICAL_DB if self.fidelity is None else -self.fidelity
+        figure = self.figure(judge)
+        if figure is None:
+            raise InputError("the drop against photos was asked to decide, but there are no photos")
+        return figure
+
+
+class Target(Protocol):
+    """What `adapt` needs to know of a target."""
+
+    @property
+    def judge(self) -> Judge: ...
+
+    @property
+    def limit_bytes(self) -> int | None:
+        """Largest size that is allowed, or `None` when quality decides."""
+
+    def excess(self, size: int, measurement: Measurement | None) -> float:
+        """By how much a point misses; zero or less holds."""
+
+    def describe(self) -> str:
+        """The target in words, for the summary and for messages."""
+
+    def report(self, size: int, measurement: Measurement | None) -> str:
+        """The point's figure in the target's own words."""
+
+
+@dataclass(frozen=True)
+class MaxDrop:
+    """Lose at most `limit` dB, by photos (`judge="drop"`) or modelled (`judge="modelled drop"`)."""
+
+    limit: float
+    judge: Judge = "drop"
+    limit_bytes: int | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.limit) and self.limit > 0.0):
+            raise InputError(f"--max-drop {self.limit:g}: expected a drop above 0 dB (1.0 is the usual choice)")
+
+    def excess(self, size: int, measurement: Measurement | None) -> float:
+        assert measurement is not None
+        return _log_loss(measurement.loss(self.judge), self.limit)
+
+    def describe(self) -> str:
+        return f"{self.judge} <= {self.limit:g} dB"
+
+    def report(self, size: int, measurement: Measurement | None) -> str:
+        assert measurement is not None
+        return f"{self.judge} {measurement.loss(self.judge):.3f} dB at {format_size(size)}"
+
+
+def _log_loss(loss: float, limit: float) -> float:
+    """Log scale: the error grows about exponentially with the rates, so interpolation is near linear in it.
+
+    The floor keeps drops at or below zero (compressed beats original) in the domain, far on the side that holds.
+    """
+    return math.log(max(loss / limit, 0.02))
+
+
+@dataclass(frozen=True)
+class MinFidelity:
+    """Keep a PSNR of at least `limit` dB against the original's renders."""
+
+    limit: float
+    judge: Judge = "fidelity"
+    limit_bytes: int | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.limit) and 0.0 < self.limit < IDENTICAL_DB):
+            raise InputError(
+                f"--min-fidelity {self.limit:g}: expected decibels between 0 and {IDENTICAL_DB:g} (40 is about 1 dB of drop)"
+            )
+
+    def excess(self, size: int, measurement: Measurement | None) -> float:
+        assert measurement is not None
+        return (self.limit + measurement.loss("fidelity")) * (math.log(10.0) / 10.0)
+
+    def describe(self) -> str:
+        return f"fidelity >= {self.limit:g} dB"
+
+    def report(self, size: int, measurement: Measurement | None) -> str:
+        assert measurement is not None
+        fidelity = "identical" if measurement.fidelity is None else f"{measurement.fidelity:.3f} dB"
+        return f"fidelity {fidelity} at {format_size(size)}"
+
+
+@dataclass(frozen=True)
+class WorstToo:
+    """Hold `target`, and lose at most `limit_worst` dB in the worst view as well."""
+
+    target: MaxDrop | MinFidelity
+    limit_worst: float
+    drop: Judge
+    """What the worst view loses is told by this figure: `drop` or `modelled drop`."""
+    limit_bytes: int | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.limit_worst) and self.limit_worst > 0.0):
+            raise InputError(
+                f"--max-worst-drop {self.limit_worst:g}: expected a drop above 0 dB (1.5 times --max-drop is a usual choice)"
+            )
+
+    @property
+    def judge(self) -> Judge:
+        """The figure of the mean."""
+        return self.target.judge
+
+    @property
+    def limit(self) -> float:
+        """Of the mean."""
+        return self.target.limit
+
+    def _loss(self, measurement: Measurement | None) -> float:
+        assert measurement is not None and measurement.worst is not None
+        return measurement.worst.loss(self.drop)
+
+    def excess(self, size: int, measurement: Measurement | None) -> float:
+        return max(self.target.excess(size, measurement), _log_loss(self._loss(measurement), self.limit_worst))
+
+    def describe(self) -> str:
+        return f"{self.target.describe()}, {self.drop} <= {self.limit_worst:g} dB in every view"
+
+    def report(self, size: int, measurement: Measurement | None) -> str:
+        worst = self._loss(measurement)
+        return f"{self.target.report(size, measurement)}, {self.drop} {worst:.3f} dB in the worst view"
+
+
+@dataclass(frozen=True)
+class MaxSize:
+    """Stay within `limit_bytes`; `judge` picks the best of the points that fit."""
+
+    limit_bytes: int
+    judge: Judge = "modelled drop"
+    words: str = ""
+
+    def __post_init__(self) -> None:
+        if self.limit_bytes < 1:
+            raise InputError(f"a size limit of {self.limit_bytes} bytes: expected at least 1 byte")
+
+    def excess(self, size: int, measurement: Measurement | None) -> float:
+        return math.log(size / self.limit_bytes)
+
+    def describe(self) -> str:
+        return self.words or f"size <= {format_size(self.limit_bytes)}"
+
+    def report(self, size: int, measurement: Measurement | None) -> str:
+        figure = None if measurement is None else measurement.figure(self.judge)
+        return f"{size} bytes ({format_size(size)})" + ("" if figure is None else f", {self.judge} {figure:.3f} dB")
+
+
+def min_ratio(ratio: float, ply_bytes: int, judge: Judge = "modelled drop") -> MaxSize:
+    """The size target behind `--min-ratio`: PLY bytes / ratio, rounded down.
+
+    >>> min_ratio(10.0, 2480).limit_bytes
+    248
+    """
+    if not (math.isfinite(ratio) and ratio >= 1.0):
+        raise InputError(f"--min-ratio {ratio:g}: expected a ratio of 1 or more")
+    limit = int(ply_bytes / ratio)
+    return MaxSize(max(limit, 1), judge, f"ratio >= {ratio:g} (size <= {format_size(limit)})")

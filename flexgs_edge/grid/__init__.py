@@ -1,0 +1,1 @@
+"""Integers of the method `best`: a value is an integer times a step size."""

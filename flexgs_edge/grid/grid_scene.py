@@ -1,0 +1,89 @@
+"""A scene of integers: codes on the grids that its step sizes span."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.memory.storage import MEMORY, Room
+
+
+@dataclass(frozen=True, eq=False)
+class GridScene:
+    """A scene in integers, rows sorted by layer, then along the Morton curve of the position cells.
+
+    Parameters
+    ----------
+    count : int
+        Rows n.
+    sh_degree : int
+        D; 0 when no row has SH.
+    origin : np.ndarray
+        [3] f64, world: positions are relative to it.
+    steps : Steps
+        Value = code * step.
+    position : np.ndarray
+        [3, n] i32.
+    scale : np.ndarray
+        [3, n] i32.
+    rotation : np.ndarray
+        [3, n] i32: x, y, z of the unit quaternion, which has w >= 0 and no component larger than w.
+    opacity : np.ndarray
+        [n] i32.
+    dc : np.ndarray
+        [3, n] i32: Y, Co, Cg.
+    sh_degrees : np.ndarray
+        [n] u8, 0 to D.
+    sh : tuple of np.ndarray
+        For each degree l from 1 to D: [3 * (2l + 1), rows with a degree >= l] i32: all Y, all Co, all Cg.
+    layer : np.ndarray
+        [n] u8, ascending; all 0 when there are no layers.
+    """
+
+    count: int
+    sh_degree: int
+    origin: np.ndarray
+    steps: Steps
+    position: np.ndarray
+    scale: np.ndarray
+    rotation: np.ndarray
+    opacity: np.ndarray
+    dc: np.ndarray
+    sh_degrees: np.ndarray
+    sh: tuple[np.ndarray, ...]
+    layer: np.ndarray
+
+    @property
+    def sh_count(self) -> int:
+        """Rows with SH above degree 0."""
+        return int(np.count_nonzero(self.sh_degrees))
+
+    def take(self, rows: np.ndarray, room: Room = MEMORY) -> GridScene:
+        """The rows `rows` in their order, with the SH degree that is left."""
+        rows = np.arange(self.count)[rows]
+        degrees = self.sh_degrees[rows]
+        top = int(degrees.max(initial=0))
+        bands = tuple(room.take(self.sh[d], _places(self.sh_degrees, rows, d + 1)) for d in range(top))
+        return GridScene(
+            len(rows),
+            top,
+            self.origin,
+            replace(self.steps, sh=self.steps.sh[:top]),
+            room.take(self.position, rows),
+            room.take(self.scale, rows),
+            room.take(self.rotation, rows),
+            room.take(self.opacity, rows),
+            room.take(self.dc, rows),
+            degrees,
+            bands,
+            self.layer[rows],
+        )
+
+
+def _places(degrees: np.ndarray, rows: np.ndarray, degree: int) -> np.ndarray:
+    """Where the SH of those `rows` that have `degree` lie in the arrays of that degree."""
+    places = np.cumsum(degrees >= degree) - 1
+    chosen: np.ndarray = places[rows[degrees[rows] >= degree]]
+    return chosen

@@ -1,0 +1,180 @@
+"""From values to grid codes: positions on a curve, quaternions, opacities, colours and SH."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
+from flexgs_edge.errors import InputError
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.step_sizes import POSITION_BITS, Planes, Steps
+from flexgs_edge.memory.ordered import OrderedPlanes, stable_order
+from flexgs_edge.memory.rows import blocks, put_rows, read_ahead, read_rows
+from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.scene.curve import morton
+from flexgs_edge.scene.fields import sh_rest_count
+from flexgs_edge.scene.rotations import canonical_axes
+
+
+def to_grid(
+    planes: Planes,
+    sh_degrees: np.ndarray,
+    steps: Steps,
+    origin: np.ndarray | Sequence[float],
+    layer: np.ndarray | None = None,
+    room: Room = MEMORY,
+    rename: bool = True,
+) -> tuple[GridScene, np.ndarray]:
+    """Put a scene on its grid.
+
+    Every Gaussian is written in that one of its 24 equal forms (its axes can be renamed and turned round) whose rotation
+    is smallest: 1.4 bits less a Gaussian than the form that training left.
+
+    Parameters
+    ----------
+    planes : mapping
+        {field: [width, n] f32}, finite; `means` relative to `origin`.
+    sh_degrees : np.ndarray
+        [n], the SH degree kept for each row; coefficients above it are left out.
+    steps : Steps
+        Needs one SH step for each degree kept.
+    origin : array_like
+        [3] f64.
+    layer : np.ndarray, optional
+        [n], 0 to 255.
+    room : Room, optional
+        Where the grid goes.
+    rename : bool
+        Look for that form; False leaves rotations and scales as they are.
+
+    Returns
+    -------
+    tuple
+        The `GridScene`, and [n] i64: the input row of each of its rows.
+
+    Raises
+    ------
+    InputError
+        When a value is not finite or its code is out of range: nothing is clipped.
+    """
+    count = planes["means"].shape[1]
+    degrees = _bytes("sh_degrees", sh_degrees, count, MAX_SH_DEGREE)
+    top = int(degrees.max(initial=0))
+    if len(steps.sh) < top or planes["sh_rest"].shape[0] < 3 * sh_rest_count(top):
+        raise InputError(f"SH degree {top} asked for: expected a step and coefficients for each degree up to it")
+    position, order = _along_curve(planes["means"], steps.position, layer, room)
+    scale, rotation, dc = (room.empty((3, count), np.int32) for _ in range(3))
+    opacity = room.empty((count,), np.int32)
+    ordered = OrderedPlanes(planes, order, room)
+    for part, values in ordered.parts(count, "quats", "log_scales", "opacity_logits", "sh_dc"):
+        rows, (quats, log_scales, logits, colours) = order[part], values
+        if rename:
+            quats, log_scales = canonical_axes(quats, log_scales)
+        put_rows(scale, part, _codes("log_scales", log_scales, steps.scale, rows))
+        put_rows(rotation, part, _codes("quats", quats[1:], steps.rotation, rows))
+        put_rows(opacity, part, _codes("opacity_logits", logits, steps.opacity, rows)[0])
+        put_rows(dc, part, _colour_codes("sh_dc", colours[:, None], steps.colour(steps.dc), rows)[:, 0])
+    degrees = degrees[order]
+    grid = GridScene(
+        count,
+        top,
+        np.array(origin, np.float64).reshape(3),
+        replace(steps, sh=steps.sh[:top]),
+        position,
+        scale,
+        rotation,
+        opacity,
+        dc,
+        degrees,
+        tuple(
+            _band_codes(ordered, degree, np.flatnonzero(degrees >= degree), steps, room, order)
+            for degree in range(1, top + 1)
+        ),
+        np.zeros(count, np.uint8) if layer is None else _bytes("layer", layer, count, 255)[order],
+    )
+    return grid, order
+
+
+def _along_curve(means: np.ndarray, step: float, layer: np.ndarray | None, room: Room) -> tuple[np.ndarray, np.ndarray]:
+    """Position codes [3, n] i32 in their order, and that order ([n] i64): by layer, then along the Morton curve."""
+    count = means.shape[1]
+    codes = room.empty((3, count), np.int32)
+    low, high = np.full((3, 1), CODE_LIMIT), np.full((3, 1), -CODE_LIMIT)
+    for part, (values,) in read_ahead(count, means):
+        some = _codes("means", values, step, np.arange(part.start, part.stop))
+        put_rows(codes, part, some)
+        low, high = (
+            np.minimum(low, some.min(axis=1, keepdims=True)),
+            np.maximum(high, some.max(axis=1, keepdims=True)),
+        )
+    if count and (high - low).max() >= 1 << POSITION_BITS:
+        raise InputError(
+            f"means: the scene is {int((high - low).max())} position steps of {step:g} wide, expected less than "
+            f"2^{POSITION_BITS}: take a larger step or remove far outliers"
+        )
+    keys = room.empty((count,), np.uint64)
+    for part, (some,) in read_ahead(count, codes):
+        put_rows(keys, part, morton(some - low))
+    layers = None if layer is None else _bytes("layer", layer, count, 255)
+    order = stable_order(keys, room) if layers is None else np.lexsort((keys, layers)).astype(np.int64)
+    return room.take(codes, order), order
+
+
+def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray, room: Room = MEMORY) -> GridScene:
+    """The same rows with other colours ([3, n] and [3 * K, n] f32, in the grid's row order) put on the same steps."""
+    dc = room.empty((3, grid.count), np.int32)
+    for part in blocks(grid.count):
+        rows, some = np.arange(part.start, part.stop), read_rows(sh_dc, part)[:, None]
+        put_rows(dc, part, _colour_codes("sh_dc", some, grid.steps.colour(grid.steps.dc), rows)[:, 0])
+    degrees = range(1, grid.sh_degree + 1)
+    colours = OrderedPlanes({"sh_rest": sh_rest}, None, room)
+    bands = tuple(_band_codes(colours, d, np.flatnonzero(grid.sh_degrees >= d), grid.steps, room) for d in degrees)
+    return replace(grid, dc=dc, sh=bands)
+
+
+def _bytes(name: str, values: np.ndarray, count: int, highest: int) -> np.ndarray:
+    values = np.asarray(values)
+    if values.shape != (count,):
+        raise InputError(f"{name}: expected {count} rows, got an array of shape {values.shape}")
+    bad = np.flatnonzero((values < 0) | (values > highest))
+    if len(bad):
+        raise InputError(f"{name}: row {bad[0]}: expected 0 to {highest}, got {values[bad[0]]}")
+    return values.astype(np.uint8)
+
+
+def _codes(name: str, values: np.ndarray, step: float | np.ndarray, order: np.ndarray | None = None) -> np.ndarray:
+    """rint(value / step) in float64 as i32; `order` gives input rows for the message."""
+    codes = np.rint(np.asarray(values, np.float64) / step)
+    bad = ~(np.abs(codes) <= CODE_LIMIT)  # NaN compares false
+    if bad.any():
+        *_, at = place = tuple(np.argwhere(bad)[0])
+        row = at if order is None else order[at]
+        raise InputError(
+            f"{name}: row {row}: value {np.asarray(values)[place]:g} at a step of {np.broadcast_to(step, codes.shape)[place]:g}:"
+            f" expected a finite number of at most 2^24 steps"
+        )
+    return codes.astype(np.int32)
+
+
+def _colour_codes(name: str, rgb: np.ndarray, steps: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """Codes of Y = (R + 2G + B) / 4, Co = R - B, Cg = (2G - R - B) / 2 of [3, m, n] values."""
+    red, green, blue = np.asarray(rgb, np.float64)
+    both = red + blue
+    colour = np.stack([(both + 2 * green) / 4, red - blue, (2 * green - both) / 2])
+    return _codes(name, colour, steps[:, None, None].astype(np.float64), order)
+
+
+def _band_codes(
+    planes: OrderedPlanes, degree: int, rows: np.ndarray, steps: Steps, room: Room, order: np.ndarray | None = None
+) -> np.ndarray:
+    """[3 * (2l + 1), n] codes of the coefficients of one SH degree; `order` gives input rows for the message."""
+    codes = room.empty((3, 2 * degree + 1, len(rows)), np.int32)
+    for part in blocks(len(rows)):
+        chosen = rows[part]
+        named = chosen if order is None else order[chosen]
+        rgb = planes.band(degree, chosen)
+        put_rows(codes, part, _colour_codes("sh_rest", rgb, steps.colour(steps.sh[degree - 1]), named))
+    return codes.reshape(6 * degree + 3, len(rows))

@@ -1,0 +1,125 @@
+"""From grid codes back to float32 values, as every decoder computes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from flexgs_edge.grid.grid_scene import GridScene, _places
+from flexgs_edge.memory.rows import put_rows, read_ahead, read_rows
+from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.scene.fields import FIELD, sh_rest_count
+
+
+def values_of(grid: GridScene, room: Room = MEMORY) -> dict[str, np.ndarray]:
+    """`from_grid` of all rows and fields, in arrays of `room`."""
+    planes = {name: room.empty((field.width(grid.sh_degree), grid.count), np.float32) for name, field in FIELD.items()}
+    names = [name for name in FIELD if name != "sh_rest"]
+    first = np.zeros(grid.sh_degree, np.int64)
+    for part, found in read_ahead(grid.count, grid.position, grid.scale, grid.rotation, grid.opacity, grid.dc):
+        position, scale, rotation, opacity, dc = found
+        some = replace(
+            grid,
+            count=part.stop - part.start,
+            position=position,
+            scale=scale,
+            rotation=rotation,
+            opacity=opacity,
+            dc=dc,
+        )
+        for name, values in from_grid(some, slice(None), names).items():
+            put_rows(planes[name], part, values)
+        # As `from_grid` finds them, but counted once.
+        degrees = grid.sh_degrees[part]
+        last = first + np.array([np.count_nonzero(degrees > level) for level in range(grid.sh_degree)], np.int64)
+        bands = [
+            read_rows(band, slice(a, b)) for band, a, b in zip(grid.sh, first.tolist(), last.tolist(), strict=True)
+        ]
+        put_rows(planes["sh_rest"], part, _spread_bands(grid, degrees, bands))
+        first = last
+    return planes
+
+
+def from_grid(
+    grid: GridScene, rows: slice | np.ndarray = slice(None), fields: Sequence[str] = tuple(FIELD)
+) -> dict[str, np.ndarray]:
+    """Values of `rows` of a grid: the specification of every decoder.
+
+    In float32, each operation rounded once and none fused: value = code * step; quaternions
+    w = sqrt(max(0, 1 - ((x*x + y*y) + z*z))); colours h = Cg * 0.5, c = Co * 0.5, t = Y - h, then
+    red = t + c, green = Y + h, blue = t - c.
+
+    Returns
+    -------
+    dict
+        {field: [width, n] f32}; SH above a row's degree are zero.
+    """
+    steps = grid.steps
+    makers = {
+        "means": lambda: _values(_part(grid.position, rows), steps.position),
+        "sh_dc": lambda: _rgb(_part(grid.dc, rows)[:, None], steps.colour(steps.dc))[:, 0],
+        "sh_rest": lambda: _sh_rest(grid, rows),
+        "opacity_logits": lambda: _values(_part(grid.opacity, rows)[None], steps.opacity),
+        "log_scales": lambda: _values(_part(grid.scale, rows), steps.scale),
+        "quats": lambda: _quats(_values(_part(grid.rotation, rows), steps.rotation)),
+    }
+    return {field: makers[field]() for field in fields}
+
+
+def _part(values: np.ndarray, rows: slice | np.ndarray) -> np.ndarray:
+    if isinstance(rows, slice) and rows.step in (None, 1):
+        return read_rows(values, slice(*rows.indices(values.shape[-1])[:2]))
+    return values[..., rows]
+
+
+def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:
+    """[3 * K, n] f32, zero above each row's degree."""
+    if isinstance(rows, slice):
+        start, stop, step = rows.indices(grid.count)
+        rows = rows if step == 1 else np.arange(start, stop, step)
+    degrees = grid.sh_degrees[rows]
+    bands = []
+    for degree in range(1, grid.sh_degree + 1):
+        if isinstance(rows, slice):
+            first = int(np.count_nonzero(grid.sh_degrees[:start] >= degree))
+            last = first + int(np.count_nonzero(degrees >= degree))
+            bands.append(read_rows(grid.sh[degree - 1], slice(first, last)))
+        else:
+            bands.append(grid.sh[degree - 1][:, _places(grid.sh_degrees, np.arange(grid.count)[rows], degree)])
+    return _spread_bands(grid, degrees, bands)
+
+
+def _spread_bands(grid: GridScene, degrees: np.ndarray, bands: Sequence[np.ndarray]) -> np.ndarray:
+    """[3 * K, n] f32 of rows with these degrees ([n]) and these codes of each degree."""
+    planes = np.zeros((3, sh_rest_count(grid.sh_degree), len(degrees)), np.float32)
+    for degree, chosen in enumerate(bands, start=1):
+        has = np.flatnonzero(degrees >= degree)
+        values = _rgb(chosen.reshape(3, 2 * degree + 1, len(has)), grid.steps.colour(grid.steps.sh[degree - 1]))
+        band = planes[:, degree * degree - 1 : (degree + 1) ** 2 - 1]
+        for colour, coefficients in zip(band, values, strict=True):
+            # Plane by plane: one list of places for all of them at once takes five times as long.
+            for plane, value in zip(colour, coefficients, strict=True):
+                plane[has] = value
+    return planes.reshape(planes.shape[0] * planes.shape[1], len(degrees))
+
+
+def _values(codes: np.ndarray, step: float) -> np.ndarray:
+    values: np.ndarray = codes.astype(np.float32) * np.float32(step)
+    return values
+
+
+def _quats(xyz: np.ndarray) -> np.ndarray:
+    """[4, n] f32 quaternions w x y z of their last three components."""
+    x, y, z = xyz
+    square = np.float32(1) - ((x * x + y * y) + z * z)
+    return np.stack([np.sqrt(np.maximum(square, np.float32(0))), x, y, z])
+
+
+def _rgb(codes: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """[3, m, n] f32 colours of Y, Co, Cg codes."""
+    luma, orange, green = codes.astype(np.float32) * steps[:, None, None]
+    half_orange, half_green = orange * np.float32(0.5), green * np.float32(0.5)
+    rest = luma - half_green
+    return np.stack([rest + half_orange, luma + half_green, rest - half_orange])

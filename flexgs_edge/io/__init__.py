@@ -1,0 +1,1 @@
+"""Files of other programs: PLY, SPZ, SOG, compressed PLY, model folders."""

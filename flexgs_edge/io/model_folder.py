@@ -1,0 +1,94 @@
+"""From a path to a scene: files by suffix, INRIA's model folders, and what lies beside them."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flexgs_edge.errors import FormatError, InputError
+
+_ITERATION = re.compile(r"iteration_([0-9]{1,18})")
+_CFG_LIMIT = 1 << 16
+"""Bytes of cfg_args: it has a few hundred."""
+
+
+def latest_iteration(folder: Path) -> Path:
+    """The `point_cloud.ply` of the highest iteration in a model folder."""
+    found = {
+        int(match.group(1)): ply
+        for ply in folder.glob("point_cloud/iteration_*/point_cloud.ply")
+        if (match := _ITERATION.fullmatch(ply.parent.name)) and ply.is_file()
+    }
+    if not found:
+        raise InputError(f"{folder}: no point_cloud/iteration_*/point_cloud.ply in this folder; is it a model folder?")
+    return found[max(found)]
+
+
+@dataclass(frozen=True)
+class Companions:
+    """What was found beside a scene; None for what was not."""
+
+    cameras: Path | None = None
+    images: Path | None = None
+    white_background: bool | None = None
+    antialiased: bool | None = None
+
+
+def find_companions(path: str | os.PathLike[str]) -> Companions:
+    """Find the cameras, photos and ways of drawing that belong to a scene.
+
+    Looks beside the file (`cameras.json`, `images/`), or in the model folder: the one given, or the one that holds
+    the file as `point_cloud/iteration_*/*.ply`. A model folder's `cfg_args` names photos elsewhere, the background, and
+    may say that the model is antialiased (the reference program leaves `antialiasing` out of it, others put it in).
+
+    Raises
+    ------
+    FormatError
+        When there is a `cfg_args` that cannot be understood.
+    """
+    place = Path(path)
+    folder = place if place.is_dir() else place.parent
+    holder = folder.absolute()  # a bare file name has no parents of its own to look at
+    inside = _ITERATION.fullmatch(holder.name) and holder.parent.name == "point_cloud"
+    if inside and not (folder / "cameras.json").is_file():
+        folder = holder.parent.parent
+    settings = _read_cfg_args(folder / "cfg_args")
+    white, antialiased = settings.get("white_background"), settings.get("antialiasing")
+    cameras = folder / "cameras.json"
+    return Companions(
+        cameras if cameras.is_file() else None,
+        _find_images(folder, settings),
+        white if isinstance(white, bool) else None,
+        antialiased if isinstance(antialiased, bool) else None,
+    )
+
+
+def _find_images(folder: Path, settings: dict[str, Any]) -> Path | None:
+    """The folder of photos: where cfg_args says if it is there, else `images/` beside the scene."""
+    images, source = settings.get("images", "images"), settings.get("source_path")
+    places = [folder / "images"]
+    if isinstance(images, str) and isinstance(source, str) and images and source and "\0" not in images + source:
+        places.insert(0, folder / source / images)  # an absolute source_path stands alone
+    return next((place for place in places if place.is_dir()), None)
+
+
+def _read_cfg_args(path: Path) -> dict[str, Any]:
+    """The literal arguments of the text `Namespace(key=value, ...)`; empty without the file. Nothing is evaluated."""
+    if not path.is_file():
+        return {}
+    try:
+        with open(path, "rb") as file:
+            text = file.read(_CFG_LIMIT + 1)
+        call = ast.parse(text.decode().strip(), mode="eval").body
+    except OSError as error:
+        raise InputError(f"{path}: cannot read it ({error.strerror})") from error
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise FormatError(f"{path}: expected the text Namespace(key=value, ...), found {text[:40]!r}") from error
+    if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.func.id != "Namespace":
+        raise FormatError(f"{path}: expected the text Namespace(key=value, ...), found {text[:40]!r}")
+    pairs = ((keyword.arg, keyword.value) for keyword in call.keywords)
+    return {key: value.value for key, value in pairs if key is not None and isinstance(value, ast.Constant)}

@@ -1,0 +1,203 @@
+"""Which OpenCL devices there are, which of them work, and which one is taken."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from flexgs_edge.errors import DeviceError
+
+if TYPE_CHECKING:
+    import pyopencl as cl
+
+
+HINT = (
+    "install an OpenCL runtime (Debian, Ubuntu, Jetson: `apt install pocl-opencl-icd`) or run the NumPy twins with "
+    "`--device numpy` (same results, far slower)"
+)
+
+# Contracted and separate multiply-add on vectors of 16: catches runtimes that cannot build for this processor (every kernel
+# of the PoCL wheels from pip fails on CPUs newer than their compiler), that fuse what must not be fused, or miss lanes.
+_SELF_TEST = """
+#pragma OPENCL FP_CONTRACT OFF
+__kernel void self_test(__global const float *a, __global const float *b, __global float *out) {
+  const size_t i = get_global_id(0) * 16;
+  float16 x = vload16(0, a + i), y = vload16(0, b + i);
+  vstore16(fma(x, y, -y), 0, out + i);
+  vstore16(x * y - y, 0, out + 64 + i);
+  vstore16(1.0f / sqrt(x), 0, out + 128 + i);
+}
+"""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One OpenCL device: its limits, and whether it passed the self-test.
+
+    `self_test` is "ok", "not run", or the reason why the device cannot be used.
+    """
+
+    index: int
+    name: str
+    platform: str
+    type: str
+    driver: str
+    opencl_c: str
+    compute_units: int
+    native_width: int
+    max_work_group: int
+    local_bytes: int
+    global_bytes: int
+    max_alloc_bytes: int
+    self_test: str
+    handle: cl.Device | None = field(default=None, repr=False, compare=False)
+    context: cl.Context | None = field(default=None, repr=False, compare=False)
+    """The self-test's. PoCL's compiler starts again, for half a second, in the first context after the last one has gone."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether the device passed (or was spared) the self-test."""
+        return self.self_test in ("ok", "not run")
+
+    def to_json(self) -> dict[str, Any]:
+        """All fields but the handle and the context."""
+        fields = asdict(DeviceInfo(**{**self.__dict__, "handle": None, "context": None}))
+        del fields["handle"], fields["context"]
+        return fields
+
+
+def list_devices(self_test: bool = True) -> list[DeviceInfo]:
+    """Every device of every OpenCL platform, in the order of the loader.
+
+    Parameters
+    ----------
+    self_test : bool
+        Build and run a small kernel on each device and compare its result with NumPy's.
+    """
+    import pyopencl as cl
+
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError:  # PLATFORM_NOT_FOUND_KHR: no runtime installed
+        return []
+    found: list[DeviceInfo] = []
+    for platform in platforms:
+        try:
+            devices = platform.get_devices()
+        except cl.Error:  # a platform without devices may raise DEVICE_NOT_FOUND
+            continue
+        for device in devices:
+            found.append(_describe(len(found), platform, device, self_test))
+    return found
+
+
+def _describe(index: int, platform: Any, device: Any, self_test: bool) -> DeviceInfo:
+    import pyopencl as cl
+
+    context, verdict = None, "not run"
+    if self_test:
+        try:
+            context = cl.Context([device])
+            verdict = run_self_test(context)
+        except cl.Error as error:
+            verdict = f"no context: {_first_line(str(error))}"
+    kind = "gpu" if device.type & cl.device_type.GPU else "cpu" if device.type & cl.device_type.CPU else "other"
+    return DeviceInfo(
+        index=index,
+        name=device.name.strip(),
+        platform=platform.name.strip(),
+        type=kind,
+        driver=device.driver_version.strip(),
+        opencl_c=device.opencl_c_version.strip(),
+        compute_units=device.max_compute_units,
+        native_width=device.native_vector_width_float,
+        max_work_group=device.max_work_group_size,
+        local_bytes=device.local_mem_size,
+        global_bytes=device.global_mem_size,
+        max_alloc_bytes=device.max_mem_alloc_size,
+        self_test=verdict,
+        handle=device,
+        context=context,
+    )
+
+
+def run_self_test(context: cl.Context) -> str:
+    """`ok`, or one line that says what went wrong."""
+    import pyopencl as cl
+
+    a = np.linspace(0.5, 3.0, 64, dtype=np.float32)
+    b = np.linspace(-7.0, 5.0, 64, dtype=np.float32)
+    got = np.empty(192, np.float32)
+    flags = cl.mem_flags
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            program = cl.Program(context, _SELF_TEST).build(options=["-cl-std=CL1.2"], cache_dir=False)  # type: ignore[arg-type]
+        queue = cl.CommandQueue(context)
+        inputs = [cl.Buffer(context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=x) for x in (a, b)]
+        output = cl.Buffer(context, flags.WRITE_ONLY, got.nbytes)
+        cl.Kernel(program, "self_test")(queue, (4,), (1,), *inputs, output)
+        cl.enqueue_copy(queue, got, output)
+        queue.finish()
+    except cl.Error as error:
+        return f"kernel does not build or run: {_first_line(str(error))}"
+    exact = a.astype(np.float64) * b
+    fused, separate = (exact - b).astype(np.float32), exact.astype(np.float32) - b
+    if not np.array_equal(got[:64], fused):
+        return "fma() is not exact"
+    if not np.array_equal(got[64:128], separate):
+        return "multiply and add are fused although FP_CONTRACT is off"
+    if np.abs(got[128:] * np.sqrt(a) - 1).max() > 1e-6:
+        return "1/sqrt() is wrong"
+    return "ok"
+
+
+def _first_line(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    errors = [line for line in lines if "error" in line.lower()]
+    return (errors or lines or ["unknown error"])[0][:200]
+
+
+def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceInfo, str]:
+    """The device that `spec` names, and why.
+
+    Parameters
+    ----------
+    spec : str or None
+        An index, `cpu`, `gpu`, a part of the device's or platform's name, or None: the first GPU that passed the
+        self-test, else PoCL's CPU device, else any other CPU device.
+
+    Raises
+    ------
+    DeviceError
+        When nothing matches or what matches failed its self-test; the message lists what is there. Never another device
+        than the one asked for.
+    """
+    listing = "; ".join(f"[{d.index}] {d.name} ({d.platform}, {d.type}): {d.self_test}" for d in devices)
+    if not devices:
+        raise DeviceError(f"no OpenCL device found: {HINT}")
+    if spec is None:
+        usable = [d for d in devices if d.usable]
+        if not usable:
+            raise DeviceError(f"no OpenCL device passed the self-test: {listing}. To go on, {HINT}")
+        ranked = sorted(
+            usable, key=lambda d: (d.type != "gpu", "portable computing" not in d.platform.lower(), d.index)
+        )
+        return ranked[0], "first GPU that works" if ranked[
+            0
+        ].type == "gpu" else "no GPU works; first CPU device, PoCL before others"
+    if spec.isdigit():
+        matches = [d for d in devices if d.index == int(spec)]
+    elif spec in ("cpu", "gpu"):
+        matches = [d for d in devices if d.type == spec]
+    else:
+        matches = [d for d in devices if spec.lower() in f"{d.name} {d.platform}".lower()]
+    if not matches:
+        raise DeviceError(f"--device {spec}: no such OpenCL device; there are: {listing}")
+    for device in matches:
+        if device.usable:
+            return device, f"asked for by --device {spec}"
+    raise DeviceError(f"--device {spec}: failed the self-test: {listing}. To go on, {HINT}")

@@ -1,0 +1,151 @@
+"""One OpenCL session: context, queue, built programs, kept kernels and counted buffers."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from flexgs_edge.errors import BudgetError, DeviceError
+from flexgs_edge.kernels.choose_device import DeviceInfo
+from flexgs_edge.memory.budget import MemoryBudget
+
+SCALARS = {"u": np.uint32, "i": np.int32, "f": np.float32, "b": None}
+
+
+class DeviceArray:
+    """A buffer on the device with the shape and dtype of the array in it."""
+
+    def __init__(self, session: Session, shape: tuple[int, ...], dtype: Any) -> None:
+        self.shape = shape
+        self.dtype = np.dtype(dtype)
+        self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
+        self._session = session
+        session.budget.take("a device buffer", self.nbytes)
+        try:
+            # Zero-sized buffers are not allowed; nobody reads the spare bytes.
+            self.buffer = cl.Buffer(session.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 16))
+        except (cl.MemoryError, cl.LogicError) as error:
+            session.budget.give(self.nbytes)
+            raise BudgetError(
+                f"the device refused a buffer of {self.nbytes} bytes ({error}); it allows "
+                f"{session.info.max_alloc_bytes} a buffer: use a smaller --memory-limit, so that chunks get smaller"
+            ) from error
+
+    def release(self) -> None:
+        """Free the buffer (once)."""
+        if self.nbytes >= 0:
+            self.buffer.release()
+            self._session.budget.give(self.nbytes)
+            self.nbytes = -1
+
+
+class Session:
+    """Context, in-order queue, programs, kernels and buffers of one device.
+
+    Parameters
+    ----------
+    info : DeviceInfo
+        From `choose_device`.
+    budget : MemoryBudget
+        Buffers are taken from it.
+    """
+
+    def __init__(self, info: DeviceInfo, budget: MemoryBudget) -> None:
+        self.info = info
+        self.budget = budget
+        assert info.handle is not None
+        self.context = info.context or cl.Context([info.handle])
+        self.queue = cl.CommandQueue(self.context)
+        # Of its own: filling an array that no kernel uses must not wait for the kernels of others.
+        self._maps = cl.CommandQueue(self.context)
+        self.compile_seconds = 0.0
+        self.profile: defaultdict[str, float] | None = None
+        self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
+
+    def kernel(self, source: str, name: str, options: tuple[str, ...], signature: str) -> cl.Kernel:
+        """The kernel `name` of `source`, built with `options`; `signature` has one of u i f b an argument.
+
+        Raises
+        ------
+        DeviceError
+            With the device, the options and the compiler's words when the program does not build.
+        """
+        key = (source, options)
+        if key not in self._programs:
+            start = time.perf_counter()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # CompilerWarning on any build log, such as PoCL's remarks
+                try:
+                    built = cl.Program(self.context, source).build(options=["-cl-std=CL1.2", *options], cache_dir=False)  # type: ignore[arg-type]
+                except cl.Error as error:
+                    device = f"{self.info.name} ({self.info.platform})"
+                    raise DeviceError(
+                        f"kernel {name} does not build on {device} with {' '.join(options)}:\n{error}"
+                    ) from error
+            self._programs[key] = built
+            self.compile_seconds += time.perf_counter() - start
+        kernel = cl.Kernel(self._programs[key], name)
+        kernel.set_scalar_arg_dtypes([SCALARS[kind] for kind in signature])
+        return kernel
+
+    def launch(
+        self, label: str, kernel: cl.Kernel, size: tuple[int, ...], local: tuple[int, ...], args: tuple[Any, ...]
+    ) -> None:
+        """Enqueue `kernel`; with `profile` set, wait and add its wall seconds under `label`."""
+        start = time.perf_counter() if self.profile is not None else 0.0
+        kernel(self.queue, size, local, *(a.buffer if isinstance(a, DeviceArray) else a for a in args))
+        if self.profile is not None:
+            self.queue.finish()
+            self.profile[label] += time.perf_counter() - start
+
+    def array(self, shape: tuple[int, ...], dtype: Any) -> DeviceArray:
+        """An array on the device, not initialised."""
+        return DeviceArray(self, shape, dtype)
+
+    def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0) -> None:
+        """Copy C-contiguous `values` to the flat element `offset` of `array`."""
+        values = np.ascontiguousarray(values, array.dtype)
+        if values.size:
+            cl.enqueue_copy(
+                self.queue, array.buffer, values, dst_offset=offset * array.dtype.itemsize, is_blocking=True
+            )
+
+    @contextmanager
+    def mapped(self, array: DeviceArray) -> Iterator[np.ndarray]:
+        """`array`, which no kernel uses, on the host to be written: what is in it may be gone. The device has it afterwards."""
+        flags = cl.map_flags.WRITE_INVALIDATE_REGION
+        values, _ = cl.enqueue_map_buffer(self._maps, array.buffer, flags, 0, array.shape, array.dtype)
+        try:
+            yield values
+        finally:
+            values.base.release(self._maps).wait()
+
+    def mark(self) -> Callable[[], None]:
+        """What waits for everything enqueued so far."""
+        marker: cl.Event = cl.enqueue_marker(self.queue)
+        self.queue.flush()
+        return marker.wait
+
+    def read(self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
+        """Copy `array` (from the flat element `offset` on, as much as `out` holds) to the host, waiting for the queue."""
+        out = np.empty(array.shape, array.dtype) if out is None else out
+        if out.size:
+            cl.enqueue_copy(self.queue, out, array.buffer, src_offset=offset * array.dtype.itemsize, is_blocking=True)
+        return out
+
+    def fill(self, array: DeviceArray, value: int) -> None:
+        """Set every element of `array` to `value`."""
+        cl.enqueue_fill_buffer(
+            self.queue, array.buffer, np.array(value, array.dtype), 0, max(array.nbytes, array.dtype.itemsize)
+        )
+
+    def finish(self) -> None:
+        """Wait for everything enqueued."""
+        self.queue.finish()

@@ -1,0 +1,68 @@
+"""Columns of planes in another order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from flexgs_edge.memory.rows import COPY_ROWS, blocks, put_rows, read_ahead, read_listed, read_rows
+from flexgs_edge.memory.storage import MEMORY, Room
+
+
+class OrderedPlanes:
+    """Columns of planes in another order (None: their own), read in parts.
+
+    From memory they are looked up as they are asked for. In files all are put in order first, plane by plane: otherwise places
+    all over every plane would be read for each part.
+    """
+
+    def __init__(self, planes: Mapping[str, np.ndarray], order: np.ndarray | None, room: Room) -> None:
+        self._planes, self._order = dict(planes), order
+        if order is not None and room.spills:
+            self._planes = {name: room.take(values, order) for name, values in planes.items() if name != "means"}
+            self._order = None
+
+    def parts(self, count: int, *fields: str) -> Iterator[tuple[slice, list[np.ndarray]]]:
+        """Of the first `count` rows some at a time, and [width, m] of each field."""
+        planes = [self._planes[field] for field in fields]
+        if self._order is None:
+            yield from read_ahead(count, *planes)
+            return
+        for rows in blocks(count):
+            yield rows, [values[:, self._order[rows]] for values in planes]
+
+    def band(self, degree: int, rows: np.ndarray) -> np.ndarray:
+        """[3, 2l + 1, m] coefficients of one SH degree of some rows."""
+        values = self._planes["sh_rest"]
+        band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
+        rgb = values.reshape(3, len(values) // 3, values.shape[1])[:, band]
+        return read_listed(rgb, rows if self._order is None else self._order[rows])
+
+
+def stable_order(keys: np.ndarray, room: Room = MEMORY, rows: int = 1 << 22) -> np.ndarray:
+    """[n] i64, what `np.argsort(keys, kind="stable")` gives, with no more than about `rows` keys sorted at a time in memory.
+
+    Keys are split by value into parts of about equal size (as a sample says), which are sorted one after the other; equal keys
+    are never split.
+    """
+    count = len(keys)
+    if not room.spills or count <= rows:
+        return np.argsort(keys, kind="stable")
+    order = room.empty((count,), np.int64)
+    sample = np.sort(keys[:: max(count // 65536, 1)])
+    parts = -(-2 * count // rows)
+    edges = np.unique(sample[[len(sample) * part // parts for part in range(1, parts)]])
+    at = 0
+    for low, high in zip([None, *edges], [*edges, None], strict=True):
+        chosen = []
+        for part in blocks(count, COPY_ROWS):
+            some = read_rows(keys, part)
+            inside = np.ones(len(some), bool) if low is None else some >= low
+            if high is not None:
+                inside &= some < high
+            chosen.append(part.start + np.flatnonzero(inside))
+        places = np.concatenate(chosen)
+        put_rows(order, slice(at, at + len(places)), places[np.argsort(keys[places], kind="stable")])
+        at += len(places)
+    return order

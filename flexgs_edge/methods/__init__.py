@@ -1,0 +1,1 @@
+"""What stays and how finely: one folder a method, one door each (`method.py`)."""

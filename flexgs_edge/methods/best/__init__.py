@@ -1,0 +1,1 @@
+"""The default method: measured costs, one multiplier, one search."""

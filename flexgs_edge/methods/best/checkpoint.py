@@ -1,0 +1,125 @@
+"""The rounds of a path kept in a folder, so that a run that was killed goes on from its last finished round."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.files import DISK_FULL
+from flexgs_edge.memory.rows import blocks, read_rows
+from flexgs_edge.memory.storage import Room
+from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
+from flexgs_edge.methods.best.spill import LOG
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.fingerprint import fingerprint
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import SceneSource
+
+DONE = "done"
+"""File of a round that is there last: without it the round was cut short."""
+
+
+class Checkpoint:
+    """A folder with a folder for each finished round of one path.
+
+    Parameters
+    ----------
+    folder : path
+        Made if missing. Its name says which path it is of.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.folder}: cannot keep the state of the run there ({error.strerror})") from error
+
+    def has(self, number: int) -> bool:
+        """Whether a round was finished."""
+        return (self._place(number) / DONE).is_file()
+
+    @property
+    def key(self) -> str:
+        """What the folder's name says of the path."""
+        return self.folder.name.rpartition("-")[2]
+
+    @property
+    def rounds(self) -> int:
+        """Finished rounds."""
+        number = 0
+        while self.has(number):
+            number += 1
+        return number
+
+    def load(self, number: int, room: Room) -> dict[str, np.ndarray]:
+        """The arrays of a finished round, by name, in `room`."""
+        arrays = {}
+        for place in sorted(self._place(number).glob("*.npy")):
+            held = np.load(place, mmap_mode="r", allow_pickle=False)
+            arrays[place.stem] = room.copy(held)
+        return arrays
+
+    def save(self, number: int, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
+        """Keep a round; whatever an earlier run left of it is written over.
+
+        Raises
+        ------
+        BudgetError
+            When the disk is full.
+        """
+        place = self._place(number)
+        shutil.rmtree(place, ignore_errors=True)
+        try:
+            place.mkdir()
+            for name, values in arrays:
+                with open(place / f"{name}.npy", "wb") as file:
+                    np.lib.format.write_array_header_1_0(
+                        file, {"descr": values.dtype.str, "fortran_order": False, "shape": values.shape}
+                    )
+                    for plane in values.reshape(-1, values.shape[-1]) if values.size else ():
+                        for rows in blocks(values.shape[-1], 1 << 20):
+                            file.write(np.ascontiguousarray(read_rows(plane, rows)).data)
+                    file.flush()
+                    os.fsync(file.fileno())
+            (place / DONE).touch()
+        except OSError as error:
+            if error.errno not in DISK_FULL:
+                raise
+            raise BudgetError(
+                f"{place}: the disk is full ({error.strerror}): --resume keeps every round of the search there; free some space, "
+                "name another folder with --scratch, or leave --resume out"
+            ) from error
+
+    def remove(self) -> None:
+        """Remove the folder: the run is done."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _place(self, number: int) -> Path:
+        return self.folder / f"round-{number}"
+
+
+def open_checkpoint(
+    renderer: Renderer, source: SceneSource, scored: Sequence[Camera], options: CompressOptions, folder: Path
+) -> Checkpoint:
+    """Where the path of a search keeps its rounds: a folder named by all that they depend on."""
+    # A path that leads to a descent keeps views from between the poses as well.
+    distils = distil_steps(options, len(scored)) > 0
+    words = f"path {EFFORTS[options.effort].keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r} {distils}"
+    assert options.near is not None and options.extent is not None
+    key = fingerprint(source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
+    checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")
+    if checkpoint.rounds:
+        LOG.info(
+            "%s: an earlier run was cut short after %d rounds: going on from there",
+            checkpoint.folder,
+            checkpoint.rounds,
+        )
+    return checkpoint

@@ -1,0 +1,120 @@
+"""How much work a search by measured costs spends: counted, never timed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.run.options import CompressOptions
+
+LEAST_VIEWS = 6
+"""Poses a step of the refit at the least: steps after 3 poses each fitted fox's 24 scored ones ever better and all others ever
+worse."""
+
+MENDED = 0.66
+"""Loss after the first round of the colour refit over the loss before it, until a whole result tells (fox .61 to .75, the sample
+.8 to .9)."""
+LARGEST_STEP = 4
+"""Most pixels from one to the next: splats of one or two pixels must not fall between them in every view."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much work a search spends; fixed counts.
+
+    Parameters
+    ----------
+    keep : float
+        Share of the Gaussians that stays in each round of the path.
+    refit_rounds : int
+        Rounds on all coefficients before SH are put on their grid (one on the constant follows). None in fast: a fifth of its
+        time for 5 % of the bytes.
+    subsets : int
+        Steps a round at most, as for `refit_colours`.
+    steps : int
+        Whole results that are measured, at most while something holds.
+    close : float
+        Excess (log of loss over limit) that ends the search when it is no farther below the target: 0.03 are about 1.5 % of
+        the bytes.
+    few : int
+        Scored poses at the least, where there are as many. Balanced, at a target of 1 dB: fox from all 43 poses 563 kB at 0.93
+        dB, from 32 582 kB at 0.86; the sample from all 70 119 kB at 0.87 dB, from 32 121 kB at 0.90.
+    views : int
+        Scored poses at the most: more than `few` where these have too few pixels.
+    pixels : int
+        Pixels of all scored poses for each Gaussian at the least: only every k-th one in both directions is looked at while
+        there are as many. Bytes at 1 dB and processor seconds (balanced): fox at every pixel (131 for each Gaussian) 557 kB,
+        123 s; at every second (33) 546 kB, 75 s; every third (15) 8 % more bytes. The sample at every second (92) and third
+        (41): 121 and 119 kB.
+    mended : float
+        `MENDED` at this effort: the fewer pixels are fitted, the less of it holds elsewhere. (More poses than `few` mean more
+        Gaussians, not more pixels for each. A million from 21 poses, fast when it refitted SH:
+        with .66 the first result misses by 0.19 dB and three
+        are measured, with .84 it holds at 0.80 dB.)
+    probed : int
+        Poses that trial grids are judged on, at most. 4 instead of 8 spare fast a tenth of its time; 2 % fewer bytes on fox, as
+        many on the sample: chance.
+    passes : float
+        Times that the descent to the first whole result looks at every scored pose; 0: colours are refitted instead.
+    """
+
+    keep: float
+    refit_rounds: int
+    subsets: int
+    steps: int
+    close: float
+    few: int
+    views: int
+    pixels: int
+    mended: float = MENDED
+    probed: int = 8
+    passes: float = 0.0
+
+    def poses_of(self, pixels: Sequence[int], count: int) -> int:
+        """How many poses to score of those that have so many pixels, for `count` Gaussians."""
+        enough = int(np.searchsorted(np.cumsum(pixels), self.pixels * count)) + 1
+        return min(max(self.few, enough), self.views, len(pixels))
+
+    def subsets_of(self, poses: int) -> int:
+        """Steps a round for so many scored poses."""
+        return max(min(self.subsets, poses // LEAST_VIEWS), 1)
+
+
+def sampled_poses(cameras: Sequence[Camera], pixels: int) -> list[Camera]:
+    """The views at every pixel, or at as large a part of them as leaves `pixels` of all.
+
+    The part is the same lattice in every view, begun at another pixel from view to view in the order of their names: ties among
+    poses, which rounding of a scene that was moved may break, decide no pixel.
+    """
+    step = 1
+    while step < LARGEST_STEP and sum(_lattice(camera, step + 1) for camera in cameras) >= pixels:
+        step += 1
+    places = np.argsort(np.argsort([camera.name for camera in cameras], kind="stable"), kind="stable")
+    return [
+        camera.every(step, *divmod(int(place) % step**2, step)) for place, camera in zip(places, cameras, strict=True)
+    ]
+
+
+def _lattice(camera: Camera, step: int) -> int:
+    """Pixels of `camera` at every `step`-th one."""
+    return (camera.width // step) * (camera.height // step)
+
+
+EFFORTS = {
+    "fast": Effort(
+        keep=0.77, refit_rounds=0, subsets=7, steps=1, close=0.08, few=18, views=48, pixels=12, mended=0.86, probed=4
+    ),
+    "balanced": Effort(
+        keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.06, few=32, views=96, pixels=24, mended=0.7
+    ),
+    "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, few=400, views=400, pixels=24),
+    "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=96, views=96, pixels=24, passes=10.0),
+}
+
+
+def distil_steps(options: CompressOptions, poses: int) -> int:
+    """Steps of the descent to the first whole result; 0 for none."""
+    return round(EFFORTS[options.effort].passes * poses) if options.distil is None else options.distil

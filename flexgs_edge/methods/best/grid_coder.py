@@ -1,0 +1,74 @@
+"""Codes the grids of a search, and tells what they cost."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.codec.v2.container import coded_size, write_grid
+from flexgs_edge.codec.v2.encode import Encoded, encode_grid
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.methods.best.allocation import BitModel
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.decoding import coding_device
+
+SETTINGS_MOST = 1536
+"""Bytes that the settings in the header take at most: the search counts them before they are known."""
+
+
+class GridCoder:
+    """Codes the grids of a search. The last one stays coded, so that writing it is copying.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        Its device codes where it can.
+    """
+
+    def __init__(self, renderer: Renderer) -> None:
+        self._renderer = renderer
+        self._last: tuple[GridScene, Encoded] | None = None
+
+    def _encode(self, grid: GridScene) -> Encoded:
+        device = coding_device(self._renderer.backend, self._renderer.budget, grid.count, grid.sh_degree)
+        return encode_grid(grid, device=device, room=self._renderer.room)
+
+    def encoded(self, grid: GridScene) -> Encoded:
+        """The grid as it will lie in a file."""
+        if self._last is None or self._last[0] is not grid:
+            self._last = None
+            encoded = self._encode(grid)
+            # Of a scene in scratch files even the bytes of the file may be too many.
+            self._last = grid, encoded if self._renderer.room.spills else encoded.finished()
+        return self._last[1]
+
+    def bits(self, grid: GridScene) -> BitModel:
+        """What its Gaussians cost; no stream is written for that."""
+        return bit_model(grid, self._encode(grid))
+
+    def size(self, grid: GridScene, settings: Mapping[str, Any] | None = None) -> int:
+        """Bytes of the file that `write` makes; without `settings`, which a search does not know yet, at most."""
+        size = coded_size(grid, settings or {}, encoded=self.encoded(grid))
+        return size + SETTINGS_MOST if settings is None else size
+
+    def write(self, path: str | os.PathLike[str], grid: GridScene, settings: Mapping[str, Any]) -> int:
+        """See `write_grid`."""
+        return write_grid(path, grid, settings, encoded=self.encoded(grid))
+
+
+def bit_model(grid: GridScene, encoded: Encoded) -> BitModel:
+    """What the Gaussians of a coded grid cost.
+
+    The information in the SH is shared among their coefficients; the rest among the rows.
+    """
+    sh = encoded.sh_bytes
+    base = encoded.information - sh
+    rows = [int(np.count_nonzero(grid.sh_degrees >= level)) for level in range(1, grid.sh_degree + 1)]
+    values = sum((2 * level + 1) * count for level, count in enumerate(rows, start=1))
+    each = 8 * sh / max(values, 1)
+    return BitModel(
+        8 * base / max(grid.count, 1), tuple((2 * level + 1) * each for level in range(1, grid.sh_degree + 1))
+    )

@@ -1,0 +1,254 @@
+"""The search for a `.fgs`: candidates along one multiplier, each refitted, coded and measured."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from flexgs_edge.goals.line import AIM, next_point
+from flexgs_edge.goals.target import Target
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.on_grid import lowered
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.to_grid import recolour, to_grid
+from flexgs_edge.grid.values import values_of
+from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOPE, RateStep, bounds, misses
+from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
+from flexgs_edge.methods.best.effort import Effort
+from flexgs_edge.methods.best.kept import Kept, Mended
+from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
+from flexgs_edge.methods.best.refit.colour import refit_colours
+from flexgs_edge.methods.best.refit.distil import Schedule, distil
+from flexgs_edge.methods.best.rounds import PrunePath
+
+FINE_COLOUR = 2.0**-8
+"""Colour steps before the refit, as a share of the final ones: only geometry shall move."""
+FURTHER = 0.92
+"""Loss after each further round of the colour refit over the round before it (fox .92)."""
+DRIFT = -0.12
+"""What a second refit, which goes on where the first one ended, adds to the excess (fox -.15, the sample -.3 to 0)."""
+DISTILLED = 0.4
+"""Loss after a descent over the loss before it, until a whole result tells; above what was seen (fox and the sample .33): from
+a result that holds, further descents go on with fewer Gaussians, but not with more."""
+DRIFT_DISTILLED = -0.3
+"""`DRIFT` of a further descent (the sample -.43)."""
+PRUNED_DISTILLED = 1.6
+"""`PRUNED_PART` where a descent follows: it takes more back than pruning may lose."""
+FURTHER_STEPS = 0.4
+"""Steps of a further descent, which goes on where the last one ended, as a share of those of the first."""
+FURTHER_RATE = 0.5
+"""Its rates, as a share of those that the first began with."""
+FULL_RATES, LEAST_RATE = 41.0, 0.25
+"""Fidelity before a descent up to which it goes at full rates, dB, and the least share of them: `rate_from`."""
+DECAY = 0.8
+"""Part of that which the next refit adds again (fox .9, the sample .4). Above zero where refits fit the scored poses too well."""
+FARTHER = 0.05
+"""Excess below the target that is aimed at for each result that missed it, from the second in a row on."""
+PROBES = 4
+"""Unmended results that are looked at between two whole ones, at most: less than a tenth of the time each."""
+FARTHEST = 2.0
+"""The same for probes together."""
+
+
+def rate_from(fidelity: float | None) -> float:
+    """Share of its rates that a descent from a fidelity goes at: as the root of the mean squared error.
+
+    Where there is less to mend, full steps break more. From 46.3 dB (fox, at 0.1 dB) full rates end at a mean fidelity of 46.1 dB
+    over six views and half of them at 46.5, from 48.1 (the sample) at 48.9 and 49.5; from 34.2 (fox, at 1 dB) at 36.7 and 36.3.
+    """
+    return 1.0 if fidelity is None else max(min(1.0, 10 ** ((FULL_RATES - fidelity) / 20)), LEAST_RATE)
+
+
+class RateSearch(MultiplierSearch[GridScene]):
+    """The search for the grid that is coded in container version 2.
+
+    Parameters
+    ----------
+    path : PrunePath
+    size_of : callable
+        Exact bytes of a grid's file.
+    measure : callable
+        Quality of a grid's decoded planes.
+    steps : int
+        Views that the descent to the first whole result looks at; 0: colours are refitted instead.
+    """
+
+    def __init__(
+        self,
+        path: PrunePath,
+        size_of: Callable[[GridScene], int],
+        measure: Measure,
+        effort: Effort,
+        refit: bool = True,
+        on_step: Callable[[RateStep], None] | None = None,
+        steps: int = 0,
+    ) -> None:
+        super().__init__(path, measure, effort, on_step)
+        self.size_of, self.refit, self.steps = size_of, refit, steps
+        if steps:
+            self.pruned_part, self.keeps_best = PRUNED_DISTILLED, True
+        self._slopes: Slopes | None = None
+        self._mended: Mended | None = None
+        self._descents: list[tuple[float, Mended]] = []
+        # Where SH are not refitted, a result has nothing from the one before.
+        self._drift = DRIFT_DISTILLED if steps else DRIFT if effort.refit_rounds else 0.0
+        self._expected = 0.0
+
+    def _unmended(self, multiplier: float) -> GridScene:
+        kept, steps = self._choice(multiplier)
+        return to_grid(kept.planes, kept.degrees, steps, self.path.origin, room=self.path.room)[0]
+
+    def _probe(self, multiplier: float, target: Target) -> float:
+        """The excess of a multiplier's result without a refit of its own."""
+        grid = self._unmended(multiplier)
+        if target.limit_bytes is not None:
+            return target.excess(self.size_of(grid), None)
+        return target.excess(0, self.measure(values_of(grid, self.path.room), estimate=True))
+
+    def _aim(self, multiplier: float, steps: Sequence[RateStep], target: Target) -> float:
+        """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""
+        by_size = target.limit_bytes is not None
+        slope = SIZE_SLOPE if by_size else SLOPE
+        offset = math.log(self._mended_part()) if self.refit and not by_size else 0.0
+        if steps:
+            offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
+            if self.refit and not by_size:
+                # Those probes have the colours of the last refit; the next one goes on from them.
+                if len(steps) > 1:
+                    self._drift = DECAY * (self._drift + steps[-1].excess - self._expected)
+                # Whatever the reason that results keep missing: go farther each time.
+                offset += self._drift + FARTHER * max(misses(steps) - 1, 0)
+        low, high = bounds(steps, by_size)
+        place = min(max(math.log(multiplier), low), high)
+        # Curves that are flat, where nothing holds, must not send the search to the end of numbers.
+        low, high = max(low, place - FARTHEST), min(high, place + FARTHEST)
+        seen: list[tuple[float, float]] = []
+        self._expected = AIM
+        for _ in range(PROBES):
+            excess = self._probe(math.exp(place), target) + offset
+            if abs(excess - AIM) < -AIM:
+                self._expected = excess
+                break
+            seen.append((place, excess))
+            there, place = place, min(max(next_point(seen, slope, LARGEST_STRIDE), low), high)
+            if place == there:
+                break
+        return math.exp(place)
+
+    def _mended_part(self) -> float:
+        """Loss after the first whole result's refit, or descent, over the loss before it, as far as it is known before."""
+        if self.steps:
+            return DISTILLED
+        return self.effort.mended * FURTHER ** (self.effort.refit_rounds - 1)
+
+    def _choice(self, multiplier: float) -> tuple[Kept, Steps]:
+        """What a multiplier keeps, with the colours of the last refit, and the grid steps."""
+        kept = self.kept(multiplier)
+        mended = self._descended(multiplier) if self.steps else self._mended
+        if mended is not None:
+            kept.planes = mended.apply(kept.rows, kept.degrees, kept.planes, self.path.room)
+        snapshot = self.path.snapshots[kept.snapshot]
+        if self._slopes is None:
+            # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
+            self._slopes = probe_slopes(
+                self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras, self.effort.probed
+            )
+        steps = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
+        kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0), self.path.room)
+        return kept, holdable(steps, kept.planes)
+
+    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
+        started = time.perf_counter()
+        kept, steps = self._choice(multiplier)
+        grid = self._distilled(multiplier, kept, steps) if self.steps else self._finish(kept, steps)
+        grid = lowered(grid, self.path.room)
+        size = self.size_of(grid)
+        measurement = self.measure(values_of(grid, self.path.room))
+        excess = target.excess(size, measurement)
+        seconds = time.perf_counter() - started
+        return RateStep(multiplier, len(kept.rows), grid.sh_count, size, measurement, excess, seconds), grid
+
+    def _descended(self, multiplier: float) -> Mended | None:
+        """Values of the last descent that kept what this multiplier keeps and more.
+
+        Not of one that kept less: its values make up for what it lacked, and would be too much of it with that back (fox: .92 dB
+        at 366 kB after 1.15 at 278, where the curve would have .76).
+        """
+        before = [(at, mended) for at, mended in self._descents if at <= multiplier]
+        return max(before, key=lambda pair: pair[0])[1] if before else None
+
+    def _distilled(self, multiplier: float, kept: Kept, steps: Steps) -> GridScene:
+        """All values moved towards the original's renders with the grid in view, on the grid, and the constant refitted."""
+        path = self.path
+        first = self._descended(multiplier) is None
+        count, rate = (self.steps, 1.0) if first else (math.ceil(FURTHER_STEPS * self.steps), FURTHER_RATE)
+        rate *= rate_from(self.measure(kept.planes, estimate=True).fidelity)
+        moved = distil(
+            path.renderer,
+            kept.planes,
+            kept.degrees,
+            path.origin,
+            [*path.cameras, *path.between],
+            path.targets,
+            Schedule(count, rate),
+            steps,
+            progress=path.progress,
+        )
+        own = np.arange(len(kept.rows))
+        self._descents.append((multiplier, Mended.of(kept.rows, kept.degrees, own, moved, fields=tuple(moved))))
+        grid, order = to_grid(moved, kept.degrees, holdable(steps, moved), path.origin)
+        if not self.refit:
+            return grid
+        moved = refit_colours(
+            path.renderer,
+            values_of(grid),
+            kept.degrees[order],
+            path.origin,
+            path.cameras,
+            path.targets,
+            rounds=1,
+            bands=False,
+            subsets=self.effort.subsets_of(len(path.cameras)),
+            progress=path.progress,
+        )
+        return recolour(grid, moved["sh_dc"], moved["sh_rest"])
+
+    def _finish(self, kept: Kept, steps: Steps) -> GridScene:
+        """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
+        path, room, planes = self.path, self.path.room, kept.planes
+        fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
+        fine = holdable(fine, planes)
+        grid, order = to_grid(planes, kept.degrees, fine, path.origin, room=room)
+        degrees = kept.degrees[order]
+        moved = values_of(grid, room)
+        if self.refit:
+            shared = (path.origin, path.cameras, path.targets)
+            if self.effort.refit_rounds:
+                moved = refit_colours(
+                    path.renderer,
+                    moved,
+                    degrees,
+                    *shared,
+                    rounds=self.effort.refit_rounds,
+                    subsets=self.effort.subsets_of(len(path.cameras)),
+                    progress=path.progress,
+                )
+                self._mended = Mended.of(kept.rows, kept.degrees, order, moved, room)
+            grid = replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree]))
+            coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], room), room)
+            moved = refit_colours(
+                path.renderer,
+                coarse,
+                degrees,
+                *shared,
+                rounds=1,
+                bands=False,
+                subsets=self.effort.subsets_of(len(path.cameras)),
+                progress=path.progress,
+            )
+        final = replace(grid.steps, dc=steps.dc, sh=steps.sh[: grid.sh_degree])
+        return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"], room)

@@ -1,0 +1,67 @@
+"""Layers: rows ordered so that a file cut at a layer's end is the best scene of those bytes that needs no new decision."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.values import values_of
+from flexgs_edge.methods.best.allocation import BitModel
+from flexgs_edge.methods.best.costs import measure_costs
+from flexgs_edge.methods.best.rounds import take_rows
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.render.fit import sum_bytes
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.scene.source import MemorySource
+
+HALF = 0.485
+"""Share of the bits that stays from layer to layer: a file cut to half its bytes shall hold a whole layer, header included."""
+ROUND = 0.8
+"""Share of the bits that one measurement of costs decides on: removed Gaussians interact."""
+
+
+def assign_layers(
+    grid: GridScene,
+    layers: int,
+    bits: BitModel,
+    renderer: Renderer,
+    cameras: Sequence[Camera],
+    progress: Progress = SILENT,
+) -> GridScene:
+    """The same Gaussians, the ones that matter most a bit first, in `layers` layers that each double the bytes.
+
+    The costs of removal are measured again after each fifth of the bits, on the scene as it decodes: a cut file has no refit.
+    Gaussians that no pose sees come last.
+
+    Parameters
+    ----------
+    layers : int
+        From 1 (none) to 4.
+    bits : BitModel
+        What the coder takes for a row of each SH degree.
+    cameras : sequence of Camera
+        The scored poses.
+    """
+    spent = np.array([bits.of_degree(degree) for degree in range(grid.sh_degree + 1)])[grid.sh_degrees]
+    layer = np.zeros(grid.count, np.uint8)
+    left = np.arange(grid.count)
+    planes, room = values_of(grid, renderer.room), renderer.room
+    for level in range(layers - 1, 0, -1):
+        end = HALF * spent[left].sum()
+        while len(left) and spent[left].sum() > end:
+            kept = take_rows(planes, left, room)
+            with renderer.load(MemorySource(kept, origin=grid.origin), sum_bytes(2)) as scene:
+                costs = measure_costs(renderer, scene, cameras, sh_costs=False, progress=progress)
+            worth = np.where(costs.weight2 > 0, costs.removal / spent[left], -1.0)
+            order = np.argsort(worth, kind="stable")
+            gone = np.cumsum(spent[left][order])
+            goal = gone[-1] - max(end, ROUND * gone[-1])
+            cut = order[: int(np.searchsorted(gone, goal)) + 1]
+            layer[left[cut]] = level
+            left = np.delete(left, cut)
+    order = np.argsort(layer, kind="stable")
+    return replace(grid.take(order, room), layer=layer[order])

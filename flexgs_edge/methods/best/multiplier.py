@@ -1,0 +1,166 @@
+"""The search over one multiplier, shared by `.fgs` and other formats."""
+
+from __future__ import annotations
+
+import logging
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Generic, Protocol
+
+import numpy as np
+
+from flexgs_edge.constants import SH_C0
+from flexgs_edge.errors import TargetError
+from flexgs_edge.goals.steps import better
+from flexgs_edge.goals.target import Measurement, Target
+from flexgs_edge.methods.best.allocation import BitModel, choose, drop_bands
+from flexgs_edge.methods.best.candidates import Product, RateResult, RateStep, next_multiplier
+from flexgs_edge.methods.best.costs import RemovalCosts
+from flexgs_edge.methods.best.effort import Effort
+from flexgs_edge.methods.best.kept import Kept
+from flexgs_edge.methods.best.rounds import PrunePath, Snapshot
+
+LOG = logging.getLogger("flexgs_edge")
+
+
+class Measure(Protocol):
+    """Quality of planes ([width, n] f32 by field); with `estimate` a good guess, in a part of the time."""
+
+    def __call__(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement: ...
+
+
+PRUNED_PART = 0.45
+"""Part of the allowed loss that pruning alone has used up when a whole result meets the target (fox .45, the sample .55): where
+the search starts."""
+MOST_ROUNDS = 24
+EXTRA_STEPS = 4
+"""Steps beyond the effort's own while nothing holds, or what does is far below the target."""
+FAR = 0.25
+"""Excess below the target that is far: a sixth of the bytes."""
+
+
+class MultiplierSearch(ABC, Generic[Product]):
+    """Searches the multiplier whose whole result meets a target with the fewest bytes.
+
+    Parameters
+    ----------
+    path : PrunePath
+    measure : callable
+        Quality of planes without quantization, where the search starts.
+    effort : Effort
+    on_step : callable, optional
+        Called after each step.
+    """
+
+    pruned_part = PRUNED_PART
+    """Part of the allowed loss that the path goes down to."""
+    keeps_best = False
+    """An interrupted search answers with the best so far, where its results take long; otherwise it ends."""
+
+    def __init__(
+        self,
+        path: PrunePath,
+        measure: Measure,
+        effort: Effort,
+        on_step: Callable[[RateStep], None] | None = None,
+    ) -> None:
+        self.path, self.measure, self.effort, self.on_step = path, measure, effort, on_step
+        self.bits = BitModel()
+
+    @abstractmethod
+    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, Product]:
+        """The whole result at a multiplier, measured."""
+
+    def _aim(self, multiplier: float, steps: Sequence[RateStep], target: Target) -> float:
+        """A better guess than `multiplier` of where the next whole result should be, for less than the time of one."""
+        return multiplier
+
+    def discard(self, product: Product) -> None:
+        """Let go of what is not the best any more."""
+        return
+
+    def choose(self, costs: RemovalCosts, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
+        """Which rows to keep ([n] bool), and their SH degrees."""
+        return choose(costs, self.bits, multiplier)
+
+    def run(self, target: Target, best_effort: bool = False) -> RateResult[Product]:
+        """Search; raises `TargetError` with the closest point when nothing holds and `best_effort` is not set."""
+        steps: list[RateStep] = []
+        best: tuple[RateStep, Product] | None = None
+        multiplier = self._aim(self._start(target), steps, target)
+        for count in range(self.effort.steps + EXTRA_STEPS):
+            try:
+                step, product = self._whole(multiplier, target)
+            except KeyboardInterrupt:
+                if best is None or not self.keeps_best:
+                    raise
+                LOG.warning("interrupted: the best of %d results is taken", len(steps))
+                break
+            steps.append(step)
+            if self.on_step:
+                self.on_step(step)
+            if best is None:
+                best = (step, product)
+            elif better(step, best[0], target):
+                self.discard(best[1])
+                best = (step, product)
+            else:
+                self.discard(product)
+            close = best[0].holds and best[0].excess > -self.effort.close
+            enough = best[0].holds and best[0].excess > -FAR and count + 1 >= self.effort.steps
+            if close or enough or step.multiplier < 1e-30:
+                break
+            multiplier = self._aim(next_multiplier(steps, target), steps, target)
+        assert best is not None
+        chosen, product = best
+        if not chosen.holds and not best_effort:
+            raise TargetError(
+                f"{target.describe()} is out of reach; the closest point has {target.report(chosen.size, chosen.measurement)}"
+                " (--best-effort writes it)"
+            )
+        return RateResult(product, chosen, chosen.holds, tuple(steps))
+
+    def _start(self, target: Target) -> float:
+        """Walk down until pruning alone has used up its part of the target; the multiplier at that cut."""
+        for _ in range(MOST_ROUNDS):
+            last = self.path.snapshots[-1]
+            if target.limit_bytes is not None:
+                if last.count * self.bits.base / 8 <= target.limit_bytes:
+                    break
+            elif len(self.path.snapshots) > 1:
+                excess = target.excess(0, self.measure(last.planes, estimate=True))
+                if excess >= math.log(self.pruned_part):
+                    break
+            if last.count < 16:
+                break
+            self.path.descend(self.effort.keep)
+        return self._cut(self.path.snapshots[-1])
+
+    def _cut(self, snapshot: Snapshot) -> float:
+        """The multiplier at which a snapshot would lose half a round more."""
+        costs = snapshot.costs.removal[snapshot.costs.weight2 > 0]
+        if not len(costs):
+            return 1.0
+        share = (1 - self.effort.keep) / 2
+        return max(float(np.quantile(costs, share)) / self.bits.base, 1e-30)
+
+    def _snapshot(self, multiplier: float) -> tuple[int, np.ndarray, np.ndarray]:
+        """The first snapshot that this multiplier would not cut by more than a round, and its choice; walks on if needed."""
+        for index in range(MOST_ROUNDS + 1):
+            if index == len(self.path.snapshots):
+                self.path.descend(self.effort.keep)
+            snapshot = self.path.snapshots[index]
+            keep, degrees = self.choose(snapshot.costs, multiplier)
+            if keep.mean() >= self.effort.keep or snapshot.count < 16:
+                break
+        return index, keep, degrees
+
+    def kept(self, multiplier: float) -> Kept:
+        """What a multiplier keeps."""
+        index, keep, degrees = self._snapshot(multiplier)
+        snapshot = self.path.snapshots[index]
+        rows, room = np.flatnonzero(keep), self.path.room
+        planes = drop_bands(snapshot.planes, rows, degrees[rows], snapshot.costs.sh_mean, SH_C0, room)
+        weight2 = room.take(snapshot.costs.weight2, rows)
+        return Kept(index, room.take(snapshot.rows, rows), planes, degrees[rows], weight2)

@@ -1,0 +1,1 @@
+"""What pruning and quantization broke, mended in the values that are kept."""

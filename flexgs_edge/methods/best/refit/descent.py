@@ -1,0 +1,253 @@
+"""A scene whose values all move: on a device, step by step down the squared error of single views."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.constants import LANES
+from flexgs_edge.errors import BudgetError
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.render.chunks import Chunk
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.fit import sum_bytes
+from flexgs_edge.render.renderer import GRADIENT_SUMS, Renderer
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.units import format_mib
+
+ORDER = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
+"""Fields in the order of a gradient's planes (cl_kernels/backward.cl)."""
+DECAYS = (0.9, 0.99)
+"""Of the running means of gradients and of their squares. The usual 0.999 of the second remembers longer than a descent of a few
+hundred views lasts."""
+GRID_VALUES = 14
+"""Steps that `snap` takes."""
+
+
+def widths(sh_degree: int) -> dict[str, int]:
+    """Planes of each field, in their order."""
+    return {name: FIELD[name].width(sh_degree) for name in ORDER}
+
+
+def descent_bytes(sh_degree: int) -> int:
+    """Bytes a row that a descent takes on the backend beside the scene.
+
+    Sums of a view; all planes four times (values, gradient, two running means); stored geometry, degrees, flags and powers.
+    """
+    return sum_bytes(GRADIENT_SUMS) + 4 * (4 * sum(widths(sh_degree).values()) + 8 + 4)
+
+
+class Descent:
+    """Values of a scene, their gradients, and what Adam remembers of these.
+
+    Views are drawn from the values as a file of `steps` would give them back, and the gradients there move the values themselves
+    (the straight-through rule): errors of rounding are errors like others then, and neighbours mend them.
+
+    Parameters
+    ----------
+    renderer : Renderer
+    planes : dict
+        Stored planes ([width, n] f32 by field); not changed.
+    degrees : np.ndarray
+        [n] SH degree of each row: coefficients above it stay as they are.
+    origin : np.ndarray
+        [3] f64.
+    camera : Camera
+        The largest view: memory is planned with it.
+
+    Raises
+    ------
+    BudgetError
+        When the scene and what is remembered of it do not fit at once.
+    """
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        planes: dict[str, np.ndarray],
+        degrees: np.ndarray,
+        origin: np.ndarray,
+        camera: Camera,
+    ) -> None:
+        self.renderer, self.backend = renderer, renderer.backend
+        source = MemorySource(planes, origin=origin, sh_count=int(np.flatnonzero(degrees).max(initial=-1)) + 1)
+        self.count, self.widths = source.count, widths(source.sh_degree)
+        self._parts: list[_Part] = []
+        self._arrays: list[Any] = []
+        # Planes of the last chunk with SH and of the last without are padded.
+        size = descent_bytes(source.sh_degree) * (self.count + 2 * LANES)
+        self._scene = renderer.load(source, -(-size // max(self.count, 1)), targets=True)
+        try:
+            renderer.render_planes(self._scene, camera)
+            if not self._scene.resident:
+                raise BudgetError(
+                    f"distilling {source.count} Gaussians keeps all of them in memory at once with what their steps remember "
+                    f"({format_mib(size)}), more than the memory limit leaves: use a larger --memory-limit, or --effort thorough"
+                )
+            self._rates, self._steps = (self._array((n,)) for n in (sum(self.widths.values()), GRID_VALUES))
+            for chunk in self._scene.chunks():
+                self._parts.append(_Part(self._scene, chunk, planes, degrees))
+            self.put_on(None)
+        except BaseException:
+            self.close()
+            raise
+
+    def _array(self, shape: tuple[int, ...]) -> Any:
+        self._arrays.append(self.backend.array(shape, np.float32))
+        return self._arrays[-1]
+
+    def put_on(self, steps: Steps | None) -> None:
+        """Draw from values on this grid from now on (None: from the values themselves)."""
+        self.backend.write(self._steps, step_record(steps))
+        for part in self._parts:
+            part.snap(self._steps)
+
+    def differentiate(self, camera: Camera, target: np.ndarray) -> None:
+        """Gradients of the squared error of a view against `target` ([3, H, W] f16, as for `Renderer.residual_sums`)."""
+        sums = self.renderer.gradient_sums(self._scene, camera, target)
+        for part in self._parts:
+            part.differentiate(self.renderer, sums)
+
+    def step(self, camera: Camera, target: np.ndarray, rates: dict[str, float]) -> None:
+        """One step of Adam down the squared error of a view; `rates` are the largest changes of each field's values."""
+        self.differentiate(camera, target)
+        per_plane = np.concatenate([np.full(width, rates[name], np.float32) for name, width in self.widths.items()])
+        self.backend.write(self._rates, per_plane)
+        for part in self._parts:
+            part.step(self._rates)
+            part.snap(self._steps)
+
+    def gradients(self) -> dict[str, np.ndarray]:
+        """The last view's gradients, zero where it has none."""
+
+        def read(part: _Part) -> np.ndarray:
+            return np.where(self.backend.read(part.touched) > 0, self.backend.read(part.gradient), np.float32(0))
+
+        return self._gathered(read)
+
+    def planes(self) -> dict[str, np.ndarray]:
+        """The values, not on any grid."""
+        return self._gathered(lambda part: self.backend.read(part.values))
+
+    def _gathered(self, read: Any) -> dict[str, np.ndarray]:
+        whole = {name: np.zeros((width, self.count), np.float32) for name, width in self.widths.items()}
+        for part in self._parts:
+            values = read(part)
+            for _, rows, own in _fields(whole, part.widths):
+                span = slice(part.chunk.base, part.chunk.base + part.chunk.count)
+                own[..., span] = values[rows, : part.chunk.count].reshape(own[..., span].shape)
+        return whole
+
+    def close(self) -> None:
+        """Free everything."""
+        for part in self._parts:
+            part.release()
+        for array in self._arrays:
+            array.release()
+        self._parts, self._arrays = [], []
+        self._scene.close()
+
+    def __enter__(self) -> Descent:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+class _Part:
+    """One chunk of it."""
+
+    def __init__(self, scene: DeviceScene, chunk: Chunk, planes: dict[str, np.ndarray], degrees: np.ndarray) -> None:
+        self.backend, self.chunk, self.antialiased = scene.backend, chunk, int(scene.antialiased)
+        self.widths, self._arrays = widths(chunk.degree), []  # type: dict[str, int], list[Any]
+        stride, count = chunk.stride, sum(self.widths.values())
+        try:
+            self.values, self.gradient, self.first, self.second = (self._array((count, stride)) for _ in range(4))
+            self.powers, self.touched = self._array((2, stride)), self._array((stride,))
+            self.degrees = self._array((stride,), np.uint32)
+            self.stored = [self._array((width, stride)) for width in (3, 4, 1)]
+            self._fill(planes, degrees)
+        except BaseException:
+            self.release()
+            raise
+
+    def _array(self, shape: tuple[int, ...], dtype: Any = np.float32) -> Any:
+        self._arrays.append(self.backend.array(shape, dtype))
+        return self._arrays[-1]
+
+    def _fill(self, planes: dict[str, np.ndarray], degrees: np.ndarray) -> None:
+        backend, chunk = self.backend, self.chunk
+        span = slice(chunk.base, chunk.base + chunk.count)
+        for array in (self.values, self.first, self.second):
+            backend.fill(array, 0)
+        backend.write(self.powers, np.ones(self.powers.shape, np.float32))
+        own_degrees = np.zeros(chunk.stride, np.uint32)
+        own_degrees[: chunk.count] = degrees[span]
+        backend.write(self.degrees, own_degrees)
+        for _, rows, own in _fields(planes, self.widths):
+            values = own[..., span].reshape(rows.stop - rows.start, chunk.count)
+            for plane in range(rows.start, rows.stop):
+                backend.write(self.values, values[plane - rows.start], plane * chunk.stride)
+
+    def snap(self, steps: Any) -> None:
+        chunk, stride = self.chunk, self.chunk.stride
+        self.backend.launch(
+            "snap",
+            (stride,),
+            stride,
+            chunk.degree,
+            steps,
+            self.values,
+            chunk.means,
+            *self.stored,
+            chunk.sh_dc,
+            chunk.sh_rest,
+        )
+        self.backend.launch(
+            "activate", (stride,), stride, self.antialiased, *self.stored, chunk.cov, chunk.log2_opacity
+        )
+
+    def differentiate(self, renderer: Renderer, sums: Any) -> None:
+        chunk = self.chunk
+        self.backend.launch(
+            "project_backward", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, self.antialiased,
+            renderer.camera_array, chunk.means, *self.stored, chunk.sh_rest, self.degrees, renderer.records_array, sums,
+            self.touched, self.gradient,
+        )  # fmt: skip
+
+    def step(self, rates: Any) -> None:
+        stride = self.chunk.stride
+        self.backend.launch(
+            "adam", (stride,), stride, sum(self.widths.values()), *DECAYS, rates, self.touched, self.gradient, self.powers,
+            self.first, self.second, self.values,
+        )  # fmt: skip
+
+    def release(self) -> None:
+        for array in self._arrays:
+            array.release()
+        self._arrays = []
+
+
+def _fields(planes: dict[str, np.ndarray], own: dict[str, int]) -> Iterator[tuple[str, slice, np.ndarray]]:
+    """Name, planes in an array of all, and values of each field; of SH the first coefficients of every channel, a view."""
+    at = 0
+    for name, width in own.items():
+        values = planes[name]
+        if name == "sh_rest":
+            values = values.reshape(3, len(values) // 3, values.shape[1])[:, : width // 3]
+        yield name, slice(at, at + width), values
+        at += width
+
+
+def step_record(steps: Steps | None) -> np.ndarray:
+    """What `snap` takes for steps (None: zeros)."""
+    record = np.zeros(GRID_VALUES, np.float32)
+    if steps is not None:
+        record[:4] = steps.position, steps.scale, steps.rotation, steps.opacity
+        for k, luma in enumerate((steps.dc, *steps.sh)):
+            record[4 + 2 * k : 6 + 2 * k] = steps.colour(luma)[:2]
+    return record

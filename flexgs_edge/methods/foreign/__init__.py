@@ -1,0 +1,1 @@
+"""Compression into other programs' formats."""

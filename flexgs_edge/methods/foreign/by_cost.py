@@ -1,0 +1,126 @@
+"""Files of other formats by measured costs: the rounds of `best`, colours refitted to what the format makes of geometry."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from flexgs_edge.goals.target import Target
+from flexgs_edge.io.exchange import near_order
+from flexgs_edge.io.formats import Format
+from flexgs_edge.methods.best.allocation import BitModel, choose_one_degree
+from flexgs_edge.methods.best.candidates import RateStep
+from flexgs_edge.methods.best.costs import RemovalCosts
+from flexgs_edge.methods.best.effort import EFFORTS, Effort
+from flexgs_edge.methods.best.method import SearchMaker
+from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
+from flexgs_edge.methods.best.refit.colour import refit_colours
+from flexgs_edge.methods.best.rounds import PrunePath, take_rows
+from flexgs_edge.methods.foreign.file_maker import FileMaker, WrittenFile
+from flexgs_edge.methods.foreign.lower_sh import lower_degree
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.scene.fields import FIELD, sh_rest_count
+from flexgs_edge.scene.source import MemorySource
+
+
+class FileSearch(MultiplierSearch[WrittenFile]):
+    """The search for a file; see `MultiplierSearch`.
+
+    Parameters
+    ----------
+    files : FileMaker
+        Writes and measures.
+    refit : bool
+        Refit colours to the decoded geometry, and their constant to the decoded SH.
+    """
+
+    def __init__(
+        self,
+        path: PrunePath,
+        files: FileMaker,
+        measure: Measure,
+        effort: Effort,
+        refit: bool = True,
+        on_step: Callable[[RateStep], None] | None = None,
+    ) -> None:
+        super().__init__(path, measure, effort, on_step)
+        self.files, self.refit = files, refit
+        self.bits = bit_model(files.format, len(path.snapshots[0].costs.sh))
+
+    def choose(self, costs: RemovalCosts, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
+        """See `MultiplierSearch`; one degree for all where the format has no other way."""
+        if self.files.format.one_degree:
+            return choose_one_degree(costs, self.bits, multiplier)
+        return super().choose(costs, multiplier)
+
+    def discard(self, product: WrittenFile) -> None:
+        """Remove a file that is not the best any more."""
+        product.path.unlink()
+
+    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, WrittenFile]:
+        started = time.perf_counter()
+        kept = self.kept(multiplier)
+        planes, degrees = kept.planes, kept.degrees
+        planes["sh_rest"] = lower_degree(planes["sh_rest"], int(degrees.max(initial=0)))
+        order = near_order(MemorySource(planes, origin=self.path.origin))
+        file = self._finish(take_rows(planes, order), degrees[order])
+        assert file.measurement is not None
+        excess = target.excess(file.size, file.measurement)
+        seconds = time.perf_counter() - started
+        return RateStep(multiplier, file.count, file.sh_count, file.size, file.measurement, excess, seconds), file
+
+    def _finish(self, planes: dict[str, np.ndarray], degrees: np.ndarray) -> WrittenFile:
+        """All colours refitted to the decoded geometry, then the constant to the decoded SH; geometry goes in as it was."""
+        path = self.path
+        if not self.refit:
+            return self.files.make(MemorySource(planes, origin=path.origin))
+        found, rows = self.files.geometry(MemorySource(planes, origin=path.origin))
+        shared = (degrees[rows], found.origin, path.cameras, path.targets)
+        geometry = found.read(slice(0, found.count), list(FIELD))
+        colours = {name: np.ascontiguousarray(planes[name][:, rows]) for name in ("sh_dc", "sh_rest")}
+        moved = refit_colours(
+            path.renderer,
+            {**geometry, **colours},
+            *shared,
+            rounds=self.effort.refit_rounds,
+            subsets=self.effort.subsets_of(len(path.cameras)),
+            progress=path.progress,
+        )
+        planes = {**planes, "sh_dc": _put(moved["sh_dc"], rows), "sh_rest": _put(moved["sh_rest"], rows)}
+        if len(planes["sh_rest"]):
+            place, coded = self.files.write(MemorySource(planes, origin=path.origin))
+            decoded = coded.read(slice(0, coded.count), list(FIELD))
+            place.unlink()
+            mended = refit_colours(
+                path.renderer,
+                {**decoded, "sh_dc": moved["sh_dc"]},
+                *shared,
+                rounds=1,
+                bands=False,
+                subsets=self.effort.subsets_of(len(path.cameras)),
+                progress=path.progress,
+            )
+            planes["sh_dc"] = _put(mended["sh_dc"], rows)
+        return self.files.make(MemorySource(planes, origin=path.origin))
+
+
+def _put(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """`values` with column i moved to column `rows[i]`."""
+    placed = np.empty_like(values)
+    placed[:, rows] = values
+    return placed
+
+
+def bit_model(format: Format, sh_degree: int) -> BitModel:
+    """What a Gaussian costs in a format, SH's part shared among its coefficients."""
+    each = 8 * format.sh_bytes / sh_rest_count(3)
+    bands = tuple((2 * level + 1) * each for level in range(1, sh_degree + 1))
+    return BitModel(8 * (format.row_bytes - format.sh_bytes), bands)
+
+
+def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[WrittenFile]:
+    """Searches for a file of another program's format."""
+    plan = EFFORTS[options.effort]
+    return lambda path, measure, report: FileSearch(path, files, measure, plan, options.refit, report)

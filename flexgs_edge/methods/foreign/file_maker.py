@@ -1,0 +1,123 @@
+"""Written files of other formats: made, read back, measured, and the best one kept."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flexgs_edge.files import check_writable
+from flexgs_edge.goals.target import Measurement
+from flexgs_edge.io.converter import converter_bytes
+from flexgs_edge.io.exchange import read_foreign, write_foreign
+from flexgs_edge.io.formats import Format
+from flexgs_edge.io.geometry import read_geometry
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.methods.paper.prune import nonzero_sh
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.judge import Judge, measurement_of
+from flexgs_edge.scene.source import SceneSource
+
+LOG = logging.getLogger("flexgs_edge")
+
+
+@dataclass(frozen=True)
+class WrittenFile:
+    """A finished file and what it decodes to.
+
+    Parameters
+    ----------
+    path : Path
+    size : int
+        Bytes.
+    count, sh_count : int
+        Gaussians, and of these with SH as they went in (codebooks of `.sog` have no exact zero).
+    sh_degree : int
+    measurement : Measurement or None
+        Quality of the decoded file (`None` without views).
+    """
+
+    path: Path
+    size: int
+    count: int
+    sh_count: int
+    sh_degree: int
+    measurement: Measurement | None
+
+
+@contextmanager
+def open_files(
+    format: Format,
+    output: Path | None,
+    force: bool,
+    budget: MemoryBudget,
+    renderer: Renderer | None,
+    judge: Judge | None,
+) -> Iterator[FileMaker]:
+    """A folder for files beside `output` (in a dry run: where TMPDIR says), gone when the block ends."""
+    beside = None if output is None else check_writable(output, force).parent
+    with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=beside) as folder:
+        yield FileMaker(format, Path(folder), budget, renderer, judge)
+
+
+class FileMaker:
+    """Writes candidates, reads them back and measures them.
+
+    Parameters
+    ----------
+    folder : Path
+        For the files.
+    renderer, judge : Renderer, Judge or None
+        `None`: nothing is measured.
+    """
+
+    def __init__(
+        self, format: Format, folder: Path, budget: MemoryBudget, renderer: Renderer | None, judge: Judge | None
+    ) -> None:
+        self.format, self.folder = format, folder
+        self._budget, self._renderer, self._judge = budget, renderer, judge
+        self._made = 0
+
+    def make(self, source: SceneSource) -> WrittenFile:
+        """The file of `source`, measured on what it decodes to."""
+        path, found = self.write(source)
+        measurement = None
+        if self._renderer is not None and self._judge is not None:
+            with self._renderer.load(found) as scene:
+                measurement = measurement_of(self._judge.compare(scene))
+        sh_count = int(np.count_nonzero(nonzero_sh(source))) if found.sh_degree else 0
+        return WrittenFile(path, path.stat().st_size, found.count, sh_count, found.sh_degree, measurement)
+
+    def write(self, source: SceneSource) -> tuple[Path, SceneSource]:
+        """A new file of `source`, and what it decodes to."""
+        self._made += 1
+        path = self.folder / f"{self._made}{self.format.suffix}"
+        with self._converting(source.count):
+            write_foreign(path, source)
+            return path, read_foreign(path)
+
+    def geometry(self, source: SceneSource) -> tuple[SceneSource, np.ndarray]:
+        """See `flexgs_edge.io.geometry.read_geometry`."""
+        with self._converting(source.count):
+            return read_geometry(self.folder, source, self.format)
+
+    @contextmanager
+    def _converting(self, count: int) -> Iterator[None]:
+        """The converter's memory, taken while the block lasts."""
+        size = converter_bytes(self.format, count)
+        self._budget.take("the converter", size)
+        try:
+            yield
+        finally:
+            self._budget.give(size)
+
+
+def publish(file: WrittenFile, output: Path, force: bool) -> None:
+    """Give a file its name."""
+    os.replace(file.path, check_writable(output, force))

@@ -1,0 +1,103 @@
+"""What the search asks of a real scene: exact bytes of a choice, and its measured quality."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from flexgs_edge.codec.v1.header import container_size
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.target import Measurement
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows
+from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.packed.quantize import QuantizedScene, quantize_scene, quantized_bytes
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.judge import Judge, measurement_of
+from flexgs_edge.scene.source import SceneSource
+
+QUANTIZE_COPIES = 4
+"""Times a chunk's planes that quantizing holds at once: as read, gathered, and the codes in between (measured: 3.3)."""
+
+
+class SceneEvaluator:
+    """Prunes by rank, quantizes, and asks the judge; see `flexgs_edge.goals.Evaluator`.
+
+    Parameters
+    ----------
+    source : SceneSource
+        The original.
+    order : np.ndarray
+        [N] i64, least important row first.
+    has_sh : np.ndarray
+        [N] bool, rows with SH that are not zero.
+    bits : BitSpec
+        Bits per code.
+    groups : int or None
+        As for `quantize_scene`.
+    renderer : Renderer
+        Draws the quantized scene.
+    judge : Judge or None
+        `None`: `measure` cannot be asked.
+    """
+
+    def __init__(
+        self,
+        source: SceneSource,
+        order: np.ndarray,
+        has_sh: np.ndarray,
+        bits: BitSpec,
+        groups: int | None,
+        renderer: Renderer | None,
+        judge: Judge | None,
+        budget: MemoryBudget,
+    ) -> None:
+        self.source = source
+        self.bits = bits
+        self.groups = groups
+        self.renderer = renderer
+        self.judge = judge
+        self.budget = budget
+        self._ranks = ranks_from_order(order)
+        self._has_sh = has_sh
+        # SH rows of rank r and above, so that sizes cost nothing: the search asks for hundreds.
+        self._sh_above = np.concatenate([np.cumsum(has_sh[order][::-1])[::-1], [0]])
+
+    def counts(self, choice: Choice) -> tuple[int, int]:
+        """Rows that stay, and of these with SH."""
+        kept = self.source.count - choice.pruned(self.source.count)
+        return kept, int(self._sh_above[choice.boundary(self.source.count)])
+
+    def size(self, choice: Choice) -> int:
+        """Exact bytes of the file."""
+        kept, with_sh = self.counts(choice)
+        return container_size(kept, with_sh, self.source.sh_degree, self.bits, self.groups)
+
+    def measure(self, choice: Choice) -> Measurement:
+        """Prune, quantize, dequantize, render and compare."""
+        assert self.renderer is not None and self.judge is not None
+        with self.quantized(choice) as quantized, self.renderer.load_quantized(quantized) as scene:
+            return measurement_of(self.judge.compare(scene))
+
+    def estimate(self, choice: Choice) -> Measurement:
+        """`measure` at a fourth of the pixels."""
+        assert self.renderer is not None and self.judge is not None
+        with self.quantized(choice) as quantized, self.renderer.load_quantized(quantized) as scene:
+            return measurement_of(self.judge.estimate(scene))
+
+    @contextmanager
+    def quantized(self, choice: Choice, bits: BitSpec | None = None) -> Iterator[QuantizedScene]:
+        """The quantized scene of a choice; its bytes are taken from the budget while the block lasts."""
+        kept, with_sh = self.counts(choice)
+        bits = self.bits if bits is None else bits
+        size = quantized_bytes(kept, with_sh, self.source.sh_degree if with_sh else 0, bits, self.groups)
+        self.budget.take("the quantized scene", size)
+        try:
+            per_row = QUANTIZE_COPIES * 4 * (14 + self.source.width("sh_rest"))
+            chunk_rows = self.budget.rows("quantizing", per_row, minimum=min(kept, 1024), most=65536)
+            rows = select_rows(self._ranks, choice, self._has_sh)
+            yield quantize_scene(self.source, *rows, bits, self.groups, chunk_rows)
+        finally:
+            self.budget.give(size)

@@ -1,0 +1,53 @@
+"""Scores kept between runs, and taken again only for the same scene, poses and kind of score."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.files import atomic_write
+
+
+class ScoreCache:
+    """A file with the scores of one scene seen from one set of poses.
+
+    Parameters
+    ----------
+    path : path
+        Made by `save`; need not exist.
+    fingerprint : str
+        Of what is to be scored.
+    """
+
+    def __init__(self, path: str | Path, fingerprint: str) -> None:
+        self.path, self.fingerprint = Path(path), fingerprint
+
+    def load(self, count: int) -> np.ndarray | None:
+        """[count] f64, or `None` where there is no file yet or it is of something else.
+
+        Raises
+        ------
+        InputError
+            When the file holds no scores that `save` wrote: it would be overwritten.
+        """
+        try:
+            with open(self.path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+                key, scores = str(archive["fingerprint"]), archive["scores"]
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+            raise InputError(
+                f"{self.path}: expected scores kept by an earlier --score-cache, found something else ({error}); "
+                "remove the file, or name another one"
+            ) from error
+        same = key == self.fingerprint and scores.shape == (count,) and scores.dtype == np.float64
+        return scores if same else None
+
+    def save(self, scores: np.ndarray) -> None:
+        """Write, in place of what was there."""
+        with atomic_write(self.path, force=True) as file:
+            np.savez(file, fingerprint=np.array(self.fingerprint), scores=scores)

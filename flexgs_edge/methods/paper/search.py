@@ -1,0 +1,296 @@
+"""FOA, fast online adaptation: the strongest compression that holds a target, found in a counted number of steps.
+
+1. *List.* The paper's candidates, sorted by exact predicted bytes, are walked from (.4, .4): to fewer bytes while the target
+   holds, else to more bytes up to the first that holds.
+2. *Refinement.* Around the answer p and s move on a grid of 0.02 within +-0.1. Bytes are exact and free, so only points
+   with fewer bytes than the best are of interest. Each step measures the smallest point that a local model of the loss
+   (log-linear in p and s, fitted to the points measured so far) expects to hold. A point that fails rules out all points
+   with both rates as high. The answer is always a point that was itself measured to hold.
+
+Both look at estimates, from a part of the pixels, whose distance from a full measurement is taken at the first point. The
+answer is then measured in full; if it does not hold, the next one by what that showed is.
+
+Steps are counted, never timed, and the model uses plain Python floats in a fixed order: same command, same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import MAX_PRUNE, REFINE_STEPS, Phase, SearchResult, Step, out_of_reach
+from flexgs_edge.goals.target import Measurement, Target
+from flexgs_edge.methods.paper.loss_model import LossModel
+
+CANDIDATES: tuple[tuple[int, int], ...] = (
+    (2, 3), (1, 5), (2, 4), (3, 3), (1, 6), (2, 5), (3, 4), (4, 3), (2, 6), (3, 5),
+    (4, 4), (3, 6), (4, 5), (5, 4), (6, 3), (5, 5), (6, 4), (7, 3), (8, 2), (9, 1),
+)  # fmt: skip
+"""The paper's list of (p, s), in tenths, as published (not monotone in bytes: it is sorted before use)."""
+START = (4, 4)
+GRID = 20
+"""Step of the refinement in p and s, in thousandths."""
+REACH = 100
+"""Largest distance of the refinement from the list's answer, in thousandths."""
+
+
+class Evaluator(Protocol):
+    """What a search may ask of a scene."""
+
+    def size(self, choice: Choice) -> int:
+        """Exact bytes of the file at this choice; must be cheap."""
+
+    def measure(self, choice: Choice) -> Measurement:
+        """Prune, quantize, dequantize, render and compare: the costly question."""
+
+    def estimate(self, choice: Choice) -> Measurement:
+        """The same from a part of the pixels, in less time."""
+
+
+def adapt(
+    evaluator: Evaluator,
+    target: Target,
+    effort: str = "balanced",
+    best_effort: bool = False,
+    on_step: Callable[[Step], None] | None = None,
+) -> SearchResult:
+    """Find the choice that meets `target` with the fewest bytes (a size target: with the best quality).
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+        Answers for sizes, estimates and measurements; no point is asked for either twice.
+    target : Target
+        What must hold.
+    effort : {"fast", "balanced", "thorough"}
+        Number of refinement steps (`REFINE_STEPS`).
+    best_effort : bool
+        Return the closest point when nothing holds, with `reached` False.
+    on_step : callable, optional
+        Called after each new step.
+
+    Raises
+    ------
+    TargetError
+        When no point that was tried holds; the message names the closest.
+    """
+    search = _Search(evaluator, target, on_step)
+    refine_steps = REFINE_STEPS[effort]
+    if target.limit_bytes is None:
+        chosen = _search_quality(search, refine_steps)
+    else:
+        chosen = _search_size(search, target.limit_bytes, refine_steps)
+    chosen = _confirmed(search, chosen)
+    if not chosen.holds and not best_effort:
+        raise out_of_reach(target, chosen)
+    return SearchResult(chosen, chosen.holds, tuple(search.steps))
+
+
+def measure_fixed(evaluator: Evaluator, choice: Choice, target: Target | None = None) -> SearchResult:
+    """The result of a run with fixed rates: one step, no search; `reached` compares it with `target` if there is one."""
+    started = time.perf_counter()
+    size, measurement = evaluator.size(choice), evaluator.measure(choice)
+    excess = 0.0 if target is None else target.excess(size, measurement)
+    step = Step(choice, size, measurement, excess, "fixed", time.perf_counter() - started)
+    return SearchResult(step, step.holds, (step,))
+
+
+class _Search:
+    """Asks the evaluator, remembers every answer and logs the steps."""
+
+    def __init__(self, evaluator: Evaluator, target: Target, on_step: Callable[[Step], None] | None) -> None:
+        self.evaluator = evaluator
+        self.target = target
+        self.on_step = on_step
+        self.steps: list[Step] = []
+        self._known: dict[Choice, Step] = {}
+        self._confirmed: dict[Choice, Step] = {}
+        self._sizes: dict[Choice, int] = {}
+        self._off = 0.0
+
+    def size(self, choice: Choice) -> int:
+        if choice not in self._sizes:
+            self._sizes[choice] = self.evaluator.size(choice)
+        return self._sizes[choice]
+
+    def known(self, choice: Choice) -> bool:
+        return choice in self._known
+
+    def estimate(self, choice: Choice, phase: Phase) -> Step:
+        """The step of a choice; the first one is measured in full as well, to tell how far estimates are off."""
+        if choice not in self._known:
+            first = not self._known
+            started = time.perf_counter()
+            measurement = self.evaluator.estimate(choice)
+            excess = self.target.excess(self.size(choice), measurement)
+            if first and self.target.limit_bytes is None:
+                off = self.confirm(choice).excess - excess
+                self._off = off if math.isfinite(off) else 0.0  # identical renders have no finite distance
+            seconds = time.perf_counter() - started
+            step = Step(choice, self.size(choice), measurement, excess + self._off, phase, seconds, estimated=True)
+            self._known[choice] = step
+            self._tell(step)
+        return self._known[choice]
+
+    def confirm(self, choice: Choice) -> Step:
+        """The step of a choice measured in full."""
+        if choice not in self._confirmed:
+            started = time.perf_counter()
+            measurement = self.evaluator.measure(choice)
+            excess = self.target.excess(self.size(choice), measurement)
+            step = Step(choice, self.size(choice), measurement, excess, "confirm", time.perf_counter() - started)
+            self._confirmed[choice] = step
+            self._tell(step)
+        return self._confirmed[choice]
+
+    def _tell(self, step: Step) -> None:
+        self.steps.append(step)
+        if self.on_step:
+            self.on_step(step)
+
+    @property
+    def estimates(self) -> list[Step]:
+        """The estimated steps, in order."""
+        return list(self._known.values())
+
+    def unconfirmed(self) -> list[Step]:
+        """Steps that were only estimated, the one that holds with the fewest bytes first, then those that miss by least."""
+        steps = [step for choice, step in self._known.items() if choice not in self._confirmed]
+        return sorted(steps, key=lambda step: (max(step.excess, 0.0), step.size))
+
+    def closest(self) -> Step:
+        """Of the steps measured in full, the one that misses by least."""
+        return min(self._confirmed.values(), key=lambda step: (step.excess, step.size))
+
+    def by_size(self, choices: list[Choice]) -> list[Choice]:
+        """Choices from most to fewest bytes; ties by rates, so that the order is one."""
+        return sorted(choices, key=lambda choice: (-self.size(choice), choice.prune, choice.sh))
+
+
+def _confirmed(search: _Search, chosen: Step) -> Step:
+    """`chosen` measured in full; while that does not hold, the next of the steps that should by what it showed."""
+    full = search.confirm(chosen.choice)
+    while not full.holds:
+        off = max(full.excess - chosen.excess, 0.0)
+        # Where the estimate already said that nothing holds, the rest is farther away.
+        rest = [step for step in search.unconfirmed() if step.excess + off <= 0.0]
+        if not rest:
+            return search.closest()
+        chosen = rest[0]
+        full = search.confirm(chosen.choice)
+    return full
+
+
+def _candidates(search: _Search) -> list[Choice]:
+    return search.by_size([Choice(100 * p, 100 * s) for p, s in CANDIDATES])
+
+
+def _search_quality(search: _Search, refine_steps: int) -> Step:
+    candidates = _candidates(search)
+    at = candidates.index(Choice(100 * START[0], 100 * START[1]))
+    best = search.estimate(candidates[at], "list")
+    if best.holds:
+        for choice in candidates[at + 1 :]:
+            step = search.estimate(choice, "list")
+            if not step.holds:
+                break
+            best = step
+    else:
+        for choice in reversed(candidates[:at]):
+            best = search.estimate(choice, "list")
+            if best.holds:
+                break
+    gentlest = best.choice == candidates[0]
+    box = _box(best.choice, to_zero=gentlest)
+    if not best.holds:
+        # The whole list fails: only the gentlest point can still hold, and it is the closest if it does not.
+        best = search.estimate(Choice(0, 0), "refine")
+        refine_steps -= 1
+        if not best.holds:
+            return min(search.estimates, key=lambda step: (step.excess, step.size))
+    return _refine(search, best, box, refine_steps)
+
+
+def _refine(search: _Search, best: Step, box: list[Choice], steps: int) -> Step:
+    """Walk from `best` towards fewer bytes inside `box`, measuring at most `steps` new points."""
+    for _ in range(steps):
+        failed = [step.choice for step in search.estimates if not step.holds]
+        open_points = [
+            choice
+            for choice in box
+            if search.size(choice) < best.size and not search.known(choice) and not _ruled_out(choice, failed)
+        ]
+        if not open_points:
+            break
+        model = LossModel.fit([(step.choice, step.excess) for step in search.estimates])
+        expected = [choice for choice in open_points if model.predict(choice) <= 0.0]
+        if expected:
+            probe = search.by_size(expected)[-1]
+        else:  # none is expected to hold: the likeliest one, in case the model is wrong
+            probe = min(open_points, key=lambda choice: (model.predict(choice), search.size(choice), choice.prune))
+        step = search.estimate(probe, "refine")
+        if step.holds and step.size < best.size:
+            best = step
+    return best
+
+
+def _search_size(search: _Search, limit: int, refine_steps: int) -> Step:
+    """The least compression that fits: sizes are free, so measuring only compares points on the edge of the limit."""
+    if search.size(Choice(0, 0)) <= limit:
+        return search.estimate(Choice(0, 0), "list")
+    candidates = _candidates(search)
+    fitting = [choice for choice in candidates if search.size(choice) <= limit]
+    answer = fitting[0] if fitting else candidates[-1]
+    box = _box(answer, to_zero=answer == candidates[0])
+    edge = _edge(search, [choice for choice in box if search.size(choice) <= limit])
+    if fitting:
+        search.estimate(answer, "list")
+    if not edge:
+        smallest = search.by_size(box)[-1]
+        return search.estimate(smallest, "refine")
+    judge = search.target.judge
+
+    def loss(step: Step) -> tuple[float, int]:
+        assert step.measurement is not None
+        return step.measurement.loss(judge), step.size
+
+    # One hill climb along the edge (one point for each p), from the p of the list's answer outwards.
+    at = min(range(len(edge)), key=lambda i: (abs(edge[i].prune - answer.prune), i))
+    best = search.estimate(edge[at], "refine")
+    left = refine_steps - 1
+    for direction in (-1, 1):
+        i = at + direction
+        while 0 <= i < len(edge) and left > 0:
+            step = search.estimate(edge[i], "refine")
+            left -= 1
+            if loss(step) >= loss(best):
+                break
+            best, i = step, i + direction
+    return min((step for step in search.estimates if step.holds), key=loss)
+
+
+def _edge(search: _Search, fitting: list[Choice]) -> list[Choice]:
+    """For each prune rate the fitting choice with the most bytes, in order of prune rate."""
+    largest: dict[int, Choice] = {}
+    for choice in reversed(search.by_size(fitting)):
+        largest[choice.prune] = choice
+    return [largest[prune] for prune in sorted(largest)]
+
+
+def _box(centre: Choice, to_zero: bool) -> list[Choice]:
+    """Grid points within `REACH` of `centre`; from the gentlest candidate also everything gentler (`to_zero`)."""
+
+    def line(value: int, top: int) -> range:
+        # Start on the grid line below zero's reach, so that `centre` itself is on the grid.
+        low = value % GRID if to_zero else max(value - REACH, value % GRID)
+        return range(low, min(value + REACH, top) + 1, GRID)
+
+    return [Choice(p, s) for p in line(centre.prune, MAX_PRUNE) for s in line(centre.sh, 1000) if p + s <= 1000]
+
+
+def _ruled_out(choice: Choice, failed: list[Choice]) -> bool:
+    """A point with both rates at least as high as one that failed is taken to fail."""
+    return any(choice.prune >= other.prune and choice.sh >= other.sh for other in failed)

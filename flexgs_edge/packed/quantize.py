@@ -1,0 +1,377 @@
+"""MPQ, mixed-precision quantization: b-bit codes per channel with one range for every group of consecutive rows.
+
+Source: FlexGaussian (ACM MM 2025), section on MPQ. For a group with smallest value lo and largest hi:
+
+    step = (hi - lo) / (2^bits - 1)        code = rint((x - lo) / step), clipped        x' = lo + code * step
+
+all stored and computed in float32, x' with one multiply and one add that are never fused, so that every device gives
+the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flexgs_edge.constants import GROUP_ROWS
+from flexgs_edge.errors import InputError
+from flexgs_edge.packed.bitpack import pack_into, plane_bytes, unpack
+from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.scene.fields import FIELD, FIELDS
+from flexgs_edge.scene.rotations import normalize_quats
+
+if TYPE_CHECKING:
+    from flexgs_edge.scene.source import SceneSource
+
+
+LARGEST = 2.0**126
+"""Largest magnitude that can be coded: a range twice as wide still fits float32, so nothing on the way overflows."""
+SMALLEST_STEP = 2.0**-126
+"""Smallest normal float32. A finer step counts as constant, because devices may flush it to zero."""
+
+
+_Read = Callable[[slice, Sequence[str]], dict[str, np.ndarray]]
+"""Gives {field: [c, n] f32} for a row range and field names."""
+
+
+def group_count(rows: int, groups: int | None = None) -> int:
+    """Groups of an array of `rows` rows: about one for 512 rows, or `groups`; never more than rows.
+
+    >>> group_count(0), group_count(5), group_count(2048), group_count(3, 10)
+    (0, 1, 4, 3)
+    """
+    if groups is not None and groups < 1:
+        raise InputError(f"groups: expected at least 1, got {groups}")
+    return min(rows, max(1, round(rows / GROUP_ROWS)) if groups is None else groups)
+
+
+def group_bounds(rows: int, groups: int, first: int = 0, last: int | None = None) -> np.ndarray:
+    """First row of groups `first` to `last` (inclusive; `groups` gives the end): i * rows // groups as i64."""
+    index = np.arange(first, (groups if last is None else last) + 1, dtype=np.int64)
+    bounds: np.ndarray = index * rows // max(groups, 1)
+    return bounds
+
+
+def group_of(row: int, rows: int, groups: int) -> int:
+    """The group that holds `row`: the largest i with i * rows // groups <= row."""
+    return ((row + 1) * groups - 1) // rows
+
+
+@dataclass(frozen=True, eq=False)
+class QuantizedArray:
+    """The codes of one field, bit-packed, and their ranges.
+
+    Parameters
+    ----------
+    bits : int
+        Bits per code, 1 to 16.
+    count : int
+        Rows.
+    channels : int
+        Channels (planes).
+    low, step : np.ndarray
+        [channels, G] f32.
+    planes : np.ndarray
+        [channels, ceil(count * bits / 8)] u8; the code of row i starts at bit i * bits of its plane, least
+        significant bit first.
+    """
+
+    bits: int
+    count: int
+    channels: int
+    low: np.ndarray
+    step: np.ndarray
+    planes: np.ndarray
+
+    @property
+    def groups(self) -> int:
+        """Number of groups."""
+        return int(self.low.shape[1])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of ranges and codes."""
+        return self.low.nbytes + self.step.nbytes + self.planes.nbytes
+
+
+@dataclass(frozen=True, eq=False)
+class QuantizedScene:
+    """A quantized scene: rows [0, sh_count) have SH, the others none.
+
+    Parameters
+    ----------
+    count, sh_count : int
+        Rows, and rows with SH.
+    sh_degree : int
+        0 when no row has SH.
+    origin : np.ndarray
+        [3] f64, world: positions are relative to it.
+    arrays : dict
+        One `QuantizedArray` a scene field; `sh_rest` has `sh_count` rows, the others `count`.
+    """
+
+    count: int
+    sh_count: int
+    sh_degree: int
+    origin: np.ndarray
+    arrays: dict[str, QuantizedArray]
+
+    @property
+    def bits(self) -> BitSpec:
+        """Bits of every attribute."""
+        return BitSpec(**{FIELD[name].bits: array.bits for name, array in self.arrays.items()})
+
+    def rows_of(self, field: str) -> int:
+        """Rows that the array of `field` covers."""
+        return self.sh_count if field == "sh_rest" else self.count
+
+
+def array_bytes(rows: int, channels: int, bits: int, groups: int) -> int:
+    """Exact bytes of a `QuantizedArray`: codes, and 8 bytes of range a group and channel."""
+    return channels * (plane_bytes(rows, bits) + 8 * groups)
+
+
+def quantized_bytes(count: int, sh_count: int, sh_degree: int, bits: BitSpec, groups: int | None = None) -> int:
+    """Exact bytes of codes and ranges of a `QuantizedScene` of these counts, without the container around them."""
+    total = 0
+    for field in FIELDS:
+        rows = sh_count if field.name == "sh_rest" else count
+        total += array_bytes(rows, field.width(sh_degree), bits.of(field.name), group_count(rows, groups))
+    return total
+
+
+def quantize_array(values: np.ndarray, bits: int, groups: int) -> QuantizedArray:
+    """Quantize an array that is in memory.
+
+    Parameters
+    ----------
+    values : np.ndarray
+        [c, n] f32, finite, magnitudes up to `LARGEST`.
+    bits : int
+        1 to 16.
+    groups : int
+        0 for n = 0, else 1 to n.
+
+    Raises
+    ------
+    InputError
+        When a value is not finite or too large.
+    """
+    values = np.asarray(values, np.float32)
+    channels, rows = values.shape
+    layouts = {"values": (channels, bits)}
+    return _quantize_stream(lambda part, names: {"values": values}, layouts, rows, groups, rows)["values"]
+
+
+def codes(array: QuantizedArray, rows: slice) -> np.ndarray:
+    """[c, n] u16 codes of `rows` (a slice with step 1)."""
+    start, stop, _ = rows.indices(array.count)
+    out = np.empty((array.channels, max(stop - start, 0)), np.uint16)
+    for channel in range(array.channels):
+        out[channel] = unpack(array.planes[channel], array.bits, start, stop)
+    return out
+
+
+def dequantize(array: QuantizedArray, rows: slice) -> np.ndarray:
+    """Values of `rows` (a slice with step 1): the specification of every dequantizer.
+
+    Returns
+    -------
+    np.ndarray
+        [c, n] f32, lo + code * step: the product is rounded to float32, then the sum.
+    """
+    return dequantize_part(array, 0, rows)
+
+
+def dequantize_part(array: QuantizedArray, first: int, rows: slice, out: np.ndarray | None = None) -> np.ndarray:
+    """`dequantize` for an array whose planes start at row `first` (a multiple of 8); ranges are those of all rows.
+
+    Fills `out` ([c, n] f32) where given.
+    """
+    start, stop, _ = rows.indices(array.count)
+    if out is None:
+        out = np.empty((array.channels, max(stop - start, 0)), np.float32)
+    if out.size == 0:
+        return out
+    groups, sizes = _groups_of_rows(start, stop, array.count, array.groups)
+    for channel in range(array.channels):
+        value = out[channel]
+        value[:] = unpack(array.planes[channel], array.bits, start - first, stop - first)
+        value *= np.repeat(array.step[channel, groups], sizes)
+        value += np.repeat(array.low[channel, groups], sizes)
+    return out
+
+
+def largest_error(array: QuantizedArray) -> np.ndarray:
+    """Largest |x' - x| that the quantizer may cause, per channel and group.
+
+    Half a step, and the roundings of float32: of the step (times the largest code), of (x - lo) / step, of code * step
+    and of the sum; each is at most 2^-24 of the largest number in it.
+
+    Returns
+    -------
+    np.ndarray
+        [c, G] f64.
+    """
+    low, step = array.low.astype(np.float64), array.step.astype(np.float64)
+    span = step * (2**array.bits - 1)
+    # A step that underflowed stands for a range of at most (2^bits - 1) * SMALLEST_STEP.
+    lost = np.where(step == 0, SMALLEST_STEP * (2**array.bits - 1), 0.0)
+    bound: np.ndarray = step / 2 + 2.0**-22 * span + 2.0**-24 * np.maximum(abs(low), abs(low + span)) + lost
+    return bound
+
+
+def quantize_scene(
+    source: SceneSource,
+    rows_with_sh: np.ndarray,
+    rows_without_sh: np.ndarray,
+    bits: BitSpec = PAPER,
+    groups: int | None = None,
+    chunk_rows: int = 65536,
+) -> QuantizedScene:
+    """Quantize the chosen rows of a scene; the result does not depend on `chunk_rows`.
+
+    Parameters
+    ----------
+    source : SceneSource
+        A checked scene (finite, no zero quaternions).
+    rows_with_sh, rows_without_sh : np.ndarray
+        [n] i64 ascending, from `select_rows`; stored in this order. All are SH-less when the scene's SH degree is 0.
+    bits : BitSpec
+        Bits per code.
+    groups : int, optional
+        Groups per channel of every array; default about one for 512 rows. 1 for round to nearest.
+    chunk_rows : int
+        Rows held at a time, beside the packed result.
+    """
+    if source.sh_degree == 0 and len(rows_with_sh):
+        rows_without_sh = np.sort(np.concatenate([rows_with_sh, rows_without_sh]))
+        rows_with_sh = rows_with_sh[:0]
+    count, sh_count = len(rows_with_sh) + len(rows_without_sh), len(rows_with_sh)
+    degree = source.sh_degree if sh_count else 0
+    blocks = (rows_with_sh, rows_without_sh)
+    layouts = {field.name: (field.width(degree), bits.of(field.name)) for field in FIELDS}  # channels and bits
+    rest = {"sh_rest": layouts.pop("sh_rest")}
+
+    def read(part: slice, names: Sequence[str]) -> dict[str, np.ndarray]:
+        planes = _read_blocks(source, blocks, part, names)
+        if "quats" in planes:
+            planes["quats"] = normalize_quats(planes["quats"])
+        return planes
+
+    try:
+        arrays = _quantize_stream(read, layouts, count, group_count(count, groups), chunk_rows)
+        arrays |= _quantize_stream(read, rest, sh_count, group_count(sh_count, groups), chunk_rows)
+    except InputError as error:
+        raise InputError(f"{source.name}: {error}") from None
+    arrays = {field.name: arrays[field.name] for field in FIELDS}
+    return QuantizedScene(count, sh_count, degree, np.array(source.origin, np.float64), arrays)
+
+
+def _read_blocks(
+    source: SceneSource, blocks: Sequence[np.ndarray], part: slice, fields: Sequence[str]
+) -> dict[str, np.ndarray]:
+    """{field: [c, n] f32} of rows `part` of the blocks' concatenation, each block read as sorted rows."""
+    pieces = []
+    start, stop = part.start, part.stop
+    for block in blocks:
+        rows = block[max(start, 0) : max(stop, 0)]
+        if len(rows):
+            pieces.append(source.read(rows, fields))
+        start, stop = start - len(block), stop - len(block)
+    if len(pieces) == 1:
+        return pieces[0]
+    return {field: np.concatenate([piece[field] for piece in pieces], axis=1) for field in fields}
+
+
+def _quantize_stream(
+    read: _Read, layouts: dict[str, tuple[int, int]], rows: int, groups: int, chunk_rows: int
+) -> dict[str, QuantizedArray]:
+    """Quantize what `read` gives, in runs of whole groups of at most `chunk_rows` rows.
+
+    A single group larger than that is read twice in pieces: once for its range, once for its codes.
+    `layouts` has channels and bits of every field.
+    """
+    arrays = {name: _empty_array(rows, channels, bits, groups) for name, (channels, bits) in layouts.items()}
+    names = [name for name, array in arrays.items() if array.channels]
+    first = 0 if names else groups
+    while first < groups:
+        start = first * rows // groups
+        # Group i ends by row start + chunk_rows while i * rows // groups <= start + chunk_rows.
+        last = min(max(((start + chunk_rows + 1) * groups - 1) // rows, first + 1), groups)
+        stop = last * rows // groups
+        pieces = [slice(at, min(at + chunk_rows, stop)) for at in range(start, stop, chunk_rows)]
+        values = read(pieces[0], names)
+        ranges = _extremes(values, read, pieces, group_bounds(rows, groups, first, last))
+        for name in names:
+            _set_ranges(name, arrays[name], first, last, *ranges[name])
+        for piece in pieces:
+            if len(pieces) > 1:
+                values = read(piece, names)
+            for name in names:
+                _set_codes(arrays[name], piece, values[name])
+        first = last
+    return arrays
+
+
+def _empty_array(rows: int, channels: int, bits: int, groups: int) -> QuantizedArray:
+    low, step = np.empty((2, channels, groups), np.float32)
+    return QuantizedArray(bits, rows, channels, low, step, np.empty((channels, plane_bytes(rows, bits)), np.uint8))
+
+
+def _extremes(
+    values: dict[str, np.ndarray], read: _Read, pieces: Sequence[slice], bounds: np.ndarray
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Smallest and largest value ([c, groups] f32) of the groups in one piece, or of one group in several."""
+    starts = bounds[:-1] - bounds[0]
+    ranges = {
+        name: (np.minimum.reduceat(plane, starts, axis=1), np.maximum.reduceat(plane, starts, axis=1))
+        for name, plane in values.items()
+    }
+    for piece in pieces[1:]:
+        for name, plane in read(piece, list(values)).items():
+            low, high = ranges[name]
+            np.minimum(low, plane.min(axis=1, keepdims=True), out=low)
+            np.maximum(high, plane.max(axis=1, keepdims=True), out=high)
+    return ranges
+
+
+def _set_ranges(name: str, array: QuantizedArray, first: int, last: int, low: np.ndarray, high: np.ndarray) -> None:
+    """Fill low and step of groups [first, last)."""
+    # NaN spreads through minimum and maximum, and fails both comparisons.
+    bad = ~((low >= -LARGEST) & (high <= LARGEST))
+    if bad.any():
+        channel, group = np.argwhere(bad)[0]
+        start, stop = group_bounds(array.count, array.groups, first + int(group), first + int(group) + 1)
+        raise InputError(
+            f"{name}: channel {channel}, kept rows {start} to {stop - 1}: values from {low[channel, group]} to "
+            f"{high[channel, group]}, expected finite numbers of magnitude up to {LARGEST:.3g}"
+        )
+    step = ((high.astype(np.float64) - low) / (2**array.bits - 1)).astype(np.float32)
+    step[step < SMALLEST_STEP] = 0
+    array.low[:, first:last] = low + np.float32(0)  # -0 and 0 are equal: which of them is the minimum is chance
+    array.step[:, first:last] = step
+
+
+def _set_codes(array: QuantizedArray, rows: slice, values: np.ndarray) -> None:
+    """Pack the codes of `rows`, one channel at a time: its temporaries stay in the cache."""
+    groups, sizes = _groups_of_rows(rows.start, rows.stop, array.count, array.groups)
+    low, step = array.low[:, groups], array.step[:, groups]
+    divisors = np.where(step == 0, np.float32(1), step)
+    for channel in range(array.channels):
+        code = values[channel] - np.repeat(low[channel], sizes)
+        code /= np.repeat(divisors[channel], sizes)
+        np.rint(code, out=code)
+        np.clip(code, 0, 2**array.bits - 1, out=code)
+        pack_into(array.planes[channel], array.bits, rows.start, code.astype(np.uint16))
+
+
+def _groups_of_rows(start: int, stop: int, rows: int, groups: int) -> tuple[slice, np.ndarray]:
+    """The groups that rows [start, stop) touch, and how many of these rows each of them has."""
+    first, last = group_of(start, rows, groups), group_of(stop - 1, rows, groups)
+    bounds = group_bounds(rows, groups, first, last + 1)
+    bounds[0], bounds[-1] = start, stop
+    return slice(first, last + 1), np.diff(bounds)

@@ -1,0 +1,1 @@
+"""Two images are compared: PSNR, SSIM, LPIPS."""

@@ -1,0 +1,71 @@
+"""SSIM of images on a backend: scikit-image's with a Gaussian window, in a tenth of its time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexgs_edge.constants import LANES, SSIM_SIGMA, SSIM_WINDOW
+from flexgs_edge.kernels.backend import Backend
+
+
+def window() -> np.ndarray:
+    """[SSIM_WINDOW] f32: the taps, their sum 1."""
+    away = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+    taps = np.exp(-0.5 * np.square(away / SSIM_SIGMA))
+    return (taps / taps.sum()).astype(np.float32)
+
+
+def ssim_bytes(width: int, height: int) -> int:
+    """Bytes that `ssims` takes on the backend for images of this size."""
+    return 4 * 8 * height * (-(-width // LANES) * LANES) + 4 * 5 * LANES
+
+
+def ssims(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
+    """SSIM of pairs of images of one size, mean over pixels and channels.
+
+    Gaussian window of sigma 1.5, population covariance, data range 1, windows inside the image only (Wang et al. 2004):
+    what scikit-image gives with `gaussian_weights=True, use_sample_covariance=False, data_range=1`.
+
+    Parameters
+    ----------
+    pairs : sequence of two arrays
+        [H, W, 3] f32, clamped to [0, 1] here.
+
+    Returns
+    -------
+    list of float or None
+        `None` below 11 pixels a side.
+    """
+    if not pairs or min(pairs[0][0].shape[:2]) < SSIM_WINDOW:
+        return [None] * len(pairs)
+    height, width = pairs[0][0].shape[:2]
+    rows, stride = height - SSIM_WINDOW + 1, -(-width // LANES) * LANES
+    count = rows * stride
+    plane = count + LANES
+    shapes = ((SSIM_WINDOW,), (height, stride), (height, stride), (5, plane), (count,))
+    arrays = []
+    try:
+        for shape in shapes:
+            arrays.append(backend.array(shape, np.float32))
+        taps, *images, moments, similar = arrays
+        backend.write(taps, window())
+        backend.fill(moments, 0)  # what lies behind the last row is read, and not used
+        padded = np.zeros((height, stride), np.float32)
+        found: list[float | None] = []
+        for pair in pairs:
+            total = 0.0
+            for channel in range(3):
+                for image, array in zip(pair, images, strict=True):
+                    np.clip(image[..., channel], 0.0, 1.0, out=padded[:, :width])
+                    backend.write(array, padded)
+                backend.launch("ssim_columns", (count,), count, stride, plane, taps, *images, moments)
+                backend.launch("ssim_rows", (count,), count, plane, taps, moments, similar)
+                inside = backend.read(similar).reshape(rows, stride)[:, : width - SSIM_WINDOW + 1]
+                total += float(inside.mean(dtype=np.float64))
+            found.append(total / 3)
+        return found
+    finally:
+        for array in arrays:
+            array.release()

@@ -1,0 +1,211 @@
+"""The figures of one view and their means over views."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexgs_edge.constants import DEFAULT_BASE_PSNR
+from flexgs_edge.quality.psnr import drop, mean_psnr, modelled_drop, mse, psnr
+
+Distance = Callable[[np.ndarray, np.ndarray], float | None]
+"""A distance of two [H, W, 3] images; `None` where there is none."""
+Similarities = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | None]]
+"""Similarities of several pairs of [H, W, 3] images of one size."""
+
+
+@dataclass(frozen=True)
+class ViewQuality:
+    """Figures of one view; PSNRs in dB, `None` where images are identical or there is nothing to compare with.
+
+    Parameters
+    ----------
+    name : str
+        The view's name.
+    error : float
+        Mean squared error against the original's render.
+    photo_error, original_error : float or None
+        Mean squared error of this render and of the original's render against the photo; `None` without a photo.
+    ssim_original, ssim_photo, original_ssim : float or None
+        SSIM against the original's render, against the photo, and of the original against the photo.
+    lpips_original, lpips_photo, original_lpips : float or None
+        LPIPS of the same three pairs; `None` unless it was asked for.
+    """
+
+    name: str
+    error: float
+    photo_error: float | None = None
+    original_error: float | None = None
+    ssim_original: float | None = None
+    ssim_photo: float | None = None
+    original_ssim: float | None = None
+    lpips_original: float | None = None
+    lpips_photo: float | None = None
+    original_lpips: float | None = None
+
+    @property
+    def fidelity(self) -> float | None:
+        """PSNR against the original's render, dB."""
+        return psnr(self.error)
+
+    @property
+    def psnr(self) -> float | None:
+        """PSNR against the photo, dB."""
+        return None if self.photo_error is None else psnr(self.photo_error)
+
+    @property
+    def original_psnr(self) -> float | None:
+        """PSNR of the original against the photo, dB."""
+        return None if self.original_error is None else psnr(self.original_error)
+
+    @property
+    def drop(self) -> float | None:
+        """Drop against the photo, dB."""
+        if self.photo_error is None or self.original_error is None:
+            return None
+        return drop(self.original_error, self.photo_error)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Figures of a scene over its evaluation views: means of the per-view figures, and the worst view.
+
+    Parameters
+    ----------
+    views : tuple of ViewQuality
+        One record a view, in order of name.
+    base_psnr : float
+        PSNR of the original that the modelled drop starts from, dB.
+    """
+
+    views: tuple[ViewQuality, ...]
+    base_psnr: float = DEFAULT_BASE_PSNR
+
+    def _mean(self, name: str) -> float | None:
+        return mean_psnr([getattr(view, name) for view in self.views])
+
+    @property
+    def error(self) -> float:
+        """Mean squared error against the original's renders, mean over the views."""
+        return math.fsum(view.error for view in self.views) / max(len(self.views), 1)
+
+    @property
+    def fidelity(self) -> float | None:
+        """Mean PSNR against the original's renders, dB; `None` when every view is identical."""
+        return self._mean("fidelity")
+
+    @property
+    def psnr(self) -> float | None:
+        """Mean PSNR against the photos, dB."""
+        return self._mean("psnr")
+
+    @property
+    def original_psnr(self) -> float | None:
+        """Mean PSNR of the original against the photos, dB."""
+        return self._mean("original_psnr")
+
+    @property
+    def drop(self) -> float | None:
+        """Mean drop against the photos, dB; `None` without photos."""
+        return self._mean("drop")
+
+    @property
+    def modelled_drop(self) -> float:
+        """Drop in dB that the mean squared error against the original's renders would cost."""
+        return modelled_drop(self.error, self.base_psnr)
+
+    @property
+    def identical(self) -> int:
+        """Views whose render is the original's, pixel for pixel."""
+        return sum(view.error == 0.0 for view in self.views)
+
+    @property
+    def ssim_original(self) -> float | None:
+        """Mean SSIM against the original's renders."""
+        return self._mean("ssim_original")
+
+    @property
+    def ssim_photo(self) -> float | None:
+        """Mean SSIM against the photos."""
+        return self._mean("ssim_photo")
+
+    @property
+    def original_ssim(self) -> float | None:
+        """Mean SSIM of the original against the photos."""
+        return self._mean("original_ssim")
+
+    @property
+    def by_loss(self) -> list[int]:
+        """Indices of the views, the worst first: by drop where all have photos, else by their error."""
+        drops = [view.drop for view in self.views]
+        losses = [view.error if None in drops else drop or 0.0 for view, drop in zip(self.views, drops)]
+        return sorted(range(len(losses)), key=lambda index: -losses[index])
+
+    @property
+    def lpips_original(self) -> float | None:
+        """Mean LPIPS against the original's renders."""
+        return self._mean("lpips_original")
+
+    @property
+    def lpips_photo(self) -> float | None:
+        """Mean LPIPS against the photos."""
+        return self._mean("lpips_photo")
+
+    @property
+    def original_lpips(self) -> float | None:
+        """Mean LPIPS of the original against the photos."""
+        return self._mean("original_lpips")
+
+    @property
+    def worst(self) -> ViewQuality | None:
+        """The view with the largest drop (with photos) or the lowest fidelity (without); `None` without views."""
+        return self.views[self.by_loss[0]] if self.views else None
+
+
+def compare_view(
+    name: str,
+    image: np.ndarray,
+    original: np.ndarray,
+    photo: np.ndarray | None = None,
+    original_error: float | None = None,
+    ssims: Similarities | None = None,
+    lpips: Distance | None = None,
+) -> ViewQuality:
+    """Figures of one render.
+
+    Parameters
+    ----------
+    name : str
+        The view's name.
+    image, original : np.ndarray
+        Renders of the scene in question and of the original, [H, W, 3] f32, not clamped.
+    photo : np.ndarray, optional
+        The photo, [H, W, 3] f32 in [0, 1].
+    original_error : float, optional
+        Mean squared error of `original` against `photo`, if it is known already.
+    ssims : callable, optional
+        Also measure this similarity of all pairs of images.
+    lpips : callable, optional
+        Also measure this distance of two images (about 3 s a megapixel for LPIPS).
+    """
+    if photo is not None and original_error is None:
+        original_error = mse(original, photo)
+    similar: list[float | None] = [None] * 3
+    if ssims:
+        pairs = [(image, original), *([(image, photo), (original, photo)] if photo is not None else ())]
+        similar[: len(pairs)] = ssims(pairs)
+    return ViewQuality(
+        name=name,
+        error=mse(image, original),
+        photo_error=None if photo is None else mse(image, photo),
+        original_error=None if photo is None else original_error,
+        ssim_original=similar[0],
+        ssim_photo=similar[1],
+        original_ssim=similar[2],
+        lpips_original=lpips(image, original) if lpips else None,
+        lpips_photo=lpips(image, photo) if lpips and photo is not None else None,
+        original_lpips=lpips(original, photo) if lpips and photo is not None else None,
+    )

@@ -1,0 +1,84 @@
+"""Results as JSON: rounded where digits mean nothing, null where there is no figure."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from flexgs_edge.goals.steps import Step
+from flexgs_edge.goals.target import Measurement
+from flexgs_edge.quality.view_quality import Quality, ViewQuality
+
+
+def json_text(record: dict[str, Any]) -> str:
+    """A record as `--json` and reports write it."""
+    return json.dumps(record, indent=2, allow_nan=False) + "\n"
+
+
+def step_json(step: Step) -> dict[str, Any]:
+    """A step of the search."""
+    found = step.measurement
+    return {
+        "phase": step.phase,
+        "prune_rate": step.choice.prune / 1000,
+        "sh_rate": step.choice.sh / 1000,
+        "size": step.size,
+        "drop": _rounded(found.drop if found else None),
+        "fidelity": _rounded(found.fidelity if found else None),
+        "modelled_drop": _rounded(found.modelled_drop if found else None),
+        "worst": _worst_json(found.worst) if found and found.worst else None,
+        "holds": step.holds,
+        "estimated": step.estimated,
+        "seconds": round(step.seconds, 3),
+    }
+
+
+def _worst_json(worst: Measurement) -> dict[str, float | None]:
+    return {
+        "drop": _rounded(worst.drop),
+        "fidelity": _rounded(worst.fidelity),
+        "modelled_drop": _rounded(worst.modelled_drop),
+    }
+
+
+def quality_json(quality: Quality) -> dict[str, Any]:
+    """Means, the worst view, and every view; null where images are identical, there is no photo, or nothing was measured."""
+    worst = quality.worst
+    return {
+        "drop": _rounded(quality.drop),
+        "fidelity": _rounded(quality.fidelity),
+        "modelled_drop": _rounded(quality.modelled_drop),
+        "base_psnr": quality.base_psnr,
+        "psnr": _rounded(quality.psnr),
+        "original_psnr": _rounded(quality.original_psnr),
+        "ssim": _rounded(quality.ssim_photo, 5),
+        "original_ssim": _rounded(quality.original_ssim, 5),
+        "ssim_fidelity": _rounded(quality.ssim_original, 5),
+        "lpips": _rounded(quality.lpips_photo, 5),
+        "original_lpips": _rounded(quality.original_lpips, 5),
+        "lpips_fidelity": _rounded(quality.lpips_original, 5),
+        "identical_views": quality.identical,
+        "worst": _view_json(worst) if worst else None,
+        "views": [_view_json(view) for view in quality.views],
+    }
+
+
+def _view_json(view: ViewQuality) -> dict[str, Any]:
+    return {
+        "name": view.name,
+        "drop": _rounded(view.drop),
+        "fidelity": _rounded(view.fidelity),
+        "psnr": _rounded(view.psnr),
+        "original_psnr": _rounded(view.original_psnr),
+        "ssim": _rounded(view.ssim_photo, 5),
+        "original_ssim": _rounded(view.original_ssim, 5),
+        "ssim_fidelity": _rounded(view.ssim_original, 5),
+        "lpips": _rounded(view.lpips_photo, 5),
+        "original_lpips": _rounded(view.original_lpips, 5),
+        "lpips_fidelity": _rounded(view.lpips_original, 5),
+        "mse": view.error,
+    }
+
+
+def _rounded(value: float | None, digits: int = 4) -> float | None:
+    return None if value is None else round(value, digits)

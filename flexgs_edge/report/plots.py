@@ -1,0 +1,416 @@
+"""Charts of experiments: what to draw as plain data, and the one place that draws it.
+
+matplotlib is an extra and is imported by `require_matplotlib` and `draw` alone. Colours are Okabe and Ito's, which people
+who confuse colours can tell apart, and every series has a mark of its own besides.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from flexgs_edge.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+INCHES, TALL, DPI = (7.2, 4.4), (7.2, 6.2), 144
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#A0A000")
+GREY, INK = "#7a7a7a", "#222222"
+SHORT = 8
+"""Letters up to which a note is centred over its point."""
+MARKS, OPEN_MARKS = ("o", "s", "^", "D", "v", "P", "<", ">"), ("*", "d")
+LINEAR_BELOW = 0.1
+LEVELS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+_STYLE: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e3e3e3",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+    # Same numbers, same bytes: ids in SVG files come from this word instead of chance.
+    "svg.hashsalt": "flexgs-edge",
+    # Text as outlines: a chart then looks the same wherever it is opened.
+    "svg.fonttype": "path",
+}
+
+
+@dataclass(frozen=True)
+class Series:
+    """Points of one kind; those without a y (None) are left out.
+
+    Parameters
+    ----------
+    label : str
+        In the legend.
+    x, y : sequence
+        As in the table.
+    line : bool
+        Join the points.
+    published : bool
+        Figures of the paper and not of this run: grey, open marks.
+    notes : sequence of str
+        Words beside the points.
+    broken : sequence of float
+        Where what is shown has broken: points that are crossed out, at the head of the chart if they have no y.
+    """
+
+    label: str
+    x: Sequence[float]
+    y: Sequence[float | None]
+    line: bool = True
+    published: bool = False
+    notes: Sequence[str] = ()
+    broken: Sequence[float] = ()
+
+
+@dataclass(frozen=True)
+class LineChart:
+    """Curves over a common axis.
+
+    Parameters
+    ----------
+    limit : float, optional
+        A level of y to mark, such as a target.
+    doublings : bool
+        x in powers of two.
+    megabytes : bool
+        x in MB, in logarithms.
+    magnitudes : bool
+        y in logarithms, linear from `LINEAR_BELOW` down through zero: losses below and far above 1 dB in one chart.
+    floating : bool
+        y need not start at zero: fidelities.
+    log_x, log_y : bool
+        Plain logarithms, such as of times; all values are above zero then.
+    front : sequence of (x, y)
+        Points that no other beats, joined by steps under the series.
+    upright : (x, str), optional
+        An x to mark, and words for it: a point without a y.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    series: tuple[Series, ...]
+    limit: float | None = None
+    doublings: bool = False
+    magnitudes: bool = False
+    megabytes: bool = False
+    floating: bool = False
+    log_x: bool = False
+    log_y: bool = False
+    front: Sequence[tuple[float, float]] = ()
+    upright: tuple[float, str] | None = None
+
+
+@dataclass(frozen=True)
+class BarChart:
+    """Bars from zero, grouped; a value is written at each.
+
+    Parameters
+    ----------
+    groups : sequence of str
+        Along the axis.
+    bars : dict
+        One value a group, by label.
+    limit : float, optional
+        A level to mark; bars that pass it get a cross.
+    """
+
+    title: str
+    y_label: str
+    groups: Sequence[str]
+    bars: dict[str, Sequence[float | None]]
+    digits: int = 2
+    limit: float | None = None
+
+
+@dataclass(frozen=True)
+class DotChart:
+    """Dots on a log axis, grouped, with words beside them: for values of many magnitudes, which bars would hide.
+
+    Parameters
+    ----------
+    groups : sequence of str
+        Along the axis.
+    dots : dict
+        One value a group, by label; those that are not above zero cannot be shown and stand at the foot as "none", those that
+        there are not (None) are left out.
+    words : dict
+        As `dots`, what is written beside each.
+    """
+
+    title: str
+    y_label: str
+    groups: Sequence[str]
+    dots: dict[str, Sequence[float | None]]
+    words: dict[str, Sequence[str]]
+
+
+@dataclass(frozen=True)
+class PlaneChart:
+    """A grid of cells over the two rates, with lines and points on it.
+
+    Parameters
+    ----------
+    cells : dict
+        Value by (x, y), the middles of the cells.
+    step : float
+        Side of a cell.
+    top : float
+        Values from here on share the last colour.
+    frontier : sequence of (x, y)
+        Where the limit lies.
+    marked : sequence of (x, y)
+        Cells with a dot: the paper's candidates.
+    path : sequence of (x, y)
+        Points in order; the last one is the answer.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    colour_label: str
+    cells: dict[tuple[float, float], float]
+    step: float
+    top: float
+    frontier: Sequence[tuple[float, float]]
+    frontier_label: str
+    marked: Sequence[tuple[float, float]]
+    path: Sequence[tuple[float, float]] = field(default=())
+    answer: tuple[float, float] | None = None
+
+
+Chart = LineChart | BarChart | DotChart | PlaneChart
+
+
+def require_matplotlib() -> None:
+    """Load matplotlib, or say how to get it: asked before any work starts."""
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            f"charts need matplotlib, which cannot be loaded here ({error}): pip install 'flexgs-edge[charts]'"
+        ) from error
+
+
+def picture(chart: Chart) -> tuple[bytes, bytes]:
+    """The chart as PNG and as SVG; the same chart gives the same bytes on the same machine."""
+    import matplotlib
+
+    png, svg = io.BytesIO(), io.BytesIO()
+    with matplotlib.rc_context(_STYLE):
+        figure = draw(chart)
+        figure.savefig(png, format="png", dpi=DPI, metadata={"Software": None})
+        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
+    return png.getvalue(), svg.getvalue()
+
+
+def draw(chart: Chart) -> Figure:
+    """The chart as a figure that nothing else holds on to (no pyplot: no windows, no state)."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=TALL if isinstance(chart, PlaneChart) else INCHES, layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_title(chart.title, loc="left")
+    if isinstance(chart, LineChart):
+        _lines(axes, chart)
+    elif isinstance(chart, BarChart):
+        _bars(axes, chart)
+    elif isinstance(chart, DotChart):
+        _dots(axes, chart)
+    else:
+        _plane(figure, axes, chart)
+    return figure
+
+
+def _lines(axes: Axes, chart: LineChart) -> None:
+    from matplotlib.patheffects import withStroke
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    own = others = 0
+    xs = [x for series in chart.series for x in series.x]
+    logarithmic = chart.megabytes or chart.log_x
+    scale = math.log2 if chart.doublings or logarithmic else float
+    middle = (scale(min(xs)) + scale(max(xs))) / 2
+    for series in chart.series:
+        points = [(x, y, i) for i, (x, y) in enumerate(zip(series.x, series.y)) if y is not None]
+        if series.published:
+            style: dict[str, Any] = {
+                "color": GREY,
+                "marker": OPEN_MARKS[others],
+                "markerfacecolor": "white",
+                "markersize": 9,
+            }
+            others += 1
+        else:
+            style = {"color": COLOURS[own], "marker": MARKS[own], "markersize": 5}
+            own += 1
+        axes.plot(
+            [x for x, _, _ in points],
+            [y for _, y, _ in points],
+            linestyle="-" if series.line else "",
+            linewidth=1.5,
+            label=series.label,
+            zorder=2 if series.published else 3,
+            clip_on=False,  # marks at zero are shown whole
+            **style,
+        )
+        for place in series.broken:
+            _cross(axes, place, next((y for x, y, _ in points if x == place), None), style["color"])
+        for x, y, i in points:
+            if series.notes:
+                words = series.notes[i]
+                # Long words go towards the middle, so that they do not leave the chart; white under all of them.
+                side = "center" if len(words) < SHORT else "right" if scale(x) > middle else "left"
+                note = axes.annotate(words, (x, y), (0, 6), textcoords="offset points", fontsize=8, ha=side, zorder=5)
+                note.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
+    if chart.limit is not None:
+        axes.axhline(chart.limit, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
+        axes.annotate(
+            f"{chart.limit:g} dB", (1, chart.limit), (-2, 2), ("axes fraction", "data"), "offset points", ha="right"
+        )
+    if chart.doublings:
+        axes.set_xscale("log", base=2)
+        axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}x")
+    if logarithmic:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+        axes.xaxis.set_minor_locator(NullLocator())
+    if chart.front:
+        steps: dict[str, Any] = {"color": INK, "linewidth": 1.0, "linestyle": (0, (2, 2)), "zorder": 1}
+        axes.step(*_split(sorted(chart.front)), where="post", label="Pareto front", **steps)
+    if chart.upright is not None:
+        at, words = chart.upright
+        axes.axvline(at, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
+        axes.annotate(
+            words, (at, 0.02), (-3, 0), ("data", "axes fraction"), "offset points", ha="right", rotation=90, fontsize=8
+        )
+    # Losses start at zero, or below where compression helped: no axis makes small ones look large.
+    shown = [y for series in chart.series for y in series.y if y is not None]
+    low, high = min(shown, default=0.0), max(shown, default=1.0)
+    if chart.limit is not None:
+        high = max(high, chart.limit)  # a mark outside the axes would leave them no room
+    if chart.magnitudes:
+        axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
+        axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)
+        axes.yaxis.set_minor_locator(NullLocator())
+    if chart.log_y:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
+        axes.yaxis.set_minor_locator(NullLocator())
+    elif not chart.floating:
+        axes.set_ylim(min(low * 1.1, 0.0), max(high, LINEAR_BELOW) * (1.4 if chart.magnitudes else 1.1))
+    axes.set_xlabel(chart.x_label)
+    axes.set_ylabel(chart.y_label + (", log above 0.1" if chart.magnitudes else ""))
+    if any(series.label for series in chart.series):
+        axes.legend()
+
+
+def _cross(axes: Axes, x: float, y: float | None, colour: str) -> None:
+    cross: dict[str, Any] = {"color": colour, "markersize": 13, "markeredgewidth": 2.2, "clip_on": False, "zorder": 6}
+    if y is None:
+        axes.plot([x], [0.98], "x", transform=axes.get_xaxis_transform(), **cross)
+    else:
+        axes.plot([x], [y], "x", **cross)
+
+
+def _dots(axes: Axes, chart: DotChart) -> None:
+    axes.set_yscale("log")
+    shown = [value for values in chart.dots.values() for value in values if value is not None and value > 0]
+    axes.set_ylim(min(shown, default=1.0) / 4, max(shown, default=1.0) * 4)
+    foot = axes.get_ylim()[0]
+    width = 0.5 / len(chart.dots)
+    for number, (label, values) in enumerate(chart.dots.items()):
+        x = [group + (number + 0.5) * width - 0.4 for group in range(len(chart.groups))]
+        points = [(at, value) for at, value in zip(x, values) if value is not None and value > 0]
+        axes.plot(*_split(points), MARKS[number], color=COLOURS[number], markersize=7, label=label)
+        for at, value, words in zip(x, values, chart.words[label]):
+            if value is None:
+                continue
+            place = (at, value) if value > 0 else (at, foot)
+            text = words if value > 0 else f"none: {words}"
+            axes.annotate(text, place, (6, 0), textcoords="offset points", va="center", fontsize=8)
+    axes.set_xticks(range(len(chart.groups)), chart.groups)
+    axes.set_xlim(-0.6, len(chart.groups) - 0.4)
+    axes.set_ylabel(chart.y_label)
+    axes.legend()
+
+
+def _bars(axes: Axes, chart: BarChart) -> None:
+    width = 0.8 / len(chart.bars)
+    for number, (label, values) in enumerate(chart.bars.items()):
+        left = [group - 0.4 + (number + 0.5) * width for group in range(len(chart.groups))]
+        shown = [value or 0.0 for value in values]
+        bars = axes.bar(left, shown, width * 0.94, color=COLOURS[number], label=label)
+        axes.bar_label(
+            bars,
+            [_bar_words(value, chart) for value in values],
+            padding=2,
+            fontsize=7.5,
+            color=INK,
+        )
+    axes.axhline(0.0, color=INK, linewidth=0.8)
+    if chart.limit is not None:
+        axes.axhline(chart.limit, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
+    axes.set_xticks(range(len(chart.groups)), chart.groups)
+    axes.grid(axis="x", visible=False)
+    axes.margins(y=0.12)
+    axes.set_ylabel(chart.y_label)
+    if len(chart.bars) > 1:
+        axes.legend()
+
+
+def _bar_words(value: float | None, chart: BarChart) -> str:
+    if value is None:
+        return "-"
+    beyond = chart.limit is not None and value > chart.limit
+    return ("\N{MULTIPLICATION SIGN}\n" if beyond else "") + f"{value:.{chart.digits}f}"
+
+
+def _plane(figure: Figure, axes: Axes, chart: PlaneChart) -> None:
+    from matplotlib import colormaps
+    from matplotlib.colors import Normalize
+    from matplotlib.patches import Rectangle
+
+    colours, scale = colormaps["cividis_r"], Normalize(0.0, chart.top)
+    half = chart.step / 2
+    for (x, y), value in chart.cells.items():
+        colour = colours(scale(value))
+        axes.add_patch(Rectangle((x - half, y - half), chart.step, chart.step, facecolor=colour, edgecolor="white"))
+        dark = sum(colour[:3]) < 1.5
+        axes.annotate(
+            f"{value:.2f}", (x, y - half * 0.75), ha="center", fontsize=6.5, color="white" if dark else INK, zorder=4
+        )
+    axes.plot(*_split(chart.marked), "o", color="white", markeredgecolor=INK, markersize=5, label="paper's candidates")
+    axes.plot(*_split(chart.frontier), "-", color=INK, linewidth=2.2, label=chart.frontier_label)
+    axes.plot(*_split(chart.path), "-", color=COLOURS[1], linewidth=1.0, marker=".", markersize=5, label="search")
+    if chart.answer is not None:
+        axes.plot(*chart.answer, "*", color=COLOURS[1], markeredgecolor="white", markersize=14, label="its answer")
+    xs, ys = [x for x, _ in chart.cells], [y for _, y in chart.cells]
+    axes.set_xlim(min(xs) - half, max(xs) + half)
+    axes.set_ylim(min(ys) - half, max(ys) + half)
+    axes.set_aspect("equal")
+    axes.grid(visible=False)
+    axes.set_xlabel(chart.x_label)
+    axes.set_ylabel(chart.y_label)
+    axes.legend(loc="upper right")
+    from matplotlib.cm import ScalarMappable
+
+    figure.colorbar(ScalarMappable(scale, colours), ax=axes, label=chart.colour_label, extend="max", shrink=0.85)
+
+
+def _split(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    return [x for x, _ in points], [y for _, y in points]

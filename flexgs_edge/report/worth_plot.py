@@ -1,0 +1,45 @@
+"""The picture of `info --errors`: what every channel of a file is worth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.files import atomic_write, check_writable
+from flexgs_edge.report.plots import DotChart, picture, require_matplotlib
+
+SUFFIXES = (".png", ".svg")
+
+
+def check_picture(path: str, force: bool) -> None:
+    """Raise `InputError` for a picture that could not be made: asked before any work."""
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise InputError(f"--picture {path}: expected a name that ends in {' or '.join(SUFFIXES)}")
+    require_matplotlib()
+    check_writable(path, force)
+
+
+def write_picture(found: dict[str, Any], path: str, force: bool) -> None:
+    """Draw what `pipeline.worth` found: a dot a change, its modelled drop, and the share of the bytes that it saves."""
+    png, svg = picture(worth_chart(found))
+    with atomic_write(path, force) as file:
+        file.write(png if Path(path).suffix.lower() == ".png" else svg)
+
+
+def worth_chart(found: dict[str, Any]) -> DotChart:
+    """The chart as plain data."""
+    changes, size = found["errors"]["changes"], found["size"]
+    groups = list(dict.fromkeys(item["channel"] for item in changes))
+    kinds = list(dict.fromkeys(item["change"] for item in changes))
+    by = {(item["channel"], item["change"]): item for item in changes}
+    return DotChart(
+        title=f"{Path(found['path']).name}: what each channel is worth, beside it the share of the bytes that it saves",
+        y_label="modelled drop, dB",
+        groups=groups,
+        dots={kind: [by[g, kind]["modelled_drop"] if (g, kind) in by else None for g in groups] for kind in kinds},
+        words={
+            kind: [f"{100 * by[g, kind]['bytes_saved'] / size:.1f} %" if (g, kind) in by else "" for g in groups]
+            for kind in kinds
+        },
+    )

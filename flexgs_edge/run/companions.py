@@ -1,0 +1,32 @@
+"""What lies beside a scene. Apart from `inputs`: `info` starts without the coder."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+from flexgs_edge.cameras.read import find_cameras
+from flexgs_edge.io.model_folder import Companions, find_companions
+
+LOG = logging.getLogger("flexgs_edge")
+
+
+def companions_of(path: str | Path) -> Companions:
+    """What lies beside the scene at `path`; logged, so that nobody wonders where cameras came from."""
+    found = find_companions(path)
+    if found.cameras is None:
+        folder = Path(path) if Path(path).is_dir() else Path(path).parent
+        found = replace(found, cameras=find_cameras(folder))
+    for what, place in (("cameras", found.cameras), ("photos", found.images)):
+        if place is not None:
+            LOG.info("found %s beside the scene: %s", what, place)
+    return found
+
+
+def merge_companions(first: Companions, second: Companions) -> Companions:
+    """Cameras and photos of one place (`first` where it has cameras), background and antialiasing of either."""
+    chosen = first if first.cameras is not None else second
+    white = first.white_background if first.white_background is not None else second.white_background
+    antialiased = first.antialiased if first.antialiased is not None else second.antialiased
+    return Companions(chosen.cameras, chosen.images, white, antialiased)

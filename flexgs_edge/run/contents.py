@@ -1,0 +1,122 @@
+"""What a `.fgs` holds, and whether every byte of it is whole."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge._version import __version__
+from flexgs_edge.codec.open_fgs import read_header
+from flexgs_edge.codec.sections import ChunkEntry
+from flexgs_edge.codec.v1.header import Header
+from flexgs_edge.codec.v2.channels import Channels, channel_parts
+from flexgs_edge.codec.v2.chunk_plan import Chunk
+from flexgs_edge.codec.v2.container import GridContainer, channel_bytes
+from flexgs_edge.codec.v2.header import GridHeader
+from flexgs_edge.codec.v2.walk import ChunkCodes
+from flexgs_edge.io.ply import inria_dtype
+from flexgs_edge.packed.quantize import array_bytes
+from flexgs_edge.scene.fields import FIELDS
+
+
+def contents(path: str | Path) -> dict[str, Any]:
+    """`info` of a `.fgs`.
+
+    The header is read; of version 2 a file that was cut is decoded, since entropy coding shares the bytes out.
+    """
+    place = Path(path)
+    header = read_header(place)
+    return _packed_info(place, header) if isinstance(header, Header) else _grid_info(place)
+
+
+def _packed_info(path: Path, header: Header) -> dict[str, Any]:
+    """A file of version 1: bit-packed arrays, whose bytes follow from the header."""
+    channels: dict[str, dict[str, Any]] = {}
+    for field in FIELDS:
+        rows, width, bits = header.rows(field.name), header.width(field.name), header.bits.of(field.name)
+        groups = header.groups[field.bits]
+        total = array_bytes(rows, width, bits, groups)
+        channels[field.bits] = {
+            "field": field.name,
+            "channels": width,
+            "rows": rows,
+            "bits": bits,
+            "groups": groups,
+            "range_bytes": 8 * width * groups,
+            "bytes": total,
+            "bytes_per_channel": total // width if width else 0,
+        }
+    return _fgs_record(path, header, 1, header.sh_count, channels)
+
+
+def _grid_info(path: Path) -> dict[str, Any]:
+    """A file of version 2: what each channel takes stands in its header, or is known once its symbols have been decoded."""
+    container = GridContainer(path)
+    header = container.header
+    known = header.channels or _decoded_channels(path, header)
+    layers = [{"rows": rows, "bytes": 0} for rows in header.layers]
+    for chunk, entry in zip(header.chunks(), container.read_table(), strict=True):
+        layers[chunk.layer]["bytes"] += entry.section.length
+    channels = {}
+    for name, total in zip(channel_parts(header.sh_degree), known.bytes, strict=True):
+        degree = int(name.split()[1]) if name.startswith("sh ") and name != "sh degree" else 0
+        rows = (header.count, *known.rows)[degree]
+        channels[name] = {
+            "rows": rows,
+            "step": header.steps["sh"][degree - 1] if degree else header.steps.get(name),
+            "bytes": total,
+            "bits_per_row": round(8 * total / rows, 3) if rows else None,
+            "bits_per_gaussian": round(8 * total / header.count, 3) if header.count else None,
+        }
+    return {
+        **_fgs_record(path, header, 2, known.rows[0] if known.rows else 0, channels),
+        "chroma": header.steps["chroma"],
+        "model_bytes": header.model.length,
+        "layers": layers,
+        "cut_from": header.cut_from,
+    }
+
+
+def _decoded_channels(path: Path, header: GridHeader) -> Channels:
+    """What a file does not say of itself, such as one that was cut."""
+    rows = np.zeros(header.sh_degree, np.int64)
+
+    def count(chunk: Chunk, entry: ChunkEntry, codes: ChunkCodes) -> None:
+        degrees = codes.base["sh degree"]
+        rows[:] += [int(np.count_nonzero(degrees > degree)) for degree in range(header.sh_degree)]
+
+    taken = channel_bytes(path, count)
+    return Channels.of(taken, rows.tolist())
+
+
+def _fgs_record(
+    path: Path, header: Header | GridHeader, version: int, sh_count: int, channels: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
+    """What files of both versions tell."""
+    size = os.stat(path).st_size
+    settings = dict(header.settings)
+    count, degree = settings.get("source_count"), settings.get("source_sh_degree")
+    known = isinstance(count, int) and isinstance(degree, int) and 0 <= degree <= 4
+    ply = count * inria_dtype(degree).itemsize if known and count is not None and degree is not None else None
+    return {
+        "program": f"flexgs-edge {__version__}",
+        "command": "info",
+        "path": os.fspath(path),
+        "format": "fgs",
+        "version": version,
+        "size": size,
+        "count": header.count,
+        "sh_count": sh_count,
+        "sh_degree": header.sh_degree,
+        "origin": list(header.origin),
+        "bits_per_gaussian": round(8 * size / header.count, 3) if header.count else None,
+        "source_ply_bytes": ply,
+        "ratio": round(ply / size, 4) if ply else None,
+        "channels": channels,
+        "overhead_bytes": size - sum(channel["bytes"] for channel in channels.values()),
+        "settings": settings,
+        "notes": [],
+    }

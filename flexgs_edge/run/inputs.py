@@ -1,0 +1,105 @@
+"""From paths to a checked scene: what was given, and what lies beside it."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from flexgs_edge.constants import DEFAULT_NEAR
+from flexgs_edge.io.model_folder import Companions
+from flexgs_edge.io.ply import inria_dtype
+from flexgs_edge.report.run_info import SceneInfo
+from flexgs_edge.run.open_scene import open_scene
+from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.scene.check import check_scene
+from flexgs_edge.scene.source import SceneSource
+
+Options = TypeVar("Options", bound=ViewOptions)
+
+LOG = logging.getLogger("flexgs_edge")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A checked scene and what its file says about drawing it.
+
+    Parameters
+    ----------
+    path : Path
+        As given.
+    source : SceneSource
+        Finite, not empty.
+    input_count : int
+        Gaussians in the file, before any were left out.
+    settings : dict
+        Of a `.fgs`; of other files what they say about drawing (`antialiased` in a `.spz`), mostly nothing.
+    """
+
+    path: Path
+    source: SceneSource
+    input_count: int
+    settings: dict[str, Any]
+
+    @property
+    def ply_bytes(self) -> int:
+        """Bytes of the scene's PLY as INRIA writes it, with normals (248 a Gaussian at SH degree 3)."""
+        return self.input_count * inria_dtype(self.source.sh_degree).itemsize
+
+    @property
+    def ply_bytes_without_normals(self) -> int:
+        """The same without the three normals that nobody reads."""
+        return self.ply_bytes - 12 * self.input_count
+
+
+def read_scene(path: str | Path, drop_invalid: bool = False) -> SceneSource:
+    """A checked scene from a scene file or a model folder: finite values, at least one Gaussian; read lazily."""
+    return load_scene(path, drop_invalid).source
+
+
+def load_scene(path: str | Path, drop_invalid: bool = False) -> Scene:
+    """Open a scene and check every value of it once (raises `InputError` for what cannot be used)."""
+    opened = open_scene(path)
+    settings = dict(getattr(opened, "settings", {}))
+    return Scene(Path(path), check_scene(opened, drop_invalid), opened.count, settings)
+
+
+def resolve_drawing(options: Options, scene: Scene, companions: Companions) -> Options:
+    """Options with all that drawing needs filled in: as given, else as the files say, else the defaults."""
+    stored = scene.settings
+    background = options.background
+    if background is None:
+        white = (1.0, 1.0, 1.0) if companions.white_background else (0.0, 0.0, 0.0)
+        background = _background(stored.get("background"), white)
+    near = options.near
+    if near is None:
+        found = stored.get("near")
+        near = float(found) if isinstance(found, (int, float)) and found > 0 else DEFAULT_NEAR
+    antialiased = options.antialiased
+    if antialiased is None:
+        found = stored.get("antialiased", companions.antialiased)
+        antialiased = found if isinstance(found, bool) else False
+        if antialiased:
+            LOG.info("drawn antialiased, as %s says", "the file" if "antialiased" in stored else "cfg_args")
+    extent = options.extent or stored.get("extent") or "exact"
+    return replace(options, near=near, background=background, extent=extent, antialiased=antialiased)
+
+
+def _background(value: object, default: tuple[float, float, float]) -> tuple[float, float, float]:
+    if isinstance(value, list) and len(value) == 3 and all(isinstance(v, (int, float)) and 0 <= v <= 1 for v in value):
+        return (float(value[0]), float(value[1]), float(value[2]))
+    return default
+
+
+def scene_info(scene: Scene) -> SceneInfo:
+    """The record of a scene."""
+    return SceneInfo(
+        path=os.fspath(scene.path),
+        count=scene.source.count,
+        sh_degree=scene.source.sh_degree,
+        ply_bytes=scene.ply_bytes,
+        ply_bytes_without_normals=scene.ply_bytes_without_normals,
+        notes=tuple(scene.source.notes),
+    )

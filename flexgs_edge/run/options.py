@@ -1,0 +1,306 @@
+"""The words of the command line as one record, checked before any work starts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from flexgs_edge.cameras.camera import split_views
+from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, MAX_VIEW_WIDTH
+from flexgs_edge.errors import InputError
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import REFINE_STEPS
+from flexgs_edge.goals.target import Judge, MaxDrop, MaxSize, MinFidelity, Target, WorstToo, min_ratio
+from flexgs_edge.packed.bitspec import PAPER, BitSpec
+
+NO_PHOTOS = "none"
+"""`--images none`: leave photos that lie beside the scene alone."""
+AUTO_CAMERAS = "auto"
+"""`--cameras auto`: views made from the scene itself."""
+NO_CAMERAS = "none"
+"""`--cameras none`: no views at all; only fixed rates work then."""
+METHODS = ("best", "paper")
+EFFORT_WORDS = (*REFINE_STEPS, "max")
+"""`max`, with a descent of all values, is for the best method and a `.fgs` only."""
+SELECTS = ("test", "train")
+LAYERS_MOST = 4
+DISTIL_MOST = 100_000
+"""Steps of a descent: hours on any machine, and no more is gained from a few thousand on."""
+DEFAULT_MAX_DROP = 1.0
+METHOD_ONLY: dict[str, tuple[str, object]] = {
+    "prune_rate": ("paper", None),
+    "sh_rate": ("paper", None),
+    "score": ("paper", "gs"),
+    "save_scores": ("paper", None),
+    "score_cache": ("paper", None),
+    "bits": ("paper", "paper"),
+    "groups": ("paper", None),
+    "unseen": ("best", "keep"),
+    "views_margin": ("best", False),
+    "refit": ("best", True),
+    "distil": ("best", None),
+    "layers": ("best", 1),
+    "scratch": ("best", None),
+    "resume": ("best", False),
+    "cluster": ("best", None),
+}
+"""Options that only one `--method` knows, with their defaults."""
+
+
+def check_method(method: str, given: Iterable[str]) -> None:
+    """Raise `InputError` for options that another method than `method` was meant by; none is ignored silently."""
+    for name in given:
+        other = METHOD_ONLY[name][0]
+        if other != method:
+            word = "[no-]refit" if name == "refit" else name.replace("_", "-")
+            raise InputError(
+                f"--{word} belongs to --method {other}, and this run is --method {method}: "
+                f"add --method {other}, or leave --{word} out"
+            )
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Where views come from and how they are drawn.
+
+    Parameters
+    ----------
+    cameras : str, optional
+        A camera file or a folder with one, `auto`, or `none`. Default: what lies beside the scene, else `auto`.
+    ignore_distortion : bool
+        Take the poses of distorted lenses, without photos.
+    images : str, optional
+        Folder of photos; `none` for no photos. Default: `images/` beside the scene.
+    holdout : int
+        Every holdout-th view by name is held out; 0 holds out none.
+    resolution : int
+        Wider views are scaled down to this many pixels.
+    near : float, optional
+        Near plane, scene units. Default: what a `.fgs` says, else 0.2.
+    background : tuple of float, optional
+        Red, green, blue in [0, 1]. Default: what a `.fgs` or `cfg_args` says, else black.
+    extent : str, optional
+        `exact` or `inria`. Default: what a `.fgs` says, else `exact`.
+    antialiased : bool, optional
+        Opacities compensated for the dilation. Default: what a `.fgs` or `cfg_args` says, else not.
+    drop_invalid : bool
+        Leave rows with NaN, infinity or zero quaternions out.
+    memory_limit : int, optional
+        Bytes for the whole process. Default: 3/4 of what is free.
+    device : str, optional
+        OpenCL device (number, part of its name, `cpu`, `gpu`) or `numpy`.
+    """
+
+    cameras: str | None = None
+    ignore_distortion: bool = False
+    images: str | None = None
+    holdout: int = DEFAULT_HOLDOUT
+    resolution: int = MAX_VIEW_WIDTH
+    near: float | None = None
+    background: tuple[float, float, float] | None = None
+    extent: str | None = None
+    antialiased: bool | None = None
+    drop_invalid: bool = False
+    memory_limit: int | None = None
+    device: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.resolution < 1:
+            raise InputError(f"--resolution {self.resolution}: expected a width of at least 1 pixel")
+        split_views(0, self.holdout)
+        if self.near is not None and not 0.0 < self.near < float("inf"):
+            raise InputError(f"--near {self.near:g}: expected a distance above 0 in scene units")
+        if self.background is not None and not all(0.0 <= c <= 1.0 for c in self.background):
+            raise InputError(f"--background {self.background}: expected red, green and blue from 0 to 1")
+
+
+@dataclass(frozen=True)
+class CompressOptions(ViewOptions):
+    """Everything that `compress` may be told, beside input and output.
+
+    Parameters
+    ----------
+    method : {"best", "paper"}
+        Measured costs, one multiplier and the real coder (the default), or the paper's method as it is.
+    select : {"test", "train"}
+        Views that decide where to stop: the held-out ones, or the training poses.
+    score : str
+        `gs`, `meson`, or a .npy/.npz file with one number a Gaussian (`paper`).
+    save_scores : str, optional
+        Write the scores here, .npy (`paper`).
+    score_cache : str, optional
+        Keep the scores here, and take them from here when they are of the same scene, poses and score (`paper`).
+    max_drop, min_fidelity : float, optional
+        Quality targets, dB.
+    max_worst_drop : float, optional
+        Drop that no deciding view may pass, beside a quality target, dB.
+    max_size : int, optional
+        Size target, bytes.
+    min_ratio : float, optional
+        Size target, PLY bytes / file bytes.
+    prune_rate, sh_rate : float, optional
+        Fixed rates from 0 to 1: no search (`paper`).
+    bits : str
+        Bits per attribute, `auto`, or `rtn4`, `rtn8`, ... (`paper`).
+    groups : int, optional
+        Quantization groups per channel (`paper`). Default: one for about 512 rows.
+    base_psnr : float
+        PSNR of the original against its photos that the modelled drop starts from, dB.
+    effort : {"fast", "balanced", "thorough", "max"}
+        Steps of the search; `max` distils as well (`best`, `.fgs`).
+    best_effort : bool
+        Write the closest point when the target cannot be met.
+    unseen : str
+        What becomes of Gaussians that no training pose sees (`best`): `keep`, `drop`, or the share that stays, such as `20%`.
+    views_margin : bool
+        Make three poses of every two given ones, nearer to what is seen, farther from it and in between, and score them too
+        (`best`).
+    refit : bool
+        Refit colours after pruning and quantizing (`best`).
+    distil : int, optional
+        Steps of the descent towards the original's renders, 0 for none (`best`, `.fgs`). Default: as the effort says.
+    layers : int
+        Layers that `trim` can cut the file at, 1 to 4 (`best`).
+    scratch : str, optional
+        Folder for scratch files of scenes that do not fit into memory (`best`). Default: the output's.
+    resume : bool
+        Keep every round of the search in the scratch folder until the run is done, and go on from the rounds of a run that was
+        cut short (`best`).
+    cluster : str, optional
+        Workers that draw what is scored and compared: the address of a Dask scheduler, or `local:N` (`best`).
+    report : str, optional
+        Folder for a page about the run (index.html) and its record (result.json).
+    dry_run : bool
+        Do everything but write.
+    force : bool
+        Overwrite files that exist.
+    """
+
+    method: str = "best"
+    select: str = "test"
+    score: str = "gs"
+    save_scores: str | None = None
+    score_cache: str | None = None
+    max_drop: float | None = None
+    min_fidelity: float | None = None
+    max_worst_drop: float | None = None
+    max_size: int | None = None
+    min_ratio: float | None = None
+    prune_rate: float | None = None
+    sh_rate: float | None = None
+    bits: str = "paper"
+    groups: int | None = None
+    base_psnr: float = DEFAULT_BASE_PSNR
+    effort: str = "balanced"
+    best_effort: bool = False
+    unseen: str = "keep"
+    views_margin: bool = False
+    refit: bool = True
+    distil: int | None = None
+    layers: int = 1
+    scratch: str | None = None
+    resume: bool = False
+    cluster: str | None = None
+    report: str | None = None
+    dry_run: bool = False
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for word, value, known in (
+            ("--method", self.method, METHODS),
+            ("--select", self.select, SELECTS),
+            ("--effort", self.effort, EFFORT_WORDS),
+        ):
+            if value not in known:
+                raise InputError(f"{word} {value!r}: expected one of {', '.join(known)}")
+        if not 0.0 < self.base_psnr < 200.0:
+            raise InputError(
+                f"--base-psnr {self.base_psnr:g}: expected decibels between 0 and 200 (most scenes: 22 to 36)"
+            )
+        if self.groups is not None and self.groups < 1:
+            raise InputError(f"--groups {self.groups}: expected 1 or more")
+        check_method(self.method, [name for name in METHOD_ONLY if getattr(self, name) != METHOD_ONLY[name][1]])
+        if self.effort == "max" and self.method != "best":
+            raise InputError(f"--effort max distils, which --method {self.method} does not: take --effort thorough")
+        if not self.refit and (self.distil or (self.effort == "max" and self.distil is None)):
+            word = f"--distil {self.distil}" if self.distil else "--effort max"
+            raise InputError(f"--no-refit with {word}: distilling is the larger refit; give one or the other")
+        if self.distil is not None and not 0 <= self.distil <= DISTIL_MOST:
+            raise InputError(f"--distil {self.distil}: expected 0 (none) to {DISTIL_MOST} steps")
+        if not 1 <= self.layers <= LAYERS_MOST:
+            raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
+        if self.score_cache is not None and self.score not in ("gs", "meson"):
+            raise InputError(f"--score-cache keeps scores that are computed: leave it out with --score {self.score}")
+        self._check_targets()
+        self.bit_spec()
+        _ = self.unseen_share
+
+    def _check_targets(self) -> None:
+        words = ("max_drop", "min_fidelity", "max_size", "min_ratio")
+        given = ["--" + word.replace("_", "-") for word in words if getattr(self, word) is not None]
+        if len(given) > 1:
+            raise InputError(f"{' and '.join(given)}: give one target")
+        if (self.prune_rate is None) != (self.sh_rate is None):
+            raise InputError("--prune-rate and --sh-rate: give both (fixed rates, no search) or none")
+        if self.fixed is not None and given:
+            raise InputError(
+                f"{given[0]} with --prune-rate and --sh-rate: fixed rates leave nothing to search; give one or the other"
+            )
+        sized = [word for word in given if word in ("--max-size", "--min-ratio")]
+        if self.max_worst_drop is not None and (sized or self.fixed is not None):
+            other = sized[0] if sized else "--prune-rate and --sh-rate"
+            raise InputError(
+                f"--max-worst-drop with {other}: it goes with --max-drop or --min-fidelity; leave one of them out"
+            )
+        self.target("drop", 1)
+
+    @property
+    def unseen_share(self) -> float:
+        """Share from 0 to 1 of the Gaussians that no pose sees that stays."""
+        word = self.unseen.strip().lower()
+        if word in ("keep", "drop"):
+            return float(word == "keep")
+        try:
+            share = float(word.removesuffix("%")) / 100 if word.endswith("%") else math.nan
+        except ValueError:
+            share = math.nan
+        if not 0.0 <= share <= 1.0:
+            raise InputError(f"--unseen {self.unseen}: expected keep, drop, or a share from 0% to 100%")
+        return share
+
+    @property
+    def fixed(self) -> Choice | None:
+        """The fixed rates, if they were given."""
+        if self.prune_rate is None or self.sh_rate is None:
+            return None
+        choice = Choice.from_rates(self.prune_rate, self.sh_rate)
+        if choice.prune == 1000:
+            raise InputError(f"--prune-rate {self.prune_rate:g}: expected less than 1: nothing would be left to draw")
+        return choice
+
+    def target(self, judge: Judge, ply_bytes: int) -> Target | None:
+        """The target; `judge` is the figure that decides on drops, `None` comes back for fixed rates."""
+        if self.fixed is not None:
+            return None
+        if self.max_size is not None:
+            return MaxSize(self.max_size, judge)
+        if self.min_ratio is not None:
+            return min_ratio(self.min_ratio, ply_bytes, judge)
+        drop = MaxDrop(DEFAULT_MAX_DROP if self.max_drop is None else self.max_drop, judge)
+        mean = drop if self.min_fidelity is None else MinFidelity(self.min_fidelity)
+        return mean if self.max_worst_drop is None else WorstToo(mean, self.max_worst_drop, judge)
+
+    def bit_spec(self) -> tuple[BitSpec | None, int | None]:
+        """Bits (`None`: to be searched) and groups that `--bits` and `--groups` ask for."""
+        words = self.bits.strip().lower()
+        if words == "auto":
+            return None, self.groups
+        if words == "paper":
+            return PAPER, self.groups
+        if words.startswith("rtn"):
+            if not words[3:].isdigit():
+                raise InputError(f"--bits {self.bits}: expected rtn and a number of bits, such as rtn8")
+            return BitSpec.rtn(int(words[3:])), 1 if self.groups is None else self.groups
+        return BitSpec.parse(self.bits), self.groups

@@ -1,0 +1,51 @@
+"""Files that `compress` writes: checked before any work, published only when they are whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.files import check_writable
+from flexgs_edge.io.converter import check_converter
+from flexgs_edge.io.formats import FORMATS, Format, format_of
+from flexgs_edge.run.options import CompressOptions
+
+
+def check_outputs(output: str | Path | None, options: CompressOptions) -> Path | None:
+    """The file to write (None in a dry run); raises `InputError` for what cannot be written."""
+    if options.save_scores is not None:
+        check_writable(options.save_scores, options.force)
+    if options.score_cache is not None:
+        check_writable(options.score_cache, force=True)
+    if options.dry_run:
+        return None
+    if output is None:
+        raise InputError("-o OUT.fgs is missing: give the file to write, or --dry-run")
+    if Path(output).suffix.lower() != ".fgs" and foreign_format(output, options) is None:
+        raise InputError(f"-o {output}: expected a name that ends in .fgs, {', '.join(FORMATS)}")
+    check_writable(output, options.force)
+    return Path(output)
+
+
+FORMAT_BITS = ("bits", "groups")
+"""Options that say what the format itself has settled."""
+
+
+def foreign_format(output: str | Path | None, options: CompressOptions) -> Format | None:
+    """The format that `-o` asks for, checked against the options before any work; None for `.fgs`."""
+    format = None if output is None else format_of(output)
+    if format is None:
+        return None
+    for name in FORMAT_BITS:
+        if getattr(options, name) != CompressOptions.__dataclass_fields__[name].default:
+            raise InputError(f"--{name}: {format.suffix} has precisions of its own; leave it out, or write a .fgs")
+    if options.distil or options.effort == "max":
+        word = f"--distil {options.distil}" if options.distil else "--effort max"
+        raise InputError(
+            f"{word}: distilling ends on the grid of a .fgs, {format.suffix} has its own; leave it out, or write a .fgs"
+        )
+    if options.layers > 1:
+        raise InputError(f"--layers {options.layers}: {format.suffix} has no layers; leave it out, or write a .fgs")
+    assert output is not None
+    check_converter(output)
+    return format

@@ -1,0 +1,127 @@
+"""Pictures and camera places for a report: a few views of the original and of the decoded scene, drawn and encoded."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.report.material import Rig, Shot
+from flexgs_edge.report.tones import error_map, ramp
+from flexgs_edge.run.judge import Judge
+from flexgs_edge.run.view_set import Views
+from flexgs_edge.scene.source import SceneSource
+
+MOST_SHOTS = 5
+"""Views with pictures: the worst, the median, the best, and one between each two."""
+MOST_WIDTH = 800
+"""Pictures are scaled down to this many pixels: twice a phone's, and a page of a few MB at most."""
+LAYERS = 4
+"""Pictures of a view: original, compressed, error map, photo."""
+PIXEL_BYTES = 1
+"""Bytes a pixel that an encoded picture is allowed for (measured: renders and smooth photos 0.2 to 0.4, pure noise 2.4)."""
+JPEG_QUALITY = 95
+"""The pictures shall differ by what compression did, not by JPEG: 51 dB at this quality, 46 at 90, for a third more bytes."""
+ERROR_QUALITY = 85
+MOST_POINTS = 1500
+"""Gaussians that stand for the scene in the plans of the cameras."""
+
+
+def shown_size(camera: Camera) -> tuple[int, int]:
+    """Width and height of a view's pictures."""
+    if camera.width <= MOST_WIDTH:
+        return camera.width, camera.height
+    return MOST_WIDTH, max(1, round(camera.height * MOST_WIDTH / camera.width))
+
+
+def shots_bytes(cameras: Sequence[Camera]) -> int:
+    """Most bytes that the pictures of these views take, encoded."""
+    sizes = sorted((width * height for width, height in map(shown_size, cameras)), reverse=True)
+    return LAYERS * PIXEL_BYTES * sum(sizes[:MOST_SHOTS])
+
+
+def chosen_ranks(count: int) -> list[int]:
+    """Places, from the worst view on, of the views that are shown.
+
+    >>> chosen_ranks(10), chosen_ranks(2), chosen_ranks(0)
+    ([0, 2, 4, 6, 9], [0, 1], [])
+    """
+    most = min(count, MOST_SHOTS)
+    return [i * (count - 1) // max(most - 1, 1) for i in range(most)]
+
+
+def draw_shots(judge: Judge, scene: DeviceScene, quality: Quality, progress: Progress = SILENT) -> tuple[Shot, ...]:
+    """Pictures of some views, the worst first.
+
+    Parameters
+    ----------
+    judge : Judge
+        What measured `quality`; works in the memory that it holds for comparing views.
+    scene : DeviceScene
+        The decoded scene.
+    """
+    order = quality.by_loss
+    ranks = chosen_ranks(len(order))
+    shots = []
+    for rank in progress.track(ranks, "drawing pictures", len(ranks)):
+        view = order[rank]
+        image, original, photo = judge.images(scene, view)
+        width, height = shown_size(judge.cameras[view])
+        shots.append(
+            Shot(
+                view=view,
+                camera=judge.indices[view],
+                rank=rank,
+                of=len(order),
+                width=width,
+                height=height,
+                original=encode(original, (width, height)),
+                compressed=encode(image, (width, height)),
+                error=encode_error(image, original, (width, height)),
+                photo=None if photo is None else encode(photo, (width, height)),
+            )
+        )
+    return tuple(shots)
+
+
+def encode(image: np.ndarray, size: tuple[int, int], quality: int = JPEG_QUALITY) -> bytes:
+    """JPEG of [H, W, 3] f32 in [0, 1], scaled down to `size` by area; colours keep their full resolution."""
+    from PIL import Image
+
+    pixels = np.rint(np.clip(image, 0.0, 1.0) * np.float32(255.0)).astype(np.uint8)
+    picture = Image.fromarray(np.ascontiguousarray(pixels))
+    if picture.size != size:
+        picture = picture.resize(size, Image.Resampling.BOX)
+    out = io.BytesIO()
+    picture.save(out, "JPEG", quality=quality, subsampling=0)
+    return out.getvalue()
+
+
+def encode_error(image: np.ndarray, original: np.ndarray, size: tuple[int, int]) -> bytes:
+    """JPEG of the error map between two renders; errors are averaged where it is scaled down, not the pictures."""
+    from PIL import Image
+
+    errors = error_map(image, original)
+    if errors.shape != size[::-1]:
+        errors = np.asarray(Image.fromarray(np.ascontiguousarray(errors)).resize(size, Image.Resampling.BOX))
+    return encode(ramp()[np.rint(errors * 255.0).astype(np.uint8)] / np.float32(255.0), size, ERROR_QUALITY)
+
+
+def rig_of(views: Views, source: SceneSource) -> Rig:
+    """Where the cameras stand, and some of the scene's Gaussians (evenly spaced rows: the same ones every time)."""
+    cameras = views.cameras
+    rows = np.unique(np.linspace(0, source.count - 1, min(source.count, MOST_POINTS)).astype(np.int64))
+    means = source.read(rows, ["means"])["means"]
+    return Rig(
+        names=tuple(camera.name for camera in cameras),
+        centers=np.stack([camera.center for camera in cameras]),
+        rotations=np.stack([camera.rotation for camera in cameras]),
+        reach=np.array([(camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)) for camera in cameras]),
+        held_out=frozenset(views.held_out),
+        points=means.T.astype(np.float64) + source.origin,
+    )

@@ -1,0 +1,87 @@
+"""What a run of `compress` needs, decided before any work, and what its file will say about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.target import Judge, Target
+from flexgs_edge.run.inputs import Scene
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.view_set import WITHOUT_VIEWS, Views
+
+EVERYTHING = Choice(0, 0)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run needs, decided before any work.
+
+    `decide` and `report` are the views that decide where to stop and that the final figures come from: the held-out ones,
+    unless the training poses were asked to decide (then the held-out ones, which decided nothing, still report).
+    """
+
+    decide: list[int]
+    report: list[int]
+    judge: Judge
+    target: Target | None
+    needs_scores: bool
+    computes_scores: bool
+
+    @classmethod
+    def make(cls, options: CompressOptions, scene: Scene, views: Views | None) -> Plan:
+        fixed = options.fixed
+        needs_scores = fixed != EVERYTHING and options.method == "paper"
+        computes = needs_scores and options.score in ("gs", "meson")
+        bits, _ = options.bit_spec()
+        if views is None:
+            if options.method != "paper":
+                raise InputError(
+                    f"{WITHOUT_VIEWS}. Views are needed to measure what each Gaussian is worth; without them only "
+                    "--method paper with fixed rates works"
+                )
+            if fixed is None or computes or bits is None:
+                why = (
+                    "to score Gaussians and to judge the result"
+                    if fixed is None or bits is None
+                    else "to score Gaussians"
+                )
+                raise InputError(
+                    f"{WITHOUT_VIEWS}. Views are needed {why}; without them only fixed rates work: "
+                    "--prune-rate and --sh-rate with --score FILE, or both rates 0"
+                )
+            return cls([], [], "modelled drop", None, needs_scores, False)
+        if options.select == "test" and not views.held_out:
+            raise InputError(
+                "--holdout 0 leaves no view to decide on: use --select train as well, or another --holdout"
+            )
+        if not views.train and (options.method != "paper" or computes or bits is None or options.select == "train"):
+            raise InputError(
+                f"{views.cameras_from}: {len(views.cameras)} views, all of them held out (every {options.holdout}th by name): "
+                "give more views, or --holdout 0 --select train"
+            )
+        on_train = options.select == "train"
+        judge: Judge = "drop" if views.photos is not None and not on_train else "modelled drop"
+        return cls(
+            decide=views.train if on_train else views.held_out,
+            report=views.held_out or views.train,
+            judge=judge,
+            target=options.target(judge, scene.ply_bytes),
+            needs_scores=needs_scores,
+            computes_scores=computes,
+        )
+
+    @property
+    def decided_by(self) -> str | None:
+        """The figure that decides: `drop`, `modelled drop`, `fidelity` or `size`; `None` for fixed rates."""
+        if self.target is None:
+            return None
+        return "size" if self.target.limit_bytes is not None else self.target.judge
+
+    @staticmethod
+    def kind_of(indices: list[int], views: Views | None) -> str:
+        """`held-out`, `training` or `none`."""
+        if not indices or views is None:
+            return "none"
+        return "held-out" if indices == views.held_out else "training"

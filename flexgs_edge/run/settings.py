@@ -1,0 +1,58 @@
+"""What a `.fgs` file says about its making."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flexgs_edge._version import __version__
+from flexgs_edge.goals.steps import SearchResult
+from flexgs_edge.goals.target import Measurement
+from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.run.inputs import Scene
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.plan import Plan
+from flexgs_edge.run.view_set import Views
+
+
+def make_settings(
+    options: CompressOptions,
+    plan: Plan,
+    scene: Scene,
+    views: Views | None,
+    search: SearchResult | None,
+    bits: BitSpec | None,
+) -> dict[str, Any]:
+    """What the file says about its making: the same for every run and machine, so no times, paths or devices."""
+    choice = search.chosen.choice if search else options.fixed
+    assert choice is not None and options.background is not None
+    found = search.chosen.measurement if search else None
+    return {
+        "program": f"flexgs-edge {__version__}",
+        "method": options.method,
+        "score": None if not plan.needs_scores else options.score if plan.computes_scores else "file",
+        "prune_rate": choice.prune / 1000,
+        "sh_rate": choice.sh / 1000,
+        "bits": None if bits is None else options.bits if options.bits in ("auto", "paper") else str(bits),
+        "source_count": scene.input_count,
+        "source_sh_degree": scene.source.sh_degree,
+        "target": plan.target.describe() if plan.target else None,
+        "decided_by": plan.decided_by,
+        "reached": search.reached if search and plan.target else None,
+        "select": options.select if views else None,
+        "holdout": options.holdout if views else None,
+        "views": len(views.cameras) if views else 0,
+        "effort": options.effort if plan.target else None,
+        **({} if options.distil is None else {"distil": options.distil}),
+        "base_psnr": options.base_psnr,
+        "quality": {
+            name: None if value is None else round(value, 3) for name, value in (_means(found) if found else {}).items()
+        },
+        "near": options.near,
+        "background": list(options.background),
+        "extent": options.extent,
+        "antialiased": options.antialiased,
+    }
+
+
+def _means(found: Measurement) -> dict[str, float | None]:
+    return {"drop": found.drop, "fidelity": found.fidelity, "modelled_drop": found.modelled_drop}

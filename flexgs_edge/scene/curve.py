@@ -1,0 +1,47 @@
+"""The Morton curve: near on it is near in space."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexgs_edge.memory.ordered import stable_order
+from flexgs_edge.memory.rows import blocks, put_rows, read_rows
+from flexgs_edge.memory.storage import MEMORY, Room
+
+
+def morton(cells: np.ndarray) -> np.ndarray:
+    """[n] u64 index on the Morton curve of `cells` ([3, n], 0 to 2^21 - 1): x has the highest bit of each three.
+
+    >>> morton(np.array([[1, 0], [0, 0], [0, 3]])).tolist()
+    [4, 9]
+    """
+    x, y, z = (_spread(axis.astype(np.uint64)) for axis in cells)
+    index: np.ndarray = x << np.uint64(2) | y << np.uint64(1) | z
+    return index
+
+
+def near_rows(means: np.ndarray, room: Room = MEMORY) -> np.ndarray:
+    """[n] i64: rows of `means` ([3, n]) along a Morton curve, so that neighbours on it are near each other."""
+    # By rank along each axis: a few far rows do not squeeze the rest into one cell.
+    count = means.shape[1]
+    cells, index = room.empty(means.shape, np.int16), room.empty((count,), np.uint64)
+    for line, ranks in zip(means, cells, strict=True):
+        order = stable_order(line, room)
+        for part in blocks(count):
+            ranks[order[part]] = np.arange(part.start, part.stop) * 1024 // count
+    for part in blocks(count):
+        put_rows(index, part, morton(read_rows(cells, part)))
+    return stable_order(index, room)
+
+
+def _spread(bits: np.ndarray) -> np.ndarray:
+    """Two zero bits before every bit of a number of 21 bits."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
+    return bits

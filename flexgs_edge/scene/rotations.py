@@ -1,0 +1,121 @@
+"""The 24 equal forms of a Gaussian, and the one of them that turns least."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexgs_edge.errors import InputError
+
+
+def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same covariances with axes renamed so that every rotation is as close to none as it can be.
+
+    A Gaussian stays the same when its axes change places or direction: q becomes q p with p one of the 24 rotations of
+    the cube, and the scales follow. The largest |w| among the 24 is the largest of: the largest component; the two
+    largest over sqrt(2); all four over 2. Float64, basic operations and sqrt only.
+
+    Parameters
+    ----------
+    quats : np.ndarray
+        [4, n], w x y z, any norm but zero.
+    log_scales : np.ndarray
+        [3, n].
+
+    Returns
+    -------
+    tuple of np.ndarray
+        Unit quaternions [4, n] f64 with w >= |x|, |y|, |z|, and their log-scales [3, n] in the input's dtype.
+    """
+    wide = np.asarray(quats, np.float64)
+    largest = np.abs(wide).max(axis=0, initial=0)
+    bad = np.flatnonzero(~((largest > 0) & np.isfinite(largest)))
+    if len(bad):
+        raise InputError(f"quats: {len(bad)} quaternions have no direction: use --drop-invalid")
+    wide = wide / largest  # their squares cannot overflow
+    square = wide * wide
+    norm = np.sqrt((square[0] + square[1]) + (square[2] + square[3]))
+    wide /= norm
+    best = _nearest_cube_rotation(wide)
+    turned = _times_conjugate(wide, best)
+    return turned * np.where(turned[0] < 0, -1.0, 1.0), np.take_along_axis(log_scales, _axes(best), axis=0)
+
+
+def turned(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """[3, n] f64: vectors ([3, n]) turned by quaternions ([4, n], any norm but zero)."""
+    wide = np.asarray(quats, np.float64)
+    w, axis = wide[0], wide[1:]
+    across = 2 * np.cross(axis, vectors, axis=0) / (wide * wide).sum(axis=0)
+    result: np.ndarray = vectors + w * across + np.cross(axis, across, axis=0)
+    return result
+
+
+def tilted(quats: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """[4, n] f64: unit quaternions ([4, n]) after small turns about their own axes, `errors` [3, n] the turns' vector parts."""
+    unit = np.asarray(quats, np.float64)
+    unit = unit / np.sqrt((unit * unit).sum(axis=0))
+    return _times_conjugate(unit, np.stack([np.sqrt(1 - (errors * errors).sum(axis=0)), *-errors]))
+
+
+def _nearest_cube_rotation(quats: np.ndarray) -> np.ndarray:
+    """[4, n] f64: the cube's rotation u with the largest product u . q."""
+    size = np.abs(quats)
+    sign = np.where(quats < 0, -1.0, 1.0)
+    places = np.argsort(-size, axis=0, kind="stable")
+    ordered = np.take_along_axis(size, places, axis=0)
+    half = np.sqrt(0.5)
+    one, two = ordered[0], (ordered[0] + ordered[1]) * half
+    four = ((ordered[0] + ordered[1]) + (ordered[2] + ordered[3])) * 0.5
+    weights = np.zeros_like(quats)
+    np.put_along_axis(weights, places[:1], 1.0, axis=0)
+    pairs = (two > one) & (two >= four)
+    pair_weights = np.zeros_like(quats)
+    np.put_along_axis(pair_weights, places[:2], half, axis=0)
+    weights[:, pairs] = pair_weights[:, pairs]
+    weights[:, (four > one) & (four > two)] = 0.5
+    nearest: np.ndarray = weights * sign
+    return nearest
+
+
+def _times_conjugate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Product of `a` and the conjugate of `b`, [4, n] each."""
+    w, x, y, z = a
+    bw, bx, by, bz = b[0], -b[1], -b[2], -b[3]
+    return np.stack(
+        [
+            (w * bw - x * bx) - (y * by + z * bz),
+            (w * bx + x * bw) + (y * bz - z * by),
+            (w * by - x * bz) + (y * bw + z * bx),
+            (w * bz + x * by) - (y * bx - z * bw),
+        ]
+    )
+
+
+def _axes(quats: np.ndarray) -> np.ndarray:
+    """[3, n]: the old axis that each new axis is, for rotations of the cube conjugated."""
+    w, x, y, z = quats[0], -quats[1], -quats[2], -quats[3]
+    columns = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.argmax(np.abs(np.stack(column)), axis=0) for column in columns])
+
+
+def normalize_quats(quats: np.ndarray) -> np.ndarray:
+    """Unit quaternions with w >= 0, the form that is coded.
+
+    q / sqrt((w^2 + x^2) + (y^2 + z^2)) in float64, all four negated where w < 0, rounded to float32 once.
+
+    Parameters
+    ----------
+    quats : np.ndarray
+        [4, n] f32, w x y z, none of them zero.
+    """
+    wide = quats.astype(np.float64)
+    square = wide * wide
+    norm = np.sqrt((square[0] + square[1]) + (square[2] + square[3]))
+    zero = np.flatnonzero(norm == 0)
+    if len(zero):
+        raise InputError(f"quats: {len(zero)} quaternions are zero and have no direction: use --drop-invalid")
+    wide /= np.where(wide[0] < 0, -norm, norm)
+    return wide.astype(np.float32)

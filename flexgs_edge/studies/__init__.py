@@ -1,0 +1,1 @@
+"""Experiments on a user's own scenes, as tables, charts and one page."""

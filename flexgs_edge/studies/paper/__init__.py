@@ -1,0 +1,1 @@
+"""`study paper`: the tables and figures of FlexGaussian."""

@@ -1,0 +1,131 @@
+"""`study paper`: the FlexGaussian paper's evaluation, made again on any scene."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from flexgs_edge._version import __version__
+from flexgs_edge.errors import InputError
+from flexgs_edge.files import atomic_folder, check_folder
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.report.plots import require_matplotlib
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.studies.experiment import Experiment
+from flexgs_edge.studies.page import study_page
+from flexgs_edge.studies.paper import pruning, quantization, whole
+from flexgs_edge.studies.study_scene import Bench, open_bench, scene_names
+from flexgs_edge.studies.written import SceneStudy, write_scene
+
+LOG = logging.getLogger("flexgs_edge")
+
+EXPERIMENTS: tuple[Callable[[Bench], Experiment], ...] = (
+    quantization.rtn,
+    quantization.attributes,
+    pruning.splits,
+    pruning.plane,
+    whole.parts,
+    quantization.groups,
+    pruning.scores,
+    whole.rates,
+    whole.times,
+)
+
+
+@dataclass(frozen=True)
+class PaperStudy:
+    """What `study paper` found and wrote."""
+
+    output: str
+    scenes: tuple[SceneStudy, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {
+            "program": f"flexgs-edge {__version__}",
+            "command": "study paper",
+            "output": self.output,
+            "scenes": [scene.to_json() for scene in self.scenes],
+        }
+
+    def to_text(self) -> str:
+        """The findings, for people."""
+        lines = [line for scene in self.scenes for line in scene.to_lines()]
+        return "\n".join([*lines, f"wrote {os.path.join(self.output, 'index.html')}"]) + "\n"
+
+
+def study_paper(
+    scenes: Sequence[str | Path],
+    output: str | Path,
+    options: CompressOptions | None = None,
+    progress: Progress = SILENT,
+    **words: Any,
+) -> PaperStudy:
+    """Make the paper's experiments on every scene and write them to a folder.
+
+    Parameters
+    ----------
+    scenes : sequence of path
+        `.ply`, `.fgs` or model folders, one or more.
+    output : path
+        Folder of the results: index.html, and a folder a scene with <experiment>.csv, .json, .png and .svg. It appears when
+        everything is done; `force` lets it replace files of these names in a folder that is there.
+    options : CompressOptions, optional
+        Views, drawing, memory and device as for `compress`; `max_drop` and `effort` are the search's.
+    progress : Progress, optional
+        Bars on long work.
+    **words
+        Single options by the names of `CompressOptions`.
+
+    Raises
+    ------
+    FlexGSError
+        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
+    """
+    options = replace(options or CompressOptions(), **{**words, "method": "paper"})
+    if not scenes:
+        raise InputError("no scene: give one or more .ply, .fgs or model folders")
+    # Loaded before the memory is planned, so that its bytes count as taken.
+    require_matplotlib()
+    check_folder(output, options.force)
+    with atomic_folder(output, options.force) as folder:
+        names = scene_names(scenes)
+        found = [_study_scene(path, name, options, progress) for path, name in zip(scenes, names)]
+        _write(folder, found)
+    LOG.info("wrote %s", Path(output) / "index.html")
+    return PaperStudy(os.fspath(output), tuple(found))
+
+
+def _study_scene(path: str | Path, name: str, options: CompressOptions, progress: Progress) -> SceneStudy:
+    with open_bench(path, name, options, progress, scores=("gs", "meson")) as bench:
+        # First: several experiments build on its answer, and its steps must be measured and not remembered.
+        LOG.info("%s: searching for %s", name, bench.target.describe())
+        chosen = bench.search.chosen
+        LOG.info("%s: prune %g, SH %g", name, chosen.choice.prune / 1000, chosen.choice.sh / 1000)
+        experiments = []
+        for number, make in enumerate(EXPERIMENTS, 1):
+            started = time.perf_counter()
+            LOG.info("%s: experiment %d of %d, %s", name, number, len(EXPERIMENTS), make.__name__)
+            experiments.append(make(bench))
+            LOG.info("%s: %s: %.1f s", name, experiments[-1].key, time.perf_counter() - started)
+        return SceneStudy.of(bench, experiments)
+
+
+def _write(folder: Path, scenes: Sequence[SceneStudy]) -> None:
+    sections = []
+    for scene in scenes:
+        place = folder / scene.name
+        place.mkdir()
+        sections.append(write_scene(place, scene))
+    intro = (
+        "The experiments of the FlexGaussian paper (Tian et al., ACM MM 2025), made again by flexgs-edge with its own programs, "
+        "containers and quality figures. Sizes are bytes of the finished file; ratios are to the PLY as INRIA writes it. The "
+        "paper's figures are means over its own scenes: beside one scene they give the order of magnitude."
+    )
+    page = study_page("The paper's evaluation", intro, sections)
+    (folder / "index.html").write_text(page, encoding="utf-8")

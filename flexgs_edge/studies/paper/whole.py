@@ -1,0 +1,247 @@
+"""Experiments on the whole method: its parts alone, rate and distortion, time and memory."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import MAX_PRUNE
+from flexgs_edge.goals.target import Measurement, min_ratio
+from flexgs_edge.memory.process import peak_rss
+from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows
+from flexgs_edge.report.plots import BarChart, LineChart, Series
+from flexgs_edge.run.judge import measurement_of
+from flexgs_edge.run.plan import EVERYTHING
+from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
+from flexgs_edge.studies.experiment import Beside, Experiment
+from flexgs_edge.studies.paper.pruning import RATES
+from flexgs_edge.studies.result_tables import Cell, Table, columns
+from flexgs_edge.studies.study_scene import FIGURES, Bench, Setting
+
+RATIOS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
+STRONGEST = Choice(MAX_PRUNE, 1000 - MAX_PRUNE)
+"""The end of what the search may choose."""
+PAPER_MEANS = ([100 / (100 - saved) for saved in (94.9, 96.1, 96.4)], [0.87, 0.86, 0.85])
+"""Ratio and drop on Mip-NeRF360, Tanks&Temples and Deep Blending."""
+REPEATS = 5
+"""Times that a step's parts are measured; the median is shown."""
+PAPER_STEP = {"prune": 0.22, "quantize": 0.84, "dequantize": 0.32, "render and compare": 0.18}
+"""Seconds of the parts of a search step on the paper's RTX 3090; its rendering covers 32 views."""
+PAPER_STEP_ALL = 1.56
+"""The same for the whole step."""
+
+
+class Unquantized(SceneSource):
+    """What ADP leaves of a scene, as float32: some rows, of which the first `sh_count` keep their SH."""
+
+    def __init__(self, parent: SceneSource, with_sh: np.ndarray, without_sh: np.ndarray) -> None:
+        self._rows = SelectSource(parent, np.concatenate([with_sh, without_sh]))
+        self.name, self.origin, self.notes = parent.name, parent.origin, parent.notes
+        self.count, self.sh_count = self._rows.count, len(with_sh) if parent.sh_degree else 0
+        self.sh_degree = parent.sh_degree
+
+    @property
+    def value_bytes(self) -> int:
+        """4 bytes for every value that is left: what a file of plain float32 arrays holds."""
+        per_row = sum(self.width(name) for name in ("means", "sh_dc", "opacity_logits", "log_scales", "quats"))
+        return 4 * (self.count * per_row + self.sh_count * self.width("sh_rest"))
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`."""
+        rows, planes = self.begin_read(rows, fields, out)
+        self._rows.read(rows, fields, planes)
+        if "sh_rest" in planes:
+            index = np.arange(rows.start, rows.stop) if isinstance(rows, slice) else rows
+            planes["sh_rest"][:, index >= self.sh_count] = 0.0
+        return planes
+
+
+def parts(bench: Bench) -> Experiment:
+    """ADP only, MPQ only, and both, at the choice of the search."""
+    choice = bench.search.chosen.choice
+    pruned = _pruned(bench, choice)
+    with bench.workspace.renderer.load(pruned) as scene:
+        alone = measurement_of(bench.judge.compare(scene))
+    quantized, both = bench.points([Setting(), Setting(choice)], "parts")
+    none = Measurement(0.0 if bench.plan.judge == "drop" else None, None, 0.0)
+    source = bench.scene.source
+    whole = (
+        4
+        * source.count
+        * sum(source.width(name) for name in ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats"))
+    )
+    rows: list[dict[str, Cell]] = [
+        {"method": "float32 values", **bench.figures(whole, none)},
+        {"method": "ADP only", **bench.figures(pruned.value_bytes, alone)},
+        {"method": "MPQ only", **bench.cells(quantized)},
+        {"method": "ADP and MPQ", **bench.cells(both)},
+    ]
+    table = Table(columns(method="method", **FIGURES), tuple(rows))
+    figure = bench.figure
+    losses = [float(row[figure] or 0.0) for row in rows]
+    words = [f"{row['method']}: {row['ratio']:.1f}x, {loss:.2f} dB" for row, loss in zip(rows, losses)]
+    return Experiment(
+        "parts",
+        "Pruning only, quantization only, both",
+        f"p = {choice.prune / 1000:g}, s = {choice.sh / 1000:g} (the search's choice) and the paper's bits. Without MPQ the "
+        "bytes are 4 for every float32 value that is left, without normals and header; ratios are to the PLY with its normals.",
+        table,
+        LineChart(
+            "What pruning, quantization and both cost",
+            "ratio to the PLY",
+            FIGURES[figure],
+            (Series("", table.values("ratio"), table.values(figure), line=False, notes=words),),
+            doublings=True,
+        ),
+        (
+            f"ADP only: {rows[1]['ratio']}x at {losses[1]:.3f} dB; MPQ only: {rows[2]['ratio']}x at {losses[2]:.3f} dB; both: "
+            f"{rows[3]['ratio']}x at {losses[3]:.3f} dB, where the two alone add up to {losses[1] + losses[2]:.3f} dB.",
+        ),
+    )
+
+
+def _pruned(bench: Bench, choice: Choice) -> Unquantized:
+    return Unquantized(bench.scene.source, *select_rows(ranks_from_order(bench.orders["gs"]), choice, bench.has_sh))
+
+
+def rates(bench: Bench) -> Experiment:
+    """The best that the method finds at sizes from 8 to 256 times below the PLY's, and where it ends."""
+    rows: list[dict[str, Cell]] = [_rate_row(bench, "least", None, EVERYTHING)]
+    ply = bench.scene.ply_bytes
+    for ratio in bench.progress.track(RATIOS, "rates", len(RATIOS)):
+        if bench.size(Setting(EVERYTHING)) <= ply / ratio:
+            continue  # the bits alone are past it: the row "least" says so
+        found = bench.adapt(min_ratio(float(ratio), ply, bench.plan.judge))
+        if found.reached:
+            rows.append(_rate_row(bench, "search", ratio, found.chosen.choice))
+    rows.append(_rate_row(bench, "most", None, STRONGEST))
+    heads = columns(kind="kind", wanted_ratio="ratio wanted", **RATES, **FIGURES)
+    table = Table(heads, tuple(rows))
+    figure = bench.figure
+    reached = table.values("wanted_ratio", kind="search")
+    low, high = rows[0], rows[-1]
+    missing = [ratio for ratio in RATIOS if ratio not in reached]
+    ends = ["nothing pruned", *[""] * (len(rows) - 2), "end of the range"]
+    return Experiment(
+        "rates",
+        "Rate and distortion from 8x to 256x",
+        "For each ratio the search for the best quality in that size, at the paper's bits and with the rates alone to choose. "
+        f"least: nothing pruned; most: the end of the search's range, p = {STRONGEST.prune / 1000:g} and no SH.",
+        table,
+        LineChart(
+            "Rate and distortion",
+            "ratio to the PLY",
+            FIGURES[figure],
+            (
+                Series("here", table.values("ratio"), table.values(figure), notes=ends),
+                Series("the paper's curve: its two ends", [8.0, 256.0], [0.05, 9.0], line=False, published=True),
+                Series("the paper's means of three data sets", *PAPER_MEANS, line=False, published=True),
+            ),
+            limit=getattr(bench.target, "limit", None),
+            doublings=True,
+            magnitudes=True,
+        ),
+        (
+            f"The method reaches from {low['ratio']}x ({low[figure]:.3f} dB, nothing pruned) to {high['ratio']}x "
+            f"({high[figure]:.3f} dB); not reached: {', '.join(f'{ratio}x' for ratio in missing) or 'none of those asked for'}.",
+        ),
+        tuple(
+            Beside(
+                f"loss where {ratio}x is asked for",
+                f"{table.values(figure, wanted_ratio=ratio)[0]:.2f} dB at {table.values('ratio', wanted_ratio=ratio)[0]:.0f}x",
+                paper,
+            )
+            for ratio, paper in ((8, "0.05 dB"), (256, "9 dB"))
+            if ratio in reached
+        ),
+    )
+
+
+def _rate_row(bench: Bench, kind: str, ratio: int | None, choice: Choice) -> dict[str, Cell]:
+    rates = {"prune_rate": choice.prune / 1000, "sh_rate": choice.sh / 1000}
+    return {"kind": kind, "wanted_ratio": ratio, **rates, **bench.cells(bench.point(Setting(choice)))}
+
+
+def times(bench: Bench) -> Experiment:
+    """Seconds of every stage and of every part of a search step, and the memory of the run."""
+    steps = bench.search.steps
+    stages = dict(bench.workspace.clock.stages)
+    # meson is this study's question, not the method's.
+    meson = stages.pop("score meson", 0.0)
+    stages["search"] = sum(step.seconds for step in steps)
+    whole = sum(stages.values())
+    split = _step_parts(bench, bench.search.chosen.choice)
+    step = sum(split.values())
+    memory = peak_rss()
+    rows = [_time(f"stage: {name}", seconds) for name, seconds in stages.items()]
+    rows += [_time("all stages of compress", whole), _time("score meson, for comparison", meson)]
+    rows += [_time(f"step: {name}", seconds, PAPER_STEP[name]) for name, seconds in split.items()]
+    rows.append(_time("step: all", step, PAPER_STEP_ALL))
+    rows += [_time(f"search step {number}", taken.seconds) for number, taken in enumerate(steps, 1)]
+    rows.append({"part": "peak memory", "value": memory, "unit": "bytes", "paper": None})
+    table = Table(columns(part="part", value="here", unit="unit", paper="paper, RTX 3090"), tuple(rows))
+    source, views = bench.scene.source, bench.views
+    return Experiment(
+        "times",
+        "Time and memory",
+        f"Wall seconds of this run: {source.count} Gaussians, {len(views.train)} training and {len(bench.plan.decide)} deciding "
+        f"views. The parts of a step are medians of {REPEATS} at the search's answer; rendering includes comparing with the "
+        "references. The paper's seconds are for its own, larger scenes and 32 views on an RTX 3090: they compare shares, not "
+        "machines. Memory is the largest that the process has held, earlier scenes included.",
+        table,
+        BarChart(
+            "A step of the search",
+            "seconds",
+            list(split),
+            {
+                "here": [round(seconds, 4) for seconds in split.values()],
+                "paper (RTX 3090, larger scenes)": list(PAPER_STEP.values()),
+            },
+            digits=3,
+        ),
+        (
+            f"All stages of a compress run {whole:.1f} s, of which the search {stages['search']:.1f} s in {len(steps)} steps; "
+            f"peak memory of the process {memory / 2**30:.2f} GiB.",
+        ),
+        (
+            Beside("whole run", f"{whole:.1f} s", "26 / 18 / 26 s on an RTX 3090, 59 to 135 s on a Jetson Xavier"),
+            Beside("one step of the search", f"{step:.2f} s", f"{PAPER_STEP_ALL} s"),
+            Beside(
+                "peak memory",
+                f"{memory / 2**30:.2f} GiB for {source.count / 1e6:.2f} M Gaussians",
+                "6.75 GiB for 6.2 M, 21 GiB for 11.8 M",
+            ),
+        ),
+        timed=True,
+    )
+
+
+def _time(part: str, seconds: float, paper: float | None = None) -> dict[str, Cell]:
+    return {"part": part, "value": round(seconds, 4), "unit": "s", "paper": paper}
+
+
+def _step_parts(bench: Bench, choice: Choice) -> dict[str, float]:
+    """Median seconds of a step's parts, as `SceneEvaluator.measure` does them."""
+    ranks = ranks_from_order(bench.orders["gs"])
+    found: list[list[float]] = []
+    evaluator, renderer, first = bench.evaluator(Setting(choice)), bench.workspace.renderer, bench.judge.cameras[0]
+    for _ in range(REPEATS):
+        marks = [time.perf_counter()]
+        select_rows(ranks, choice, bench.has_sh)
+        marks.append(time.perf_counter())
+        with evaluator.quantized(choice) as quantized:
+            marks.append(time.perf_counter())
+            with renderer.load_quantized(quantized) as scene:
+                for _ in range(2):
+                    renderer.render(scene, first)
+                    marks.append(time.perf_counter())
+                bench.judge.compare(scene)
+                marks.append(time.perf_counter())
+        prune, quantize, cold, warm, render = (b - a for a, b in zip(marks, marks[1:]))
+        # Quantizing selects its rows itself; a scene is dequantized when the first view asks for it.
+        found.append([prune, max(quantize - prune, 0.0), max(cold - warm, 0.0), render])
+    medians = np.median(np.array(found), axis=0)
+    return {name: float(value) for name, value in zip(PAPER_STEP, medians)}

@@ -1,0 +1,1 @@
+"""`study rate`: bytes against quality, and what each part is worth."""

@@ -1,0 +1,272 @@
+"""Files of a scene, made by each method at the sizes asked for and judged alike."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.target import MaxSize, min_ratio
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.values import from_grid
+from flexgs_edge.io.converter import check_converter
+from flexgs_edge.io.exchange import near_order
+from flexgs_edge.io.formats import FORMATS, Format
+from flexgs_edge.methods.best.grid_coder import GridCoder
+from flexgs_edge.methods.best.method import grid_search, open_path, search_path
+from flexgs_edge.methods.best.poses import scored_poses
+from flexgs_edge.methods.foreign.file_maker import open_files
+from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.run.judge import measurement_of
+from flexgs_edge.run.plan import EVERYTHING
+from flexgs_edge.run.settings import make_settings
+from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.studies.rate.ablations import WHOLE, Variant
+from flexgs_edge.studies.rate.coders import coder_sizes
+from flexgs_edge.studies.result_tables import Cell, Column, columns
+from flexgs_edge.studies.study_scene import FIGURES, Bench, Setting
+from flexgs_edge.units import format_size
+
+LOG = logging.getLogger("flexgs_edge")
+
+MAX = "max"
+"""The effort that distils: a curve of its own."""
+
+
+@dataclass(frozen=True)
+class RatePoint:
+    """A file and what it is worth.
+
+    Parameters
+    ----------
+    method : str
+        `best`, `paper`, or the format of another program.
+    variant : str
+        What was taken away, or `whole`.
+    effort : str or None
+        Of the search, where there was one.
+    wanted : float or None
+        Ratio that was asked for.
+    size : int
+        Bytes.
+    kept : int
+        Gaussians.
+    quality : Quality
+        Over the views that decide, with SSIM.
+    seconds : float or None
+        Of search or conversion, without the last look at the quality.
+    """
+
+    method: str
+    variant: str
+    effort: str | None
+    wanted: float | None
+    size: int
+    kept: int
+    quality: Quality
+    seconds: float | None
+
+    @property
+    def ssim(self) -> float | None:
+        """Against the photos, where there are some, else against the original's renders."""
+        return self.quality.ssim_original if self.quality.ssim_photo is None else self.quality.ssim_photo
+
+
+@dataclass(frozen=True)
+class Found:
+    """Points, and what could not be had, in words."""
+
+    points: tuple[RatePoint, ...]
+    missing: tuple[str, ...] = ()
+
+    def __add__(self, other: Found) -> Found:
+        return Found(self.points + other.points, self.missing + other.missing)
+
+
+NOTHING = Found(())
+
+
+def point_columns() -> tuple[Column, ...]:
+    """Columns of a table of points."""
+    return columns(
+        method="method",
+        variant="variant",
+        effort="effort",
+        wanted_ratio="ratio wanted",
+        kept="Gaussians kept",
+        bits="bits a Gaussian kept",
+        psnr="PSNR (dB)",
+        ssim="SSIM",
+        **FIGURES,
+        seconds="seconds",
+    )
+
+
+def point_row(bench: Bench, point: RatePoint) -> dict[str, Cell]:
+    """The cells of a point."""
+    quality = point.quality
+    return {
+        "method": point.method,
+        "variant": point.variant,
+        "effort": point.effort,
+        "wanted_ratio": point.wanted,
+        "kept": point.kept,
+        "bits": round(8 * point.size / point.kept, 2),
+        "psnr": None if quality.psnr is None else round(quality.psnr, 4),
+        "ssim": None if point.ssim is None else round(point.ssim, 5),
+        **bench.figures(point.size, measurement_of(quality)),
+        "seconds": None if point.seconds is None else round(point.seconds, 2),
+    }
+
+
+def loss_of(bench: Bench, point: RatePoint) -> float:
+    """The figure that decides."""
+    return measurement_of(point.quality).loss(bench.plan.judge)
+
+
+def paper_points(bench: Bench, ratios: Sequence[float]) -> Found:
+    """`--method paper`: nothing pruned, and the least loss that its search finds in every size asked for."""
+    found = Found((_paper_point(bench, None, EVERYTHING, 0.0),))
+    least = bench.size(Setting(EVERYTHING))
+    for ratio in ratios:
+        started = time.perf_counter()
+        target = _target(bench, ratio)
+        if least <= target.limit_bytes:
+            continue  # nothing has to be pruned for it: the first point is all that there is to say
+        search = bench.adapt(target)
+        if search.reached:
+            point = _paper_point(bench, ratio, search.chosen.choice, time.perf_counter() - started)
+            found += Found((point,))
+        else:
+            found += Found((), (f"paper at {ratio:g}x",))
+    return found
+
+
+def _paper_point(bench: Bench, ratio: float | None, choice: Choice, seconds: float) -> RatePoint:
+    evaluator = bench.evaluator(Setting(choice))
+    with evaluator.quantized(choice) as quantized, bench.workspace.renderer.load_quantized(quantized) as scene:
+        quality = _judged(bench, scene)
+    kept, _ = evaluator.counts(choice)
+    variant = WHOLE.name if ratio is not None else "nothing pruned"
+    effort = None if ratio is None else bench.options.effort
+    return _said(RatePoint("paper", variant, effort, ratio, evaluator.size(choice), kept, quality, seconds))
+
+
+def best_points(
+    bench: Bench, variant: Variant, effort: str, ratios: Sequence[float], recode: Sequence[float] = ()
+) -> Found:
+    """`--method best`, whole or without a part, at every ratio: one path for all of them, the weakest compression first.
+
+    Parameters
+    ----------
+    recode : sequence of float
+        Ratios whose grids are also sized in other coders.
+    """
+    workspace, source = bench.workspace, bench.scene.source
+    options = replace(bench.options, effort=effort, refit=variant.refit, best_effort=True)
+    # All sizes share one path, and so its poses: those of the largest.
+    largest = replace(
+        options, max_drop=None, min_fidelity=None, max_size=None, min_ratio=min(ratios), max_worst_drop=None
+    )
+    poses = scored_poses(bench.views.of(bench.views.train), largest, workspace.renderer, source)
+    found = NOTHING
+    started = time.perf_counter()
+    with open_path(
+        workspace.renderer,
+        source,
+        poses.cameras,
+        options,
+        workspace.budget,
+        workspace.clock,
+        bench.progress,
+        variant.path,
+    ) as path:
+        coder = GridCoder(workspace.renderer)
+        for ratio in sorted(ratios):
+            target = _target(bench, ratio)
+            make = grid_search(options, coder, variant.search)
+            with workspace.clock.stage("search"):
+                grid, search = search_path(make, path, workspace.renderer, source, bench.judge, target, options)
+            seconds = time.perf_counter() - started
+            if search.reached:
+                plan = replace(bench.plan, target=target)
+                size = coder.size(grid, make_settings(options, plan, bench.scene, bench.views, search, None))
+                quality = _judged_source(bench, grid)
+                point = RatePoint("best", variant.name, effort, ratio, size, grid.count, quality, seconds)
+                found += Found((_said(point),))
+                if ratio in recode:
+                    found += Found(_recoded(grid, point))
+            else:
+                found += Found((), (f"best ({variant.name}, {effort}) at {ratio:g}x",))
+            started = time.perf_counter()
+    return found
+
+
+def _recoded(grid: GridScene, point: RatePoint) -> tuple[RatePoint, ...]:
+    """The same grid in other coders: other sizes, same quality."""
+    sizes = coder_sizes(grid, point.size)
+    return tuple(replace(point, variant=name, size=size, seconds=None) for name, size in sizes.items())
+
+
+def peer_points(bench: Bench, folder: Path) -> Found:
+    """The whole scene, unpruned, in the formats of other programs.
+
+    Parameters
+    ----------
+    folder : Path
+        For the files, which are gone afterwards.
+    """
+    found = NOTHING
+    for suffix, format in FORMATS.items():
+        name = suffix[1:]
+        try:
+            check_converter(f"a {suffix} to compare with")
+            found += Found((_said(_peer_point(bench, name, format, folder / f"scene{suffix}")),))
+        except InputError as error:  # no converter, or a scene that this format cannot hold
+            LOG.warning("%s left out: %s", name, error)
+            found += Found((), (f"{name} ({error})",))
+    return found
+
+
+def _peer_point(bench: Bench, name: str, format: Format, place: Path) -> RatePoint:
+    source = bench.scene.source
+    with ExitStack() as stack:
+        files = stack.enter_context(open_files(format, place, False, bench.workspace.budget, None, None))
+        started = time.perf_counter()
+        # In the order that `compress` writes rows in: bytes repeat along a curve.
+        path, decoded = files.write(source.select(near_order(source)))
+        seconds = time.perf_counter() - started
+        with bench.workspace.renderer.load(decoded) as scene:
+            quality = _judged(bench, scene)
+        return RatePoint(name, WHOLE.name, None, None, path.stat().st_size, decoded.count, quality, seconds)
+
+
+def _target(bench: Bench, ratio: float) -> MaxSize:
+    return min_ratio(ratio, bench.scene.ply_bytes, bench.plan.judge)
+
+
+def _judged_source(bench: Bench, grid: GridScene) -> Quality:
+    with bench.workspace.renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
+        return _judged(bench, scene)
+
+
+def _judged(bench: Bench, scene: DeviceScene) -> Quality:
+    with bench.workspace.clock.stage("measure"):
+        return bench.judge.compare(scene, with_ssim=True, progress=bench.progress)
+
+
+def _said(point: RatePoint) -> RatePoint:
+    wanted = "" if point.wanted is None else f" at {point.wanted:g}x"
+    found = measurement_of(point.quality)
+    loss = f"modelled drop {found.modelled_drop:.3f}" if found.drop is None else f"drop {found.drop:.3f}"
+    LOG.info(
+        "%s, %s%s: %s, %s dB, %.1f s",
+        point.method, point.variant, wanted, format_size(point.size), loss, point.seconds or 0.0,
+    )  # fmt: skip
+    return point

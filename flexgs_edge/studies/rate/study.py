@@ -1,0 +1,146 @@
+"""`study rate`: bytes against quality of every method and format, and of the measured method without each of its parts."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.files import atomic_folder, check_folder
+from flexgs_edge.methods.best.effort import EFFORTS
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.report.plots import require_matplotlib
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.studies.experiment import Experiment
+from flexgs_edge.studies.page import study_page
+from flexgs_edge.studies.rate import trade
+from flexgs_edge.studies.rate.ablations import WHOLE, parts_of
+from flexgs_edge.studies.rate.points import MAX, Found, best_points, paper_points, peer_points
+from flexgs_edge.studies.study_scene import Bench, open_bench, scene_names
+from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_scene
+
+LOG = logging.getLogger("flexgs_edge")
+
+RATIOS = (8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
+ABLATED = (16.0, 64.0)
+ABLATION_EFFORT = "fast"
+DISTILLED = (32.0, 64.0, 128.0)
+"""Below 30x every pixel is looked at, and each point takes twice as long."""
+
+
+class RateStudy(WrittenStudy):
+    """What `study rate` found and wrote."""
+
+    command = "study rate"
+
+
+def study_rate(
+    scene: str | Path,
+    output: str | Path,
+    options: CompressOptions | None = None,
+    progress: Progress = SILENT,
+    ratios: Sequence[float] = RATIOS,
+    ablations: Sequence[float] = ABLATED,
+    ablation_effort: str = ABLATION_EFFORT,
+    distilled: Sequence[float] = DISTILLED,
+    **words: Any,
+) -> RateStudy:
+    """Measure bytes and quality of every method on a scene and write them to a folder.
+
+    Parameters
+    ----------
+    scene : path
+        What `compress` takes.
+    output : path
+        Folder of the results: index.html, and rate, fidelity and parts as .csv, .json, .png and .svg. It appears when
+        everything is done; `force` lets it replace files of these names in a folder that is there.
+    options : CompressOptions, optional
+        Views, drawing, memory and device as for `compress`; `effort` is that of the curves.
+    progress : Progress, optional
+        Bars on long work.
+    ratios : sequence of float
+        PLY bytes to file bytes, for the curves.
+    ablations : sequence of float
+        The same for the points without a part; none leaves them out.
+    ablation_effort : str
+        Of these points, and of the curve that they are held against.
+    distilled : sequence of float
+        PLY bytes to file bytes of the points at the effort `max`; none leaves them out.
+    **words
+        Single options by the names of `CompressOptions`.
+
+    Raises
+    ------
+    FlexGSError
+        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
+    """
+    options = replace(options or CompressOptions(), **{**words, "method": "best"})
+    _check(ratios, ablations, ablation_effort, distilled)
+    # Loaded before the memory is planned, so that its bytes count as taken.
+    require_matplotlib()
+    check_folder(output, options.force)
+    with atomic_folder(output, options.force) as folder:
+        (name,) = scene_names([scene])
+        with open_bench(scene, name, options, progress) as bench:
+            every, without = sorted({*ratios, *ablations}), sorted(set(ablations))
+            made = _experiments(bench, folder, every, without, ablation_effort, sorted(set(distilled)))
+            found = SceneStudy.of(bench, made)
+        page = study_page("Bytes and quality", _INTRO, [write_scene(folder, found)])
+        (folder / "index.html").write_text(page, encoding="utf-8")
+    LOG.info("wrote %s", Path(output) / "index.html")
+    return RateStudy(os.fspath(output), found)
+
+
+_INTRO = (
+    "What flexgs-edge makes of a scene at many sizes, beside the paper's method and the formats of other programs. Sizes are "
+    "bytes of the finished file; ratios are to the PLY as INRIA writes it. All methods are judged by the same renderer over "
+    "the same views."
+)
+
+
+def _check(ratios: Sequence[float], ablations: Sequence[float], effort: str, distilled: Sequence[float]) -> None:
+    for word, values in (("--ratios", ratios), ("--ablations", ablations), ("--distilled", distilled)):
+        bad = [value for value in values if not (math.isfinite(value) and value >= 1.0)]
+        if bad:
+            raise InputError(f"{word} {bad[0]:g}: expected ratios of 1 or more, such as 8,16,32")
+    if not ratios:
+        raise InputError("--ratios: expected one ratio or more, such as 8,16,32")
+    if effort not in EFFORTS:
+        raise InputError(f"--ablation-effort {effort!r}: expected one of {', '.join(EFFORTS)}")
+
+
+def _experiments(
+    bench: Bench,
+    folder: Path,
+    ratios: Sequence[float],
+    ablations: Sequence[float],
+    ablation_effort: str,
+    distilled: Sequence[float],
+) -> list[Experiment]:
+    effort = bench.options.effort
+    recode = ablations if ablation_effort == effort else ()
+    found = best_points(bench, WHOLE, effort, ratios, recode) + paper_points(bench, ratios)
+    if distilled:
+        try:
+            found += best_points(bench, WHOLE, MAX, distilled)
+        except BudgetError as error:  # a descent stays in memory as a whole
+            found += Found((), (f"best ({MAX}: {error})",))
+    with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder) as place:
+        found += peer_points(bench, Path(place))
+    variants = parts_of(bench.orders["gs"], bench.scene.source.sh_degree) if ablations else ()
+    if ablations and ablation_effort != effort:
+        found += best_points(bench, WHOLE, ablation_effort, ratios, ablations)
+    for variant in variants:
+        found += best_points(bench, variant, ablation_effort, ablations)
+    made = [trade.rate(bench, found.points, found.missing, effort)]
+    if bench.plan.judge == "drop":
+        made.append(trade.fidelity(bench, found.points, effort))
+    if ablations:
+        made.append(trade.parts(bench, found.points, variants, ablation_effort, ablations))
+    return made

@@ -1,0 +1,244 @@
+"""Experiments on points of bytes and quality: all methods side by side, and what each part of the measured one is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from flexgs_edge.report.plots import BarChart, LineChart, Series
+from flexgs_edge.studies.experiment import Experiment
+from flexgs_edge.studies.rate.ablations import WHOLE, Variant
+from flexgs_edge.studies.rate.curves import Curve
+from flexgs_edge.studies.rate.points import MAX, RatePoint, loss_of, point_columns, point_row
+from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
+from flexgs_edge.studies.study_scene import FIGURES, Bench
+
+CODERS = {
+    "order-0 entropy": "a bound for coders that take each integer by itself, their tables free",
+    "lzma": "lzma (Python's, preset 9) on each plane, instead of the context coder",
+    "zlib": "zlib (level 9) on each plane, instead of the context coder",
+    "fixed bits": "as many bits a value as each plane's range needs, instead of the context coder",
+}
+FIDELITY_WORDS = "fidelity: PSNR against the original's renders"
+
+
+def rate(bench: Bench, points: Sequence[RatePoint], missing: Sequence[str], effort: str) -> Experiment:
+    """Bytes and the deciding figure of every method; the table holds all points of the study."""
+    table = Table(point_columns(), tuple(point_row(bench, point) for point in points))
+    with_photos = bench.plan.judge == "drop"
+    figure = bench.figure if with_photos else "fidelity"
+    findings = list(_comparisons(bench, points, effort))
+    if missing:
+        findings.append(f"Left out or not reached: {'; '.join(missing)}.")
+    return Experiment(
+        "rate",
+        "Bytes and quality",
+        f"Every method at the sizes asked for: best at the effort {effort} and distilled (the effort {MAX}), paper with "
+        "its rates to choose, and the whole scene in the formats of other programs as this one writes them. "
+        f"{'PSNR and SSIM are against the photos' if with_photos else 'SSIM is against the original: there are no photos'}; "
+        f"{FIDELITY_WORDS}. The rows hold all points of this study, those without a part of the method among them. The first "
+        "seconds of a curve include most of the path of prune and rescore, which its other points go on from.",
+        table,
+        _chart(table, "Bytes and quality", figure, effort),
+        tuple(findings),
+        timed=True,
+    )
+
+
+def fidelity(bench: Bench, points: Sequence[RatePoint], effort: str) -> Experiment:
+    """The same against the original's renders, where the photos decide: how far the picture moved at all."""
+    names = ("method", "wanted_ratio", "variant", "effort", "size", "ratio", "fidelity")
+    rows = [point_row(bench, point) for point in points if _on_curve(point.method, point.variant, point.effort, effort)]
+    heads = {column.name: column for column in point_columns()}
+    table = Table(tuple(heads[name] for name in names), tuple({name: row[name] for name in names} for row in rows))
+    return Experiment(
+        "fidelity",
+        "Bytes and fidelity",
+        f"The same files; {FIDELITY_WORDS}, which a drop against photos does not show: an error may come nearer to a photo.",
+        table,
+        _chart(table, "Bytes and fidelity", "fidelity", effort),
+        (
+            "Fidelity of best: "
+            + ", ".join(
+                f"{row['fidelity']:.1f} dB at {row['ratio']:.0f}x{' distilled' if row['effort'] == MAX else ''}"
+                for row in rows
+                if row["method"] == "best"
+            )
+            + ".",
+        ),
+    )
+
+
+def _on_curve(method: str, variant: str, effort: str | None, wanted: str) -> bool:
+    return method != "best" or (variant == WHOLE.name and effort in (wanted, MAX))
+
+
+def _chart(table: Table, title: str, figure: str, effort: str) -> LineChart:
+    series: dict[str, list[dict[str, Cell]]] = {}
+    for row in table.rows:
+        method = str(row["method"])
+        if _on_curve(method, str(row["variant"]), None if row["effort"] is None else str(row["effort"]), effort):
+            series.setdefault(f"{method}, distilled" if row["effort"] == MAX else method, []).append(dict(row))
+    floating = figure == "fidelity"
+    return LineChart(
+        title,
+        "bytes of the file, MB (log)",
+        FIGURES[figure],
+        tuple(
+            Series(
+                name,
+                [float(row["size"] or 0) / 1e6 for row in rows],
+                [None if row[figure] is None else float(row[figure] or 0.0) for row in rows],
+                notes=[_note(row) for row in rows] if rows[0]["method"] in ("best", "paper") else [name] * len(rows),
+            )
+            for name, rows in series.items()
+        ),
+        megabytes=True,
+        floating=floating,
+        magnitudes=not floating,
+    )
+
+
+def _note(row: dict[str, Cell]) -> str:
+    return "" if row["wanted_ratio"] is None or row["method"] != "best" else f"{row['wanted_ratio']:g}x"
+
+
+def _comparisons(bench: Bench, points: Sequence[RatePoint], effort: str) -> Iterable[str]:
+    """Sentences on best against each other method and effort, at equal loss."""
+    figure = FIGURES[bench.figure].removesuffix(" (dB)")
+    best = _points(points, "best", WHOLE.name, effort)
+    paper = {point.wanted: point for point in _points(points, "paper", WHOLE.name, effort)}
+    pairs = [(point, paper[point.wanted]) for point in best if point.wanted in paper]
+    if pairs:
+        words = ", ".join(f"{a.wanted:g}x: {loss_of(bench, a):.2f} / {loss_of(bench, b):.2f} dB" for a, b in pairs)
+        yield f"{figure.capitalize()} of best / paper at equal ratios: {words}."
+    curve = _curve(bench, best)
+    shares = [share for share in (_share(bench, curve, point) for point in paper.values()) if share is not None]
+    if shares:
+        yield (
+            f"At equal {figure} best needs {min(shares):.0%} to {max(shares):.0%} of paper's bytes "
+            f"({len(shares)} of paper's {len(paper)} points lie on its curve)."
+        )
+    for point in points:
+        if point.method not in ("best", "paper"):
+            share, loss = _share(bench, curve, point), loss_of(bench, point)
+            than = (
+                f"best needs {share:.0%} of its bytes there" if share is not None else "beyond the ends of best's curve"
+            )
+            yield f"{point.method}: {bench.scene.ply_bytes / point.size:.1f}x at {loss:.3f} dB of {figure}; {than}."
+    others = sorted({p.effort for p in points if p.effort not in (None, effort) and p.variant == WHOLE.name} - {None})
+    whole = _modelled(best)
+    for other in others:
+        # Few bytes apart: a drop against photos would say chance.
+        known = [_more(p.size, whole.size(p.quality.modelled_drop)) for p in _points(points, "best", WHOLE.name, other)]
+        costs = [cost for cost in known if cost is not None]
+        if costs:
+            yield (
+                f"The effort {other}: {mean(costs):+.1f} % bytes at equal modelled drop against {effort} "
+                f"(mean of {len(costs)} sizes)."
+            )
+
+
+def _points(points: Iterable[RatePoint], method: str, variant: str, effort: str | None) -> list[RatePoint]:
+    return [p for p in points if (p.method, p.variant, p.effort) == (method, variant, effort)]
+
+
+def _curve(bench: Bench, points: Iterable[RatePoint]) -> Curve:
+    return Curve((point.size, loss_of(bench, point)) for point in points)
+
+
+def _modelled(points: Iterable[RatePoint]) -> Curve:
+    return Curve((point.size, point.quality.modelled_drop) for point in points)
+
+
+def _share(bench: Bench, curve: Curve, point: RatePoint) -> float | None:
+    """Bytes on the curve over the point's, at its loss."""
+    size = curve.size(loss_of(bench, point))
+    return None if size is None else size / point.size
+
+
+def parts(
+    bench: Bench, points: Sequence[RatePoint], variants: Sequence[Variant], effort: str, ratios: Sequence[float]
+) -> Experiment:
+    """What every part is worth: bytes at equal loss and loss at equal bytes, against the whole method at the same effort."""
+    figure = FIGURES[bench.figure].removesuffix(" (dB)")
+    whole = _points(points, "best", WHOLE.name, effort)
+    curve = _curve(bench, whole)
+    modelled = _modelled(whole)
+    known = {**{variant.name: variant.words for variant in (WHOLE, *variants)}, **CODERS}
+    rows: list[dict[str, Cell]] = []
+    for name, words in known.items():
+        for point in _points(points, "best", name, effort):
+            if point.wanted in ratios:
+                rows.append(_part_row(bench, curve, modelled, point, words))
+    heads = columns(
+        variant="taken away",
+        instead="in its place",
+        wanted_ratio="ratio wanted",
+        **FIGURES,
+        more_bytes=f"more bytes at equal {figure} (%)",
+        more_modelled="more bytes at equal modelled drop (%)",
+        more_loss=f"more dB of {figure} at equal bytes",
+    )
+    table = Table(heads, tuple(rows))
+    names = [name for name in known if name != WHOLE.name and table.values("variant", variant=name)]
+    return Experiment(
+        "parts",
+        "Each part earns its place",
+        f"best with one part taken away at a time, at the effort {effort}, against the whole method at that effort, whose points "
+        "are joined by power laws. Other coders hold the same integers: quality is the whole method's, and each plane is coded "
+        "alone, as it is or as differences along the curve. A dash: beyond the whole method's points. Drops of a few hundredths "
+        "of a dB are mostly chance, which way errors fall against the photos: the modelled drop is then the steadier figure.",
+        table,
+        BarChart(
+            "What it costs to leave a part out",
+            f"more bytes at equal {figure}, %",
+            [_broken(name) for name in names],
+            {
+                f"{ratio:g}x": [
+                    next(iter(table.values("more_bytes", variant=n, wanted_ratio=ratio)), None) for n in names
+                ]
+                for ratio in ratios
+            },
+            digits=1,
+        ),
+        tuple(_part_words(table, name, figure) for name in names),
+    )
+
+
+def _part_row(bench: Bench, curve: Curve, modelled: Curve, point: RatePoint, words: str) -> dict[str, Cell]:
+    row = point_row(bench, point)
+    loss = curve.loss(point.size)
+    return {
+        "variant": point.variant,
+        "instead": words,
+        "wanted_ratio": point.wanted,
+        **{name: row[name] for name in FIGURES},
+        "more_bytes": _more(point.size, curve.size(loss_of(bench, point))),
+        "more_modelled": _more(point.size, modelled.size(point.quality.modelled_drop)),
+        "more_loss": None if loss is None else round(loss_of(bench, point) - loss, 4) + 0.0,
+    }
+
+
+def _more(size: int, whole: float | None) -> float | None:
+    """By how much `size` is larger, in per cent."""
+    return None if whole is None else round(100 * size / whole - 100, 2) + 0.0  # no -0.0
+
+
+def _part_words(table: Table, name: str, figure: str) -> str:
+    words = []
+    for row in table.rows:
+        if row["variant"] == name:
+            more = (
+                "beyond the curve"
+                if row["more_bytes"] is None
+                else f"{row['more_bytes']:+.1f} % bytes at equal {figure}"
+            )
+            loss = "" if row["more_loss"] is None else f" ({row['more_loss']:+.3f} dB at equal bytes)"
+            words.append(f"{row['wanted_ratio']:g}x {more}{loss}")
+    return f"{name}: {'; '.join(words)}."
+
+
+def _broken(name: str) -> str:
+    """Two lines, for the foot of a bar."""
+    first, _, rest = name.partition(" ")
+    return f"{first}\n{rest}" if rest else first

@@ -1,0 +1,1 @@
+"""`study speed`: time against quality, and where the time goes."""

@@ -1,0 +1,110 @@
+"""Whole runs of `compress`: time against the ratio at one drop, by method and effort."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+from flexgs_edge.commands.compress import compress
+from flexgs_edge.progress import Progress
+from flexgs_edge.report.plots import LineChart, Series
+from flexgs_edge.report.results import CompressResult
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.studies.experiment import Experiment
+from flexgs_edge.studies.result_tables import Cell, Table, columns
+from flexgs_edge.studies.speed.front import front
+
+LOG = logging.getLogger("flexgs_edge")
+
+PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"), ("best", "thorough"), ("best", "max"))
+"""Method and effort."""
+
+
+def presets(path: str | Path, options: CompressOptions, progress: Progress) -> Experiment:
+    """One dry run of `compress` for each preset, all with the same target."""
+    rows: list[dict[str, Cell]] = []
+    target = ""
+    for method, effort in PRESETS:
+        LOG.info("compress --method %s --effort %s", method, effort)
+        words = replace(options, method=method, effort=effort, dry_run=True, best_effort=True, report=None)
+        found = compress(path, None, words, progress)
+        target = found.target or ""
+        rows.append(_row(method, effort, found))
+    best = front([float(row["seconds"] or 0) for row in rows], [float(row["ratio"] or 0) for row in rows])
+    for row, on in zip(rows, best):
+        row["front"] = on
+    table = Table(
+        columns(
+            method="method",
+            effort="effort",
+            seconds="seconds",
+            search_seconds="of them, search",
+            steps="results measured",
+            size="bytes",
+            ratio="ratio to PLY",
+            kept="Gaussians kept",
+            drop="drop (dB)",
+            fidelity="fidelity (dB)",
+            modelled_drop="modelled drop (dB)",
+            reached="target met",
+            front="on the front",
+        ),
+        tuple(rows),
+    )
+    return Experiment(
+        "presets",
+        "Time of a whole run and the ratio that it finds",
+        f"compress by each method and effort, asked for {target}: opening, scoring, searching, coding and the last look at "
+        "the quality, in one process whose device is started and whose kernels are built before. Nothing is written.",
+        table,
+        LineChart(
+            "Time of a run against the ratio that it finds",
+            "seconds of the run (log)",
+            "ratio to the PLY",
+            tuple(
+                Series(
+                    method,
+                    table.values("seconds", method=method),
+                    table.values("ratio", method=method),
+                    notes=table.values("effort", method=method),
+                )
+                for method in dict.fromkeys(str(row["method"]) for row in rows)
+            ),
+            log_x=True,
+            front=[(float(row["seconds"] or 0), float(row["ratio"] or 0)) for row in rows if row["front"]],
+        ),
+        (
+            "; ".join(
+                f"{row['method']} {row['effort']}: {row['ratio']:.1f}x at {_loss(row)} in {row['seconds']:.1f} s"
+                for row in rows
+            )
+            + ".",
+        ),
+        timed=True,
+    )
+
+
+def _row(method: str, effort: str, found: CompressResult) -> dict[str, Cell]:
+    quality = found.quality
+    assert quality is not None
+    drop, fidelity = quality.drop, quality.fidelity
+    return {
+        "method": method,
+        "effort": effort,
+        "seconds": round(found.run.seconds - found.run.startup_seconds, 2),
+        "search_seconds": round(found.run.stages.get("search", 0.0), 2),
+        "steps": 0 if found.search is None else len(found.search.steps),
+        "size": found.size,
+        "ratio": round(found.ratio, 3),
+        "kept": found.count,
+        "drop": None if drop is None else round(drop, 4),
+        "fidelity": None if fidelity is None else round(fidelity, 4),
+        "modelled_drop": round(quality.modelled_drop, 4),
+        "reached": found.reached,
+    }
+
+
+def _loss(row: dict[str, Cell]) -> str:
+    name = "modelled_drop" if row["drop"] is None else "drop"
+    return f"{float(row[name] or 0.0):.3f} dB"

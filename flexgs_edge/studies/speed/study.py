@@ -1,0 +1,124 @@
+"""`study speed`: what speed costs in accuracy, part by part: drawing, scoring, measuring, whole runs; and how times grow."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.files import atomic_folder, check_folder
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.report.plots import require_matplotlib
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.studies.experiment import Experiment
+from flexgs_edge.studies.page import study_page
+from flexgs_edge.studies.speed.drawing import drawing
+from flexgs_edge.studies.speed.presets import presets
+from flexgs_edge.studies.speed.sampling import sampling
+from flexgs_edge.studies.speed.scaling import scaling
+from flexgs_edge.studies.speed.scoring import scoring
+from flexgs_edge.studies.study_scene import Bench, open_bench, scene_names
+from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_scene
+
+LOG = logging.getLogger("flexgs_edge")
+
+PARTS = ("drawing", "scoring", "sampling", "presets", "scaling")
+REPEATS = 5
+TRIALS = 200
+
+
+class SpeedStudy(WrittenStudy):
+    """What `study speed` found and wrote."""
+
+    command = "study speed"
+
+
+def study_speed(
+    scene: str | Path,
+    output: str | Path,
+    options: CompressOptions | None = None,
+    progress: Progress = SILENT,
+    parts: Sequence[str] = PARTS,
+    repeats: int = REPEATS,
+    trials: int = TRIALS,
+    **words: Any,
+) -> SpeedStudy:
+    """Measure speed against accuracy on a scene and write it to a folder.
+
+    Parameters
+    ----------
+    scene : path
+        What `compress` takes.
+    output : path
+        Folder of the results: index.html, and every experiment's rows and chart as .csv, .json, .png and .svg. It appears when
+        everything is done; `force` lets it replace files of these names in a folder that is there.
+    options : CompressOptions, optional
+        Views, drawing, memory and device as for `compress`; the target is that of the whole runs, and of the paper's search whose
+        answer other parts build on.
+    progress : Progress, optional
+        Bars on long work.
+    parts : sequence of str
+        Some of `PARTS`.
+    repeats : int
+        Rounds of timing; the least counts.
+    trials : int
+        Samples of tiles of every size.
+    **words
+        Single options by the names of `CompressOptions`.
+
+    Raises
+    ------
+    FlexGSError
+        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
+    """
+    options = replace(options or CompressOptions(), **words)
+    _check(parts, repeats, trials)
+    # Loaded before the memory is planned, so that its bytes count as taken.
+    require_matplotlib()
+    check_folder(output, options.force)
+    with atomic_folder(output, options.force) as folder:
+        (name,) = scene_names([scene])
+        with open_bench(scene, name, replace(options, method="paper"), progress) as bench:
+            found = SceneStudy.of(bench, _on_bench(bench, parts, repeats, trials))
+        if "presets" in parts:
+            # With the bench's memory given back: these are runs of their own.
+            found = replace(found, experiments=(*found.experiments, presets(scene, options, progress)))
+        page = study_page("Speed and accuracy", _INTRO, [write_scene(folder, found)])
+        (folder / "index.html").write_text(page, encoding="utf-8")
+    LOG.info("wrote %s", Path(output) / "index.html")
+    return SpeedStudy(os.fspath(output), found)
+
+
+_INTRO = (
+    "What less work costs: drawing views less exactly, scoring Gaussians from fewer of them, measuring a part of the pixels, and "
+    "searching less. Points that no other beats in time and accuracy are joined as the Pareto front. Times are wall times of "
+    "this run on the device named below; all but the times, and the fronts that they decide, is the same in every run."
+)
+
+
+def _check(parts: Sequence[str], repeats: int, trials: int) -> None:
+    unknown = [part for part in parts if part not in PARTS]
+    if unknown or not parts:
+        raise InputError(f"--parts {','.join(unknown or parts)}: expected one or more of {', '.join(PARTS)}")
+    for word, value in (("--repeats", repeats), ("--trials", trials)):
+        if value < 1:
+            raise InputError(f"{word} {value}: expected 1 or more")
+
+
+def _on_bench(bench: Bench, parts: Sequence[str], repeats: int, trials: int) -> list[Experiment]:
+    makers: dict[str, Callable[[], list[Experiment]]] = {
+        "drawing": lambda: [drawing(bench, repeats)],
+        "scoring": lambda: scoring(bench),
+        "sampling": lambda: [sampling(bench, trials)],
+        "scaling": lambda: [scaling(bench, repeats)],
+    }
+    made: list[Experiment] = []
+    for part, make in makers.items():
+        if part in parts:
+            LOG.info("%s: %s", bench.name, part)
+            made += make()
+    return made

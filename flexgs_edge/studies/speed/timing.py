@@ -1,0 +1,57 @@
+"""Times of views: whole passes, and the stages that a view consists of."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.renderer import Renderer
+
+STAGES = {
+    "projection": ("project",),
+    "sort": ("sort_count_first", "sort_scatter_first", "sort_count", "sort_scatter", "exclusive_scan"),
+    "tile lists": ("tile_room", "tile_count", "tile_scatter"),
+    "blend": ("blend",),
+}
+"""Kernels of each stage of a view (the scans of the tile lists, 0.1 ms, count as sorting)."""
+
+
+def draw_seconds(renderer: Renderer, scene: DeviceScene, cameras: Sequence[Camera]) -> float:
+    """Seconds to draw all views once, the scene and the first view's buffers being there."""
+    renderer.render(scene, cameras[0])
+    started = time.perf_counter()
+    for camera in cameras:
+        renderer.render(scene, camera)
+    return time.perf_counter() - started
+
+
+def stage_seconds(renderer: Renderer, scene: DeviceScene, cameras: Sequence[Camera]) -> dict[str, float]:
+    """Seconds of each of `STAGES` over all views; every kernel is waited for, so the sum is above `draw_seconds`."""
+    renderer.render(scene, cameras[0])
+    backend = renderer.backend
+    backend.profile = defaultdict(float)
+    try:
+        for camera in cameras:
+            renderer.render(scene, camera)
+        return {stage: sum(backend.profile[name] for name in kernels) for stage, kernels in STAGES.items()}
+    finally:
+        backend.profile = None
+
+
+def slope(x: Sequence[float], y: Sequence[float]) -> float:
+    """The exponent of y as a power of x: the least-squares slope of their logarithms.
+
+    >>> round(slope([1, 2, 4, 8], [3, 6, 12, 24]), 6)
+    1.0
+    """
+    return float(np.polyfit(np.log(np.asarray(x, float)), np.log(np.asarray(y, float)), 1)[0])
+
+
+def median(values: Sequence[float]) -> float:
+    """Of at least one number."""
+    return float(np.median(np.asarray(values)))

@@ -1,0 +1,1 @@
+"""`study stability`: where methods break, and where ours stops standing."""

@@ -1,0 +1,147 @@
+"""What a compressed scene lost, and whether that counts as broken."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+
+from flexgs_edge.errors import FlexGSError
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.quality.psnr import modelled_drop
+from flexgs_edge.quality.view_quality import Quality, ViewQuality
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.report.plots import Series
+from flexgs_edge.run.plan import EVERYTHING
+from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.studies.result_tables import Cell, Row
+from flexgs_edge.studies.study_scene import Bench, Setting
+
+BREAK = 3.0
+"""dB lost from which a method is said to have broken: twice the squared error."""
+LOST = f"lost {BREAK:g} dB"
+
+LOSSES = {
+    "size": "bytes",
+    "ratio": "ratio to PLY",
+    "loss": "loss (dB)",
+    "worst": "loss of the worst view (dB)",
+    "fidelity": "fidelity (dB)",
+    "broke": "broken by",
+}
+"""Columns that rows of outcomes end with, and their heads."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A compressed scene and its quality, or the error that there was instead."""
+
+    size: int | None
+    quality: Quality | None
+    error: str | None = None
+
+    def cells(self, bench: Bench) -> dict[str, Cell]:
+        """Cells of `LOSSES`."""
+        quality = self.quality
+        if quality is None or self.size is None:
+            return {**dict.fromkeys(LOSSES), "broke": f"error: {self.error}"}
+        loss = mean_loss(bench, quality.views)
+        fidelity = quality.fidelity
+        return {
+            "size": self.size,
+            "ratio": round(bench.scene.ply_bytes / self.size, 3),
+            "loss": round(loss, 4),
+            "worst": round(max(view_loss(bench, view) for view in quality.views), 4),
+            "fidelity": None if fidelity is None else round(fidelity, 4),
+            "broke": LOST if loss > BREAK else None,
+        }
+
+
+def view_loss(bench: Bench, view: ViewQuality) -> float:
+    """What decides, for one view: its drop against the photo, else its modelled drop; dB."""
+    if bench.plan.judge == "drop" and view.drop is not None:
+        return view.drop
+    return modelled_drop(view.error, bench.options.base_psnr)
+
+
+def mean_loss(bench: Bench, views: Sequence[ViewQuality]) -> float:
+    """The figure that decides, over some views, dB."""
+    if bench.plan.judge == "drop":
+        return math.fsum(view_loss(bench, view) for view in views) / len(views)
+    return Quality(tuple(views), bench.options.base_psnr).modelled_drop
+
+
+def outcome(bench: Bench, make: Callable[[], tuple[int, AbstractContextManager[DeviceScene]]]) -> Outcome:
+    """The quality of what `make` gives (bytes, and the scene to draw), or its error."""
+    try:
+        size, loaded = make()
+        with loaded as scene:
+            return Outcome(size, bench.judge.compare(scene))
+    except FlexGSError as error:
+        return Outcome(None, None, str(error))
+
+
+def of_source(bench: Bench, make: Callable[[], tuple[int, SceneSource]]) -> Outcome:
+    """The same for a source."""
+
+    def load() -> tuple[int, AbstractContextManager[DeviceScene]]:
+        size, source = make()
+        return size, bench.workspace.renderer.load(source)
+
+    return outcome(bench, load)
+
+
+def of_setting(bench: Bench, setting: Setting) -> Outcome:
+    """The same for a setting of the bench."""
+    return of_choice(bench, lambda: bench.evaluator(setting), setting.choice)
+
+
+def of_choice(bench: Bench, make: Callable[[], SceneEvaluator], choice: Choice = EVERYTHING) -> Outcome:
+    """The same for a choice of an evaluator."""
+
+    def load() -> tuple[int, AbstractContextManager[DeviceScene]]:
+        evaluator = make()
+        return evaluator.size(choice), drawn(bench, evaluator, choice)
+
+    return outcome(bench, load)
+
+
+@contextmanager
+def drawn(bench: Bench, evaluator: SceneEvaluator, choice: Choice) -> Iterator[DeviceScene]:
+    """A choice of an evaluator, quantized and loaded."""
+    with evaluator.quantized(choice) as quantized, bench.workspace.renderer.load_quantized(quantized) as scene:
+        yield scene
+
+
+def number(row: Row, column: str) -> float:
+    """A cell that holds a number."""
+    value = row[column]
+    assert isinstance(value, (int, float)), f"{column}: {value!r}"
+    return float(value)
+
+
+def curve(rows: Sequence[Row], label: str, x: str, y: str = "loss", line: bool = True, every: bool = False) -> Series:
+    """Rows as a series that is marked where it breaks first, or everywhere; points that ended in an error have no y."""
+    shown = [row for row in rows if row[x] is not None]
+    broken = [number(row, x) for row in shown if row["broke"] is not None]
+    return Series(
+        label,
+        [number(row, x) for row in shown],
+        [None if row[y] is None else number(row, y) for row in shown],
+        line=line,
+        broken=broken if every else broken[:1],
+    )
+
+
+def where_it_breaks(rows: Sequence[Row], name: str, words: Callable[[Row], str], y: str = "loss") -> str:
+    """One sentence: up to where `name` stands, and where it breaks first; rows go from mild to harsh."""
+    first = next((place for place, row in enumerate(rows) if row["broke"] is not None), None)
+    if first is None:
+        worst = max(rows, key=lambda row: number(row, y))
+        return f"{name} stands everywhere (at worst {number(worst, y):.2f} dB, {words(worst)})."
+    row = rows[first]
+    lost = str(row["broke"]) if row[y] is None else f"{number(row, y):.2f} dB"
+    before = f"stands up to {words(rows[first - 1])} ({number(rows[first - 1], y):.2f} dB) and " if first else ""
+    return f"{name} {before}breaks at {words(row)} ({lost})."

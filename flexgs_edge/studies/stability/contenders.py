@@ -1,0 +1,68 @@
+"""Compressed forms of a scene that are judged from many poses: best, paper, and baselines near paper's size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.studies.paper.pruning import nearest
+from flexgs_edge.studies.stability.breaks import drawn
+from flexgs_edge.studies.stability.ours import Whole
+from flexgs_edge.studies.study_scene import Bench, Setting
+
+BEST, PAPER, RTN, ROWS, SH = "best", "paper", "RTN, 8 bits", "rows only", "SH only"
+MARGIN = "best, --views-margin"
+WORDS = (
+    f"best and paper: the results at the study's target; {MARGIN}: with poses that nobody took among those scored. {RTN}: one "
+    f"range a channel, nothing removed. {ROWS}, {SH}: the paper's bits, and Gaussians or SH alone removed by gs, to "
+    "paper's bytes or as near as they come."
+)
+
+
+class Contenders:
+    """The compressed scenes, by name.
+
+    Parameters
+    ----------
+    bench : Bench
+    ours, guarded : Whole
+        The results of best, of given poses and of made ones as well.
+    """
+
+    def __init__(self, bench: Bench, ours: Whole, guarded: Whole) -> None:
+        self.bench, self.wholes = bench, {BEST: ours, MARGIN: guarded}
+        paper = Setting(bench.search.chosen.choice)
+        size = bench.size(paper)
+        self.settings = {
+            PAPER: paper,
+            RTN: Setting(bits=BitSpec.rtn(8), groups=1),
+            ROWS: Setting(_of_size(bench, size, lambda rate: Choice(min(rate, 980), 0))),
+            SH: Setting(_of_size(bench, size, lambda rate: Choice(0, rate))),
+        }
+        self.names = (*self.wholes, *self.settings)
+
+    def size(self, name: str) -> int:
+        """Bytes of the file."""
+        return self.wholes[name].size if name in self.wholes else self.bench.size(self.settings[name])
+
+    @contextmanager
+    def loaded(self, name: str) -> Iterator[DeviceScene]:
+        """What its file decodes to, to draw."""
+        if name in self.wholes:
+            with self.bench.workspace.renderer.load(self.wholes[name].source) as scene:
+                yield scene
+        else:
+            setting = self.settings[name]
+            with drawn(self.bench, self.bench.evaluator(setting), setting.choice) as scene:
+                yield scene
+
+
+def _of_size(bench: Bench, size: int, choice: Callable[[int], Choice]) -> Choice:
+    ladder = [choice(rate) for rate in range(1001)]
+    sizes = [bench.size(Setting(one)) for one in ladder]
+    place = nearest(sizes, size)
+    # Out of reach: the end that is nearer.
+    return ladder[place] if place is not None else ladder[-1 if size < sizes[-1] else 0]

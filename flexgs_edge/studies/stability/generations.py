@@ -1,0 +1,191 @@
+"""Compressing what was compressed: several generations at one size, and two targets in a row against one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from flexgs_edge.codec.open_fgs import open_fgs
+from flexgs_edge.codec.v1.container import write_container
+from flexgs_edge.codec.v2.container import coded_size, write_grid
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.target import MaxSize
+from flexgs_edge.io.ply import write_ply
+from flexgs_edge.methods.best.grid_coder import SETTINGS_MOST, GridCoder
+from flexgs_edge.methods.best.keep import kept_as_it_is
+from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
+from flexgs_edge.methods.paper.scores import score_scene
+from flexgs_edge.methods.paper.search import adapt
+from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.report.plots import LineChart
+from flexgs_edge.run.inputs import load_scene
+from flexgs_edge.run.plan import EVERYTHING
+from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.studies.experiment import Experiment
+from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
+from flexgs_edge.studies.stability.amounts import Amounts
+from flexgs_edge.studies.stability.breaks import BREAK, LOSSES, Outcome, curve, number, of_choice, of_source
+from flexgs_edge.studies.stability.ours import Whole, search, walked
+from flexgs_edge.studies.study_scene import Bench, Setting
+
+BEST, PAPER, RTN = "best", "paper", "RTN, 8 bits"
+IN_A_ROW, DIRECT = "two targets", "one target"
+FIRST_TIMES = 2.0
+"""Bytes of the first of two targets in a row, times those of the second."""
+MOST_LOSS = 0.1
+"""dB that all generations together may lose beyond the first."""
+
+
+class Copies:
+    """Files in a folder: what a scene is after it was compressed and decompressed.
+
+    Parameters
+    ----------
+    folder : Path
+        For the files; one of each kind is there at a time.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.file, self.ply = folder / "copy.fgs", folder / "copy.ply"
+
+    def of_grid(self, whole: Whole) -> SceneSource:
+        """The PLY that a result of the measured method decompresses to."""
+        write_grid(self.file, whole.grid, {})
+        return self._decompressed()
+
+    def of_choice(self, evaluator: SceneEvaluator, choice: Choice) -> SceneSource:
+        """The same for the paper's method."""
+        with evaluator.quantized(choice) as quantized:
+            write_container(self.file, quantized, {})
+        return self._decompressed()
+
+    def _decompressed(self) -> SceneSource:
+        write_ply(self.ply, open_fgs(self.file), force=True)
+        self.file.unlink()
+        return load_scene(self.ply).source
+
+    def remove(self) -> None:
+        """Take the last copy away."""
+        self.ply.unlink(missing_ok=True)
+
+
+def generations(bench: Bench, path: PrunePath, ours: Whole, amounts: Amounts, folder: Path) -> Experiment:
+    """Every generation of three methods, against the first original; and two targets in a row."""
+    copies = Copies(folder)
+    rows: list[dict[str, Cell]] = []
+
+    def add(method: str, generation: int, count: int, found: Outcome) -> None:
+        rows.append({"method": method, "generation": generation, "kept": count, **found.cells(bench)})
+
+    whole = ours
+    for generation in bench.progress.track(range(1, amounts.generations + 1), "generations", amounts.generations):
+        if generation > 1:
+            whole = _again(bench, copies.of_grid(whole), ours.size)
+        add(BEST, generation, whole.grid.count, of_source(bench, lambda: (whole.size, whole.source)))  # noqa: B023
+    for method, setting in (
+        (PAPER, Setting(bench.search.chosen.choice)),
+        (RTN, Setting(bits=BitSpec.rtn(8), groups=1)),
+    ):
+        evaluator, choice = bench.evaluator(setting), setting.choice
+        for generation in range(1, amounts.generations + 1):
+            if generation > 1:
+                source = copies.of_choice(evaluator, choice)
+                evaluator, choice = _evaluator(bench, source, np.arange(source.count), setting), EVERYTHING
+            count = evaluator.counts(choice)[0]
+            add(method, generation, count, of_choice(bench, lambda: evaluator, choice))  # noqa: B023
+    first = search(bench, path, MaxSize(int(FIRST_TIMES * ours.size) + SETTINGS_MOST, bench.plan.judge))
+    second = _again(bench, copies.of_grid(first), ours.size)
+    add(f"{BEST}, {IN_A_ROW}", 2, second.grid.count, of_source(bench, lambda: (second.size, second.source)))
+    add(f"{PAPER}, {IN_A_ROW}", 2, *_paper_in_a_row(bench, copies))
+    copies.remove()
+    table = Table(columns(method="method", generation="generation", kept="Gaussians kept", **LOSSES), tuple(rows))
+    parts = {name: [row for row in rows if row["method"] == name] for name in (BEST, PAPER, RTN)}
+    pairs = {name: [row for row in rows if row["method"] == f"{name}, {IN_A_ROW}"] for name in (BEST, PAPER)}
+    return Experiment(
+        "generations",
+        "Generation after generation",
+        "Compressed, decompressed to a PLY and compressed again, each time to the bytes of the first file, judged "
+        f"against the first original. {RTN}: one range a channel. {IN_A_ROW}: first to {FIRST_TIMES:g} times the "
+        "bytes, then what that decompresses to, to the bytes of the first generation.",
+        table,
+        LineChart(
+            "Loss of every generation",
+            "generation",
+            f"loss: {bench.plan.judge} (dB)",
+            (
+                *(curve(part, name, "generation") for name, part in parts.items()),
+                *(curve(part, f"{name}, {IN_A_ROW}", "generation", line=False) for name, part in pairs.items()),
+            ),
+            limit=BREAK,
+            magnitudes=True,
+        ),
+        (
+            *(_beyond(part, name) for name, part in parts.items()),
+            *(_in_a_row(pairs[name][0], parts[name][0], name) for name in pairs),
+        ),
+    )
+
+
+def _again(bench: Bench, source: SceneSource, size: int) -> Whole:
+    """The measured method on a scene, to so many bytes, as `compress` does it."""
+    workspace, target = bench.workspace, MaxSize(size + SETTINGS_MOST, bench.plan.judge)
+    renderer, budget = workspace.renderer, workspace.budget
+    # The limit has room for settings, as every search counts them.
+    found = kept_as_it_is(
+        GridCoder(renderer), renderer, source, bench.judge, target, bench.options, budget, lambda result: None
+    )
+    if found is not None:
+        grid, _ = found
+        return Whole(grid, coded_size(grid, {}), 0.0, np.arange(grid.count), 0, True)
+    with walked(bench, source, bench.views.of(bench.views.train)) as path:
+        return search(bench, path, target)
+
+
+def _evaluator(bench: Bench, source: SceneSource, order: np.ndarray, setting: Setting) -> SceneEvaluator:
+    workspace = bench.workspace
+    return SceneEvaluator(
+        source,
+        order,
+        nonzero_sh(source),
+        setting.bits,
+        setting.groups,
+        workspace.renderer,
+        bench.judge,
+        workspace.budget,
+    )
+
+
+def _paper_in_a_row(bench: Bench, copies: Copies) -> tuple[int, Outcome]:
+    last = Setting(bench.search.chosen.choice)
+    size = bench.size(last)
+    first = bench.adapt(MaxSize(int(FIRST_TIMES * size), bench.plan.judge)).chosen.choice
+    source = copies.of_choice(bench.evaluator(Setting(first)), first)
+    renderer = bench.workspace.renderer
+    with renderer.load(source) as scene:
+        order = order_from_scores(score_scene(renderer, scene, source, bench.views.of(bench.views.train)))
+    renderer.release()
+    evaluator = _evaluator(bench, source, order, last)
+    found = adapt(evaluator, MaxSize(size, bench.plan.judge), bench.options.effort, best_effort=True).chosen.choice
+    return evaluator.counts(found)[0], of_choice(bench, lambda: evaluator, found)
+
+
+def _beyond(rows: list[dict[str, Cell]], name: str) -> str:
+    first, last = rows[0], rows[-1]
+    if last["loss"] is None or first["loss"] is None:
+        return f"{name}: {last['broke'] or first['broke']}."
+    beyond = number(last, "loss") - number(first, "loss")
+    return (
+        f"{name}: generation {last['generation']} loses {beyond:+.3f} dB against the first ({last['loss']} and "
+        f"{first['loss']} dB, {last['size']} and {first['size']} bytes): "
+        f"{'within' if beyond <= MOST_LOSS else 'NOT within'} {MOST_LOSS:g} dB."
+    )
+
+
+def _in_a_row(row: Row, direct: Row, name: str) -> str:
+    return (
+        f"{name}, {IN_A_ROW}: {row['loss']} dB in {row['size']} bytes; "
+        f"{DIRECT}: {direct['loss']} dB in {direct['size']} bytes."
+    )

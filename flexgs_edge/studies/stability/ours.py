@@ -1,0 +1,126 @@
+"""The measured method on a bench: whole results at a target, or at a multiplier that is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.codec.v2.container import coded_size
+from flexgs_edge.goals.target import MaxDrop, Measurement, Target
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.values import from_grid
+from flexgs_edge.methods.best.grid_coder import GridCoder
+from flexgs_edge.methods.best.grid_search import RateSearch
+from flexgs_edge.methods.best.method import grid_search, open_path
+from flexgs_edge.methods.best.poses import scored_poses
+from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.judge import Judge, measurement_of
+from flexgs_edge.scene.source import MemorySource, SceneSource
+from flexgs_edge.studies.study_scene import Bench
+
+
+@dataclass(frozen=True, eq=False)
+class Whole:
+    """A whole result of the measured method.
+
+    Parameters
+    ----------
+    grid : GridScene
+    size : int
+        Bytes of its file, without what the header says about its making.
+    multiplier : float
+        Squared error that a bit was worth.
+    rows : np.ndarray
+        [n] i64, rows of the scene that were kept, ascending.
+    pixels : int
+        Pixels that were scored, of all poses: squared errors, and the multiplier with them, are sums over these.
+    reached : bool
+        The target holds.
+    """
+
+    grid: GridScene
+    size: int
+    multiplier: float
+    rows: np.ndarray
+    pixels: int
+    reached: bool
+
+    @property
+    def source(self) -> MemorySource:
+        """What its file decodes to."""
+        return MemorySource(from_grid(self.grid), origin=self.grid.origin)
+
+
+class FixedSearch(RateSearch):
+    """The search that can also be told the multiplier: where it stops is partly chance, what it does there is not."""
+
+    def at(self, multiplier: float) -> GridScene:
+        """The first whole result at a multiplier."""
+        return self._whole(multiplier, MaxDrop(1.0, "modelled drop"))[1]
+
+
+@contextmanager
+def walked(
+    bench: Bench,
+    source: SceneSource,
+    cameras: Sequence[Camera],
+    renderer: Renderer | None = None,
+    margin: bool = False,
+) -> Iterator[PrunePath]:
+    """The path of prune and rescore over some poses (`margin`: and made ones), for as many searches as wanted."""
+    workspace, options = bench.workspace, replace(bench.options, views_margin=margin)
+    renderer = renderer or workspace.renderer
+    with open_path(
+        renderer,
+        source,
+        scored_poses(cameras, options, renderer, source).cameras,
+        options,
+        workspace.budget,
+        workspace.clock,
+        bench.progress,
+    ) as path:
+        yield path
+
+
+def scored_pixels(path: PrunePath) -> int:
+    """Pixels that a path looks at in all its poses."""
+    return sum(camera.width * camera.height for camera in path.cameras)
+
+
+def search(bench: Bench, path: PrunePath, target: Target, judge: Judge | None = None) -> Whole:
+    """The search for a target along a path; the closest result where it cannot be met."""
+    judge = judge or bench.judge
+    made = _search(bench, path, judge, path.renderer)
+    with bench.workspace.clock.stage("search"):
+        found = made.run(target, best_effort=True)
+    multiplier = found.chosen.multiplier
+    return _whole(made, found.product, multiplier, found.reached)
+
+
+def whole_at(bench: Bench, path: PrunePath, judge: Judge, multiplier: float) -> Whole:
+    """The whole result at a multiplier, without a search."""
+    made = _search(bench, path, judge, path.renderer)
+    with bench.workspace.clock.stage("search"):
+        grid = made.at(multiplier)
+    return _whole(made, grid, multiplier, True)
+
+
+def _search(bench: Bench, path: PrunePath, judge: Judge, renderer: Renderer) -> FixedSearch:
+    def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
+        with renderer.load(MemorySource(planes, origin=path.origin)) as scene:
+            return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))
+
+    options = replace(bench.options, refit=True)
+    made = grid_search(options, GridCoder(renderer), FixedSearch)(path, measure, lambda step: None)
+    assert isinstance(made, FixedSearch)
+    return made
+
+
+def _whole(made: FixedSearch, grid: GridScene, multiplier: float, reached: bool) -> Whole:
+    rows = made.path.scene_rows(made.kept(multiplier).rows)
+    return Whole(grid, coded_size(grid, {}), multiplier, rows, scored_pixels(made.path), reached)

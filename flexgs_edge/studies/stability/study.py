@@ -1,0 +1,158 @@
+"""`study stability`: where methods break, experiment by experiment, and where ours stops standing."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from flexgs_edge.files import atomic_folder, check_folder
+from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.report.plots import require_matplotlib
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.studies.experiment import Experiment
+from flexgs_edge.studies.page import study_page
+from flexgs_edge.studies.stability import bits, removal
+from flexgs_edge.studies.stability.amounts import FULL, QUICK, Amounts
+from flexgs_edge.studies.stability.contenders import Contenders
+from flexgs_edge.studies.stability.generations import generations
+from flexgs_edge.studies.stability.heldout import held_out
+from flexgs_edge.studies.stability.moves import moves
+from flexgs_edge.studies.stability.ours import Whole, search, walked
+from flexgs_edge.studies.stability.searches import searches
+from flexgs_edge.studies.stability.strays import strays
+from flexgs_edge.studies.stability.unseen_poses import poses
+from flexgs_edge.studies.study_scene import Bench, open_bench, scene_names
+from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_scene
+
+LOG = logging.getLogger("flexgs_edge")
+
+EFFORT = "fast"
+"""Of all searches: what breaks does so at every effort, and there are some twenty of them."""
+
+
+COPIES = 6
+"""Times the scene's planes that moving it holds at once: as they are, in float64, turned, in float32."""
+
+
+@dataclass(frozen=True)
+class StabilityStudy(WrittenStudy):
+    """What `study stability` found and wrote."""
+
+    quick: bool
+
+    command = "study stability"
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {**super().to_json(), "quick": self.quick}
+
+
+def study_stability(
+    scene: str | Path,
+    output: str | Path,
+    options: CompressOptions | None = None,
+    progress: Progress = SILENT,
+    quick: bool = False,
+    **words: Any,
+) -> StabilityStudy:
+    """Look for the points at which methods break on a scene, and write them to a folder.
+
+    Parameters
+    ----------
+    scene : path
+        What `compress` takes.
+    output : path
+        Folder of the results: index.html, and every experiment's rows and chart as .csv, .json, .png and .svg. It appears when
+        everything is done; `force` lets it replace files of these names in a folder that is there.
+    options : CompressOptions, optional
+        Views, drawing, memory and device as for `compress`; the target is that of the results that are looked at.
+    progress : Progress, optional
+        Bars on long work.
+    quick : bool
+        Few points of every experiment, on small views.
+    **words
+        Single options by the names of `CompressOptions`.
+
+    Raises
+    ------
+    FlexGSError
+        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
+    """
+    options = replace(options or CompressOptions(), **{**words, "method": "best", "effort": EFFORT})
+    amounts = QUICK if quick else FULL
+    if amounts.width is not None:
+        options = replace(options, resolution=min(options.resolution, amounts.width))
+    # Loaded before the memory is planned, so that its bytes count as taken.
+    require_matplotlib()
+    check_folder(output, options.force)
+    with atomic_folder(output, options.force) as folder:
+        (name,) = scene_names([scene])
+        with open_bench(scene, name, options, progress, scores=("gs", "meson")) as bench:
+            found = SceneStudy.of(bench, _experiments(bench, amounts, folder))
+        page = study_page("Stability", _INTRO, [write_scene(folder, found)])
+        (folder / "index.html").write_text(page, encoding="utf-8")
+    LOG.info("wrote %s", Path(output) / "index.html")
+    return StabilityStudy(os.fspath(output), found, quick)
+
+
+_INTRO = (
+    "Where methods break. A method has broken at a point if it loses more than 3 dB there, or ends in an error; "
+    "charts cross out the first such point of each method, and the dashed line is the limit. All files are judged "
+    "by the same renderer; means over few views hide single bad ones, so the worst view, and where it matters the "
+    "worst tile, stand beside them."
+)
+
+
+def _experiments(bench: Bench, amounts: Amounts, folder: Path) -> list[Experiment]:
+    source, train = bench.scene.source, bench.views.of(bench.views.train)
+    bench.workspace.budget.require(
+        "copies of the scene", COPIES * source.count * sum(4 * source.width(name) for name in FIELD)
+    )
+    temporary = tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder)
+    with temporary as place:
+        # First: two paths at once would take twice the memory.
+        with walked(bench, source, train, margin=True) as path:
+            guarded = search(bench, path, bench.target)
+        with walked(bench, source, train) as path:
+            return _along_the_path(bench, path, guarded, amounts, Path(place))
+
+
+def _along_the_path(bench: Bench, path: PrunePath, guarded: Whole, amounts: Amounts, place: Path) -> list[Experiment]:
+    made: list[Experiment] = []
+
+    @contextmanager
+    def part(name: str) -> Iterator[None]:
+        LOG.info("%s: %s", bench.name, name)
+        with bench.workspace.clock.stage(name):
+            yield
+
+    with part("results at the target"):
+        ours = search(bench, path, bench.target)
+        contenders = Contenders(bench, ours, guarded)
+    with part("bits"):
+        made += [bits.rounding(bench, ours, amounts), bits.groups(bench, ours, amounts), strays(bench, ours, amounts)]
+    with part("views"):
+        made.append(removal.views(bench, amounts))
+        if amounts.halves and (sides := removal.halves(bench, ours)) is not None:
+            made.append(sides)
+    with part("held-out views"):
+        made.append(held_out(bench, path, contenders, amounts))
+    with part("poses"):
+        made += poses(bench, contenders, amounts)
+    with part("moves"):
+        made.append(moves(bench, ours, amounts, place))
+    with part("generations"):
+        made.append(generations(bench, path, ours, amounts, place))
+    # Last: it walks the path down to its end.
+    with part("pruning"):
+        made.insert(3, removal.pruning(bench, path, amounts))
+    made.append(searches(EFFORT))
+    return made

@@ -1,0 +1,277 @@
+"""A scene on the bench: opened and scored once, then measured at any setting, each setting once."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import SearchResult, Step
+from flexgs_edge.goals.target import Measurement, Target
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
+from flexgs_edge.methods.paper.scores import score_scene
+from flexgs_edge.methods.paper.search import adapt
+from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.progress import Progress
+from flexgs_edge.quality.psnr import error_for_drop
+from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.run.companions import companions_of
+from flexgs_edge.run.inputs import Scene, load_scene, resolve_drawing
+from flexgs_edge.run.judge import Judge
+from flexgs_edge.run.open_bench import Workspace
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.plan import EVERYTHING, Plan
+from flexgs_edge.run.view_set import Views, find_views
+from flexgs_edge.studies.result_tables import Cell
+
+LOG = logging.getLogger("flexgs_edge")
+
+RANK_BYTES = 24
+"""Bytes a row and score that the bench and its evaluator hold: order, rank, and the rows with SH above each rank."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is done to the scene: rates, bits, groups per channel, and the score that ranks."""
+
+    choice: Choice = EVERYTHING
+    bits: BitSpec = PAPER
+    groups: int | None = None
+    score: str = "gs"
+
+
+@dataclass(frozen=True)
+class Point:
+    """A setting, its exact bytes and its measured quality."""
+
+    setting: Setting
+    size: int
+    measurement: Measurement
+
+
+class Bench:
+    """A scene, its judge and everything measured so far.
+
+    Parameters
+    ----------
+    name : str
+        Of the scene, for tables and folders.
+    scene, views, plan, options
+        As `compress` has them; the plan's views and figure decide here too.
+    workspace : Workspace
+        Renderer, budget and stopwatch.
+    judge : Judge
+        With the original's renders.
+    orders : dict
+        Rows from the least important, [N] i64, by score.
+    has_sh : np.ndarray
+        [N] bool.
+    progress : Progress
+        Bars over settings.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        scene: Scene,
+        views: Views,
+        plan: Plan,
+        options: CompressOptions,
+        workspace: Workspace,
+        judge: Judge,
+        orders: dict[str, np.ndarray],
+        has_sh: np.ndarray,
+        progress: Progress,
+    ) -> None:
+        self.name, self.scene, self.views, self.plan, self.options = name, scene, views, plan, options
+        self.workspace, self.judge, self.orders, self.has_sh, self.progress = workspace, judge, orders, has_sh, progress
+        self._evaluators: dict[str, SceneEvaluator] = {}
+        self._points: dict[Setting, Point] = {}
+        self._search: SearchResult | None = None
+
+    @property
+    def target(self) -> Target:
+        """What the search of this study aims at."""
+        assert self.plan.target is not None
+        return self.plan.target
+
+    @property
+    def figure(self) -> str:
+        """The column that decides: `drop` with photos, else `modelled_drop`."""
+        return self.plan.judge.replace(" ", "_")
+
+    @property
+    def decided_by(self) -> str:
+        """The deciding figure and its views, in words."""
+        views = f"{len(self.plan.decide)} {self.plan.kind_of(self.plan.decide, self.views)} views"
+        if self.plan.judge == "drop":
+            return f"drop in PSNR against the photos, mean over {views}"
+        return (
+            f"modelled drop (no photos: error against the original's renders, from a base of {self.options.base_psnr:g} dB), "
+            f"over {views}"
+        )
+
+    def evaluator(self, setting: Setting) -> SceneEvaluator:
+        """The pipeline's evaluator, set to the bits, groups and score of `setting`, until it is asked for again."""
+        if setting.score not in self._evaluators:
+            workspace = self.workspace
+            self._evaluators[setting.score] = SceneEvaluator(
+                self.scene.source,
+                self.orders[setting.score],
+                self.has_sh,
+                setting.bits,
+                setting.groups,
+                workspace.renderer,
+                self.judge,
+                workspace.budget,
+            )
+        evaluator = self._evaluators[setting.score]
+        evaluator.bits, evaluator.groups = setting.bits, setting.groups
+        return evaluator
+
+    def size(self, setting: Setting) -> int:
+        """Exact bytes of the file; costs nothing."""
+        return self.evaluator(setting).size(setting.choice)
+
+    def point(self, setting: Setting) -> Point:
+        """Measure a setting, or remember it."""
+        if setting not in self._points:
+            found = self.evaluator(setting).measure(setting.choice)
+            self._points[setting] = Point(setting, self.size(setting), found)
+        return self._points[setting]
+
+    def points(self, settings: Sequence[Setting], label: str) -> list[Point]:
+        """Measure several settings, under a progress bar."""
+        return [self.point(setting) for setting in self.progress.track(settings, label, len(settings))]
+
+    def adapt(self, target: Target, on_step: Callable[[Step], None] | None = None) -> SearchResult:
+        """The paper's search for `target` over this bench's points; the closest point where it cannot be met."""
+        return adapt(_Remembering(self), target, self.options.effort, best_effort=True, on_step=on_step)
+
+    @property
+    def search(self) -> SearchResult:
+        """The search for the study's own target; made when first asked for."""
+        if self._search is None:
+            self._search = self.adapt(self.target)
+        return self._search
+
+    def figures(self, size: int, found: Measurement) -> dict[str, Cell]:
+        """Cells of `FIGURES`: bytes and quality."""
+        return {
+            "size": size,
+            "ratio": round(self.scene.ply_bytes / size, 3),
+            "drop": _decibel(found.drop),
+            "fidelity": _decibel(found.fidelity),
+            "modelled_drop": _decibel(found.modelled_drop),
+        }
+
+    def cells(self, point: Point) -> dict[str, Cell]:
+        """Cells of `FIGURES` of a point."""
+        return self.figures(point.size, point.measurement)
+
+    def error(self, point: Point) -> float:
+        """Mean squared error against the original's renders, mean over the views."""
+        return error_for_drop(point.measurement.modelled_drop, self.options.base_psnr)
+
+
+FIGURES = {
+    "size": "bytes",
+    "ratio": "ratio to PLY",
+    "drop": "drop (dB)",
+    "fidelity": "fidelity (dB)",
+    "modelled_drop": "modelled drop (dB)",
+}
+"""Columns that every measured row ends with, and their heads."""
+
+
+class _Remembering:
+    """The evaluator that a search gets: what the bench has measured is not measured again."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
+
+    def size(self, choice: Choice) -> int:
+        return self.bench.size(Setting(choice))
+
+    def measure(self, choice: Choice) -> Measurement:
+        return self.bench.point(Setting(choice)).measurement
+
+    def estimate(self, choice: Choice) -> Measurement:
+        return self.bench.evaluator(Setting()).estimate(choice)
+
+
+@contextmanager
+def open_bench(
+    path: str | Path, name: str, options: CompressOptions, progress: Progress, scores: Sequence[str] = ("gs",)
+) -> Iterator[Bench]:
+    """Open a scene, draw the original's renders and score every Gaussian, as `compress --method paper` does.
+
+    Raises
+    ------
+    FlexGSError
+        As `compress`.
+    """
+    clock = Stopwatch()
+    budget = MemoryBudget.from_limit(options.memory_limit)
+    with clock.stage("open"):
+        companions = companions_of(path)
+        scene = load_scene(path, options.drop_invalid)
+        options = resolve_drawing(options, scene, companions)
+        views = find_views(options, companions, scene.source)
+        # The plan refuses scenes without cameras and splits without training poses, in the words of `compress`.
+        plan = Plan.make(options, scene, views)
+        has_sh = nonzero_sh(scene.source)
+    assert views is not None
+    with ExitStack() as stack:
+        workspace = stack.enter_context(Workspace(options, budget, clock))
+        renderer = workspace.renderer
+        budget.take("ranks", RANK_BYTES * scene.source.count * len(scores))
+        judge = Judge(
+            renderer, scene.source, views, plan.decide, budget, plan.judge == "drop", base_psnr=options.base_psnr
+        )
+        stack.callback(judge.close)
+        with clock.stage("load"):
+            original = renderer.load(scene.source)
+        orders = {}
+        with original:
+            with clock.stage("references"):
+                judge.prepare(original, progress)
+            cameras = views.of(views.train)
+            for score in scores:
+                LOG.info("%s: %s scores over %d training poses", name, score, len(cameras))
+                with clock.stage(f"score {score}"):
+                    found = score_scene(renderer, original, scene.source, cameras, score, progress)
+                    orders[score] = order_from_scores(found)
+        renderer.release()
+        yield Bench(name, scene, views, plan, options, workspace, judge, orders, has_sh, progress)
+
+
+def scene_names(paths: Sequence[str | Path]) -> list[str]:
+    """A short name for every scene, no two alike: the file's, or its folder's where the file is a `point_cloud`.
+
+    >>> scene_names(["a/fox/point_cloud.ply", "b/fox/point_cloud/iteration_7000/point_cloud.ply", "garden.fgs"])
+    ['fox', 'fox-2', 'garden']
+    """
+    names: list[str] = []
+    for path in paths:
+        place = Path(path).absolute()
+        parts = [part for part in place.parts[1:-1] if part != "point_cloud" and not part.startswith("iteration_")]
+        stem = place.name if place.is_dir() else place.name.split(".")[0]
+        base = parts[-1] if stem in ("point_cloud", "") and parts else stem
+        name, number = base, 1
+        while name in names:
+            number += 1
+            name = f"{base}-{number}"
+        names.append(name)
+    return names
+
+
+def _decibel(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)

@@ -1,0 +1,130 @@
+"""What a study found on a scene, for people and machines, and its files."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from flexgs_edge._version import __version__
+from flexgs_edge.report.plots import picture
+from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.summary import device_words
+from flexgs_edge.run.inputs import scene_info
+from flexgs_edge.run.view_set import views_info
+from flexgs_edge.studies.experiment import Experiment
+from flexgs_edge.studies.page import Section
+from flexgs_edge.studies.result_tables import json_bytes
+from flexgs_edge.studies.study_scene import Bench
+
+
+@dataclass(frozen=True)
+class SceneStudy:
+    """What was found on one scene."""
+
+    name: str
+    scene: SceneInfo
+    views: ViewsInfo
+    decided_by: str
+    experiments: tuple[Experiment, ...]
+    run: RunInfo
+
+    @classmethod
+    def of(cls, bench: Bench, experiments: list[Experiment]) -> SceneStudy:
+        """The experiments made on a bench."""
+        return cls(
+            bench.name,
+            scene_info(bench.scene),
+            views_info(bench.views),
+            bench.decided_by,
+            tuple(experiments),
+            bench.workspace.run_info(),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {
+            "name": self.name,
+            "input": self.scene.to_json(),
+            "views": self.views.to_json(),
+            "decided_by": self.decided_by,
+            "experiments": [experiment.to_json() for experiment in self.experiments],
+            "run": self.run.to_json(),
+        }
+
+    def to_lines(self) -> list[str]:
+        """The findings, for people."""
+        lines = [f"{self.name}: {self.scene.count} Gaussians; {self.decided_by}"]
+        for experiment in self.experiments:
+            lines.append(f"  {experiment.title}")
+            lines += [f"    {words}" for words in experiment.findings]
+            lines += [f"    {b.what}: {b.here}; paper: {b.paper}" for b in experiment.beside]
+        return lines
+
+
+@dataclass(frozen=True)
+class WrittenStudy:
+    """What a study of one scene found and wrote.
+
+    Parameters
+    ----------
+    output : str
+        The folder.
+    scene : SceneStudy
+    """
+
+    output: str
+    scene: SceneStudy
+
+    command: ClassVar[str]
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {
+            "program": f"flexgs-edge {__version__}",
+            "command": self.command,
+            "output": self.output,
+            **self.scene.to_json(),
+        }
+
+    def to_text(self) -> str:
+        """The findings, for people."""
+        return "\n".join([*self.scene.to_lines(), f"wrote {os.path.join(self.output, 'index.html')}"]) + "\n"
+
+
+def write_scene(place: Path, scene: SceneStudy) -> Section:
+    """Write every experiment's rows and chart into a folder that is there; its section of the page."""
+    drawn = []
+    for experiment in scene.experiments:
+        png, svg = picture(experiment.chart)
+        record = {"scene": scene.name, "decided_by": scene.decided_by, **experiment.to_json()}
+        for suffix, data in (
+            ("csv", experiment.table.to_csv()),
+            ("json", json_bytes(record)),
+            ("png", png),
+            ("svg", svg),
+        ):
+            (place / f"{experiment.key}.{suffix}").write_bytes(data)
+        drawn.append((experiment, svg))
+    return Section(scene.name, _facts(scene), drawn)
+
+
+def _facts(scene: SceneStudy) -> list[tuple[str, str]]:
+    views = scene.views
+    facts = [
+        ("file", scene.scene.path),
+        (
+            "Gaussians",
+            f"{scene.scene.count}, SH degree {scene.scene.sh_degree}, PLY {scene.scene.ply_bytes / 1e6:.1f} MB",
+        ),
+        (
+            "views",
+            f"{views.total} of {views.width}x{views.height}, {views.train} training and {views.held_out} held out",
+        ),
+        ("decided by", scene.decided_by),
+    ]
+    facts += [("note", note) for note in (*scene.scene.notes, *views.notes)]
+    if scene.run.device is not None:
+        facts.append(("device", device_words(scene.run.device)))
+    return facts

@@ -1,1 +1,0 @@
-"""Experiments of `study stability`: where methods break, and where ours stops standing."""

@@ -1,0 +1,48 @@
+"""Sizes in bytes as people write them: `8MB`, `1.5 GiB`."""
+
+from __future__ import annotations
+
+import re
+
+from flexgs_edge.errors import InputError
+
+_UNITS = {
+    "": 1,
+    "B": 1,
+    "KB": 10**3,
+    "MB": 10**6,
+    "GB": 10**9,
+    "KIB": 2**10,
+    "MIB": 2**20,
+    "GIB": 2**30,
+}
+
+
+def parse_size(text: str) -> int:
+    """Bytes from `1.5MB` (10^6), `512MiB` (2^20) or plain bytes.
+
+    >>> parse_size("1.5MB"), parse_size("512MiB"), parse_size("700")
+    (1500000, 536870912, 700)
+    """
+    match = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?|\.[0-9]+)\s*([A-Za-z]*)\s*", text)
+    unit = match.group(2).upper() if match else None
+    if match is None or unit not in _UNITS:
+        raise InputError(f"size {text!r}: expected a number and a unit such as 700, 1.5MB or 512MiB")
+    return int(float(match.group(1)) * _UNITS[unit])
+
+
+def format_size(size: int) -> str:
+    """Bytes for people, in powers of ten: `1.50 MB`.
+
+    >>> format_size(1500000)
+    '1.50 MB'
+    """
+    for unit, scale in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
+        if size >= scale:
+            return f"{size / scale:.2f} {unit}"
+    return f"{size} B"
+
+
+def format_mib(size: int) -> str:
+    """Bytes for memory limits, rounded up to whole MiB: `512MiB` (what `parse_size` reads back)."""
+    return f"{-(-size // 2**20)}MiB"

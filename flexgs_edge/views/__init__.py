@@ -1,0 +1,1 @@
+"""Many views: references, sums over views, the workers of a cluster."""

@@ -1,0 +1,202 @@
+"""Views drawn by the workers of a Dask cluster; sums and pictures come back in the order of the views.
+
+What is added up, and in which order, is the same as on one machine, so a file does not depend on who drew what. Dask runs
+everything, and what a lost worker was drawing is drawn again by another.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import uuid
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from functools import partial
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge._version import __version__
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.errors import DeviceError, InputError
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import MemorySource, SceneSource
+from flexgs_edge.views.one_view import Drawn
+from flexgs_edge.views.worker import Drawing, _draw_planes, _draw_sums, _version, _warm_up
+
+LOG = logging.getLogger("flexgs_edge")
+
+AHEAD = 2
+"""Views for each worker that are asked for before the first of them is taken: their sums wait in the workers' memory."""
+SENDINGS = 3
+"""Times that a scene is sent when all workers that held it were lost."""
+CONNECT_SECONDS = 30
+NICE = 10
+"""Of processes that are started here: fox, half a second of 14 less."""
+
+
+class Cluster:
+    """Workers that draw; a context manager.
+
+    Processes of this machine take seconds to start, meanwhile whoever asks draws himself.
+
+    Parameters
+    ----------
+    address : str
+        Of a Dask scheduler, such as `tcp://10.0.0.5:8786`, or `local:N` for N processes of one thread each on this machine.
+    drawing : Drawing
+
+    Raises
+    ------
+    InputError
+        When the package is missing, the address is wrong or nobody answers, or workers have another version of this program.
+    """
+
+    _starting: Future[None] | None = None
+
+    def __init__(self, address: str, drawing: Drawing) -> None:
+        if find_spec("distributed") is None:
+            raise InputError("--cluster needs the package distributed: pip install 'flexgs-edge[cluster]'")
+        self._drawing = drawing
+        self._client: Any = None
+        self._local: Any = None
+        if not address.startswith("local:"):
+            self._connect(address, None)
+            return
+        count = address.removeprefix("local:")
+        if not count.isdecimal() or int(count) < 1:
+            raise InputError(f"--cluster {address}: expected a number of processes above 0, such as local:2")
+        starter = ThreadPoolExecutor(1, "cluster")
+        self._starting = starter.submit(self._connect, address, int(count))
+        starter.shutdown(wait=False)
+
+    def _connect(self, address: str, processes: int | None) -> None:
+        """Connect to the cluster, or start one of so many processes here."""
+        if processes is not None and hasattr(os, "setpriority"):
+            # Of this thread and all that it starts: views are drawn meanwhile, and whoever waits for workers leaves them a core.
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+        import distributed  # takes a second
+
+        self._lost = distributed.KilledWorker
+        if processes is not None:
+            self._local = distributed.LocalCluster(
+                n_workers=processes,
+                threads_per_worker=1,
+                memory_limit=0,  # what draws has a limit of its own
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+                env={"POCL_MAX_PTHREAD_COUNT": "1"},
+            )
+        try:
+            client = distributed.Client(
+                self._local or address,
+                timeout=CONNECT_SECONDS,
+                set_as_default=False,
+                direct_to_workers=self._local is not None,
+            )
+            versions = set(client.run(_version).values())
+        except (OSError, ValueError, ImportError) as error:
+            raise InputError(
+                f"--cluster {address}: no cluster of workers with flexgs-edge answers ({error})"
+            ) from error
+        self._client = client
+        if versions != {__version__}:
+            self._leave()
+            raise InputError(
+                f"--cluster {address}: expected workers with flexgs-edge {__version__}, found "
+                f"{', '.join(sorted(versions)) or 'no worker'}"
+            )
+        if processes is not None:
+            client.run(_warm_up, self._drawing)
+
+    @property
+    def ready(self) -> bool:
+        """Whether there are workers yet; raises `InputError` when they cannot be started."""
+        if self._starting is not None:
+            if not self._starting.done():
+                return False
+            self._starting.result()
+        return True
+
+    def close(self) -> None:
+        """Leave the cluster; a local one ends."""
+        if self._starting is not None:
+            self._starting.exception()  # waits; what went wrong was said where it was asked for, or does not matter any more
+        self._leave()
+
+    def _leave(self) -> None:
+        for part in (self._client, self._local):
+            if part is not None:
+                part.close()
+
+    def __enter__(self) -> Cluster:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def planes(self, source: SceneSource, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
+        """`Renderer.render_planes` of each view, in their order."""
+        return self._drawn(_draw_planes, source, [partial(_words, camera) for camera in cameras])
+
+    def sums(
+        self,
+        source: SceneSource,
+        kind: str,
+        cameras: Sequence[Camera],
+        targets: Callable[[int], np.ndarray] | None,
+        pictures: bool,
+    ) -> Iterator[Drawn]:
+        """What rows got in each view, in their order: see `ViewSums.draw`."""
+
+        def words(view: int) -> tuple[Any, ...]:
+            return kind, cameras[view], None if targets is None else targets(view), pictures
+
+        return self._drawn(_draw_sums, source, [partial(words, view) for view in range(len(cameras))])
+
+    def _drawn(
+        self, draw: Callable[..., Any], source: SceneSource, views: Sequence[Callable[[], tuple[Any, ...]]]
+    ) -> Iterator[Any]:
+        if not isinstance(source, MemorySource):
+            source = MemorySource(source.read(slice(0, source.count), list(FIELD)), source.sh_degree, source.origin)
+        done = 0
+        for _ in range(SENDINGS):
+            try:
+                for found in self._ask(draw, source, views[done:]):
+                    yield found
+                    done += 1
+                return
+            except CancelledError:
+                LOG.warning("all workers that held the scene were lost: it is sent again")
+            except self._lost as error:
+                raise DeviceError(
+                    f"--cluster: workers died while they drew ({error}); is their memory too small?"
+                ) from error
+        raise DeviceError(f"--cluster: the workers were lost {SENDINGS} times")
+
+    def _ask(
+        self, draw: Callable[..., Any], source: MemorySource, views: Sequence[Callable[[], tuple[Any, ...]]]
+    ) -> Iterator[Any]:
+        """Results in order; few at a time are under way."""
+        client = self._client
+        held = client.scatter([(uuid.uuid4().hex, source)], broadcast=True, hash=False)[0]
+        most, asked = AHEAD * max(len(client.nthreads()), 1), deque[Any]()
+        try:
+            for view in views:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # targets of large views make "large graphs"
+                    asked.append(client.submit(draw, held, self._drawing, *view(), pure=False))
+                if len(asked) == most:
+                    yield asked.popleft().result()
+            while asked:
+                yield asked.popleft().result()
+        finally:
+            client.cancel([held, *asked])
+
+
+def _words(*words: Any) -> tuple[Any, ...]:
+    return words

@@ -1,0 +1,175 @@
+"""Sums over views, chunk by chunk of the scene: added up view by view where memory holds them, else chunk by chunk.
+
+In memory every view is added to the sums of all chunks as soon as it is drawn. Where these do not fit, what each row got in
+each view is written to a file (only the rows that got something, 52 bytes at most), and read again chunk by chunk: then the sums
+of one chunk are held at a time. Both add up the same numbers in the same order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.render.chunks import Chunk
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.fit import padded
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.views.one_view import Drawn, Part, view_parts, view_sums
+from flexgs_edge.views.spool import _Dense, _Spool
+
+
+class ChunkSums(Protocol):
+    """Sums over views of the rows of one chunk."""
+
+    def add(self, chunk: Chunk, sums: Any, base: int) -> None:
+        """Add the view that `Renderer.camera_array` tells of; the chunk's rows begin at row `base` of its `sums`."""
+
+    def release(self) -> None:
+        """Free what is held on the backend."""
+
+
+Maker = Callable[[Chunk], ChunkSums]
+
+
+class ViewSums:
+    """Sums over the views of a scene.
+
+    Parameters
+    ----------
+    renderer, scene : Renderer, DeviceScene
+    makers : sequence of callable
+        Each makes one kind of sums for a chunk.
+    """
+
+    def __init__(self, renderer: Renderer, scene: DeviceScene, makers: Sequence[Maker]) -> None:
+        self._renderer, self._scene, self._makers = renderer, scene, makers
+        self._held: dict[int, tuple[int, list[ChunkSums]]] = {}
+        self._spool: _Spool | None = None
+        self._dense: _Dense | None = None
+
+    def draw(
+        self,
+        kind: str,
+        cameras: Sequence[Camera],
+        targets: Callable[[int], np.ndarray] | None = None,
+        pictures: bool = False,
+    ) -> Iterator[Callable[[], np.ndarray]]:
+        """Draw views and add them, one for each step of the iterator, in their order: here, or on the renderer's cluster.
+
+        Parameters
+        ----------
+        kind : str
+            Method of `Renderer` that gives a view's sums.
+        targets : callable, optional
+            The target of a view by its place among `cameras`, where that method wants one.
+        pictures : bool
+            Whether what is yielded will be asked for.
+
+        Yields
+        ------
+        callable
+            Gives the view for `TargetViews.add`; valid until the next step.
+        """
+        renderer, scene, cluster = self._renderer, self._scene, self._renderer.ready_cluster
+        if cluster is None or scene.source is None:
+            for view, camera in enumerate(renderer.in_turn(scene, cameras)):
+                self.add_view(view_sums(renderer, scene, kind, camera, targets and targets(view)), camera)
+                yield renderer.drawn_planes
+            return
+        found = cluster.sums(scene.source, kind, cameras, targets, pictures)
+        for camera, drawn in zip(cameras, found, strict=True):
+            self._add_drawn(drawn.parts, camera)
+            yield partial(_picture, drawn)
+
+    def add_view(self, sums: Any, camera: Camera) -> None:
+        """Add the view drawn last, from `camera`. The order of views is part of the result."""
+        if self._renderer.view_rows is not None:
+            self._add_parts(view_parts(self._renderer, self._scene, sums), camera)
+            return
+        for chunk, held in self._chunks():
+            for part in held:
+                part.add(chunk, sums, chunk.base)
+
+    def _chunks(self) -> Iterator[tuple[Chunk, list[ChunkSums]]]:
+        """Chunks of the scene, and their sums in memory."""
+        for chunk in self._scene.chunks():
+            if chunk.base not in self._held:
+                self._held[chunk.base] = (chunk.count, [make(chunk) for make in self._makers])
+            yield chunk, self._held[chunk.base][1]
+
+    def _add_drawn(self, parts: Sequence[Part], camera: Camera) -> None:
+        """Add a view that was drawn elsewhere."""
+        renderer, scene = self._renderer, self._scene
+        if renderer.room.spills:
+            self._add_parts(parts, camera)
+            return
+        if not parts:  # a compact view of nothing
+            return
+        renderer.aim(camera, scene.origin)
+        for chunk, held in self._chunks():
+            some = [slice(*np.searchsorted(rows, (chunk.base, chunk.base + chunk.count))) for rows, _ in parts]
+            shape = chunk.stride, *parts[0][1].shape[1:]
+            if self._dense is None or self._dense.shape != shape:
+                self._drop_dense()
+                self._dense = _Dense(renderer.backend, shape)
+            inside = [(rows[at], values[at]) for (rows, values), at in zip(parts, some, strict=True)]
+            sums = self._dense.of(inside, chunk.base)
+            for part in held:
+                part.add(chunk, sums, 0)
+
+    def _drop_dense(self) -> None:
+        if self._dense is not None:
+            self._dense.release()
+            self._dense = None
+
+    def _add_parts(self, parts: Iterable[Part], camera: Camera) -> None:
+        if self._spool is None:
+            self._spool = _Spool(self._renderer.room, self._scene.starts)
+        self._spool.add(parts, camera)
+
+    def parts(self) -> Iterator[tuple[slice, list[Any]]]:
+        """Rows of the scene and their sums over the views added, one of each kind, chunk by chunk; valid until the next."""
+        if self._held:
+            for base, (count, parts) in self._held.items():
+                yield slice(base, base + count), parts
+            return
+        self._make_room()
+        for chunk in self._scene.chunks():
+            parts = [make(chunk) for make in self._makers]
+            try:
+                # Without a spool there was no view, and the sums are those of nothing.
+                for sums in self._spool.replay(self._renderer, self._scene, chunk) if self._spool else ():
+                    for part in parts:
+                        part.add(chunk, sums, 0)
+                yield slice(chunk.base, chunk.base + chunk.count), parts
+            finally:
+                for part in parts:
+                    part.release()
+
+    def _make_room(self) -> None:
+        """Give up the buffers of the last view where the sums of a chunk have no place beside them."""
+        renderer, scene = self._renderer, self._scene
+        rows = padded(int(np.diff(scene.starts).max(initial=0)))
+        if renderer.budget.free < scene.least_chunk_bytes + rows * scene.sum_bytes:
+            scene.drop_statistics()
+            renderer.release()
+
+    def release(self) -> None:
+        """Free what is held."""
+        for _, parts in self._held.values():
+            for part in parts:
+                part.release()
+        self._held = {}
+        self._drop_dense()
+        if self._spool is not None:
+            self._spool.close()
+            self._spool = None
+
+
+def _picture(drawn: Drawn) -> np.ndarray:
+    assert drawn.picture is not None
+    return drawn.picture

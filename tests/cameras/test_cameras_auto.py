@@ -1,0 +1,266 @@
+"""The automatic rig: never inside matter, where the scene is meant to be seen from, always the same, good to rank by."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flexgs_edge.cameras.auto import automatic_rig, fibonacci, look, up_axis
+from flexgs_edge.cameras.camera import Camera, split_views
+from flexgs_edge.cameras.photos import Photos
+from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.cameras.witnesses import gather_witnesses, sh_basis, weighted_quantiles
+from flexgs_edge.errors import InputError
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.io.ply import PlySource
+from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores, ranks_from_order, select_rows
+from flexgs_edge.methods.paper.scores import score_scene
+from flexgs_edge.packed.bitspec import PAPER
+from flexgs_edge.packed.quantize import quantize_scene, quantized_bytes
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.scene.fields import FIELD, sh_rest_count
+from flexgs_edge.scene.source import MemorySource, SceneSource
+from kernel_fixtures import default_device, draw, large_budget, open_form
+from synthetic import joined, make_splats
+
+
+def ball(
+    radius: float = 1.0, count: int = 3000, centre: tuple[float, float, float] = (0.0, 0.0, 0.0), seed: int = 0
+) -> MemorySource:
+    """A solid opaque object (a hollow one without SH could as well be a room)."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(count, 3))
+    points *= radius * rng.uniform(0, 1, (count, 1)) ** (1 / 3) / np.linalg.norm(points, axis=1, keepdims=True)
+    return make_splats(points + centre, np.full((count, 3), 1.2 * radius / count ** (1 / 3)), opacity=0.95)
+
+
+def room(half: float = 4.0, count: int = 6000, seed: int = 0) -> MemorySource:
+    """Six walls around an empty middle."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-half, half, (count, 3))
+    points[np.arange(count), rng.integers(0, 3, count)] = half * rng.choice([-1.0, 1.0], count)
+    return make_splats(points, np.full((count, 3), 2.5 * half / math.sqrt(count / 6)), opacity=0.95)
+
+
+def with_sh(source: MemorySource, eye: np.ndarray, degree: int = 3, seed: int = 0) -> MemorySource:
+    """SH as training from `eye` leaves them: steps along the basis of the directions looked from, times some gradient."""
+    rng = np.random.default_rng(seed)
+    planes = source.read(slice(0, source.count), list(FIELD))
+    kept = sh_rest_count(degree)
+    total = np.zeros((3, kept, source.count))
+    for _ in range(6):
+        lines = planes["means"] - (eye + rng.normal(0, 0.5, 3))[:, None]
+        lines = lines / np.linalg.norm(lines, axis=0)
+        total += rng.normal(0, 0.05, (3, 1, source.count)) * sh_basis(lines.astype(np.float64), kept)
+    planes["sh_rest"] = total.reshape(3 * kept, source.count).astype(np.float32)
+    return MemorySource(planes, degree)
+
+
+def centres(cameras: list[Camera]) -> np.ndarray:
+    return np.array([camera.center for camera in cameras])
+
+
+def forwards(cameras: list[Camera]) -> np.ndarray:
+    return np.array([camera.rotation[2] for camera in cameras])
+
+
+def blocked(source: SceneSource, camera: Camera, near: float) -> float:
+    """Light of a view that is gone before `near` scene units, in the mean over pixels (0 to 1)."""
+    rows = source.read(slice(0, source.count), list(FIELD))
+    close = np.linalg.norm(rows["means"] - (camera.center - source.origin)[:, None], axis=0) < near
+    white = {name: plane[:, close] for name, plane in rows.items() if name != "sh_rest"}
+    white["sh_dc"] = np.full((3, int(close.sum())), 0.5 / 0.28209479177387814, np.float32)
+    if not close.any():
+        return 0.0
+    return float(draw(open_form("numpy"), MemorySource(white), camera.scaled(32, 24), near=0.01).mean())
+
+
+def test_an_object_is_seen_from_outside() -> None:
+    source = ball(1.0, centre=(10.0, -3.0, 2.0))
+    cameras, note = automatic_rig(source, views=16, width=64, height=48)
+    offsets = centres(cameras) - [10.0, -3.0, 2.0]
+    distance = np.linalg.norm(offsets, axis=1)
+    assert distance.min() > 1.2 and distance.max() < 8
+    # They look at it, and they stand around it.
+    assert (np.einsum("vx,vx->v", forwards(cameras), -offsets / distance[:, None]) > 0.7).all()
+    directions = offsets / distance[:, None]
+    assert np.linalg.norm(directions.mean(axis=0)) < 0.35
+    assert (directions @ fibonacci(12).T).max(axis=0).min() > 0.6
+    assert "16 automatic views from outside" in note and "by what is in sight" in note
+
+
+def test_a_room_is_seen_inside_out() -> None:
+    source = room()
+    cameras, note = automatic_rig(source, views=16, width=64, height=48)
+    assert (np.abs(centres(cameras)) < 3.9).all()
+    # All six walls are looked at.
+    assert (forwards(cameras) @ np.concatenate([np.eye(3), -np.eye(3)]).T).max(axis=0).min() > 0.6
+    assert "inside out" in note
+
+
+def test_an_object_in_a_room_is_seen_between_the_two() -> None:
+    source = joined(ball(0.8, 2500), room(5.0))
+    cameras, _ = automatic_rig(source, views=16, width=64, height=48)
+    assert (np.linalg.norm(centres(cameras), axis=1) > 0.9).all() and (np.abs(centres(cameras)) < 4.9).all()
+
+
+@pytest.mark.parametrize("kind", ["object", "room", "both"])
+def test_no_view_starts_inside_matter(kind: str) -> None:
+    source = {"object": ball(), "room": room(), "both": joined(ball(0.8, 2500), room(5.0))}[kind]
+    cameras, _ = automatic_rig(source, views=12, width=64, height=48)
+    assert max(blocked(source, camera, 0.15) for camera in cameras) < 0.3
+
+
+# Degree 1 alone is as strong from behind: it tells the axis, not the side.
+@pytest.mark.parametrize(("eye", "degree"), [((6.0, 0.0, 1.0), 2), ((0.0, -5.0, 0.5), 3)])
+def test_sh_tell_where_cameras_stood(eye: tuple[float, float, float], degree: int) -> None:
+    source = with_sh(ball(1.5, 4000), np.array(eye), degree)
+    cameras, note = automatic_rig(source, views=16, width=64, height=48)
+    side = np.array(eye) / np.linalg.norm(eye)
+    standing = centres(cameras) @ side / np.linalg.norm(centres(cameras), axis=1)
+    assert np.mean(standing) > 0.5 and "where SH are strongest" in note
+    blind, _ = automatic_rig(ball(1.5, 4000), views=16, width=64, height=48)
+    assert np.mean(centres(blind) @ side / np.linalg.norm(centres(blind), axis=1)) < 0.3
+
+
+def test_the_same_scene_gets_the_same_rig() -> None:
+    first, second = (automatic_rig(room(), views=9)[0] for _ in range(2))
+    assert [camera.name for camera in first] == [f"auto_{i:03d}" for i in range(9)] == sorted(c.name for c in first)
+    for a, b in zip(first, second):
+        np.testing.assert_array_equal(a.rotation, b.rotation)
+        np.testing.assert_array_equal(a.translation, b.translation)
+    assert {(c.width, c.height) for c in first} == {(640, 480)}
+    assert 2 * math.degrees(math.atan(320 / first[0].fx)) == pytest.approx(50)
+    for camera in first:
+        np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(camera.rotation) == pytest.approx(1)
+    # A smaller rig is the start of a larger one.
+    few, _ = automatic_rig(room(), views=4)
+    np.testing.assert_allclose(centres(few), centres(first[:4]), atol=1e-12)
+    np.testing.assert_allclose(forwards(few), forwards(first[:4]), atol=1e-12)
+
+
+def test_scale_and_place_do_not_matter() -> None:
+    small, _ = automatic_rig(ball(), views=6)
+    planes = ball().read(slice(0, 3000), list(FIELD))
+    planes["means"] *= 1024
+    planes["log_scales"] += np.float32(math.log(1024))
+    large, _ = automatic_rig(MemorySource(planes, origin=np.array([5e6, -2e6, 0.0])), views=6)
+    np.testing.assert_allclose(centres(large) - [5e6, -2e6, 0.0], centres(small) * 1024, rtol=1e-3, atol=1)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_tiny_scenes(count: int) -> None:
+    points = np.random.default_rng(count).normal(size=(count, 3))
+    source = make_splats(points, np.full((count, 3), 0.1))
+    cameras, _ = automatic_rig(source, views=3, width=32, height=24)
+    for camera in cameras:
+        assert np.isfinite(camera.translation).all() and np.isfinite(camera.rotation).all()
+    images = [draw(open_form("numpy"), source, camera, near=1e-3) for camera in cameras]
+    assert max(float(image.max()) for image in images) > 0.1
+
+
+def test_scenes_with_far_outliers_and_extreme_scales() -> None:
+    source = joined(ball(), make_splats(np.array([[1e5, 0, 0], [0, -3e4, 0]]), np.array([[50.0] * 3, [1e-12] * 3])))
+    cameras, _ = automatic_rig(source, views=6)
+    assert np.linalg.norm(centres(cameras), axis=1).max() < 8
+
+
+def test_what_cannot_be_looked_at() -> None:
+    with pytest.raises(InputError, match="0 automatic views: expected at least 1"):
+        automatic_rig(ball(), views=0)
+
+
+@pytest.mark.parametrize(
+    ("places", "directions", "name"),
+    [
+        (
+            [[3, 0, 1], [-3, 0, 1], [0, 3, 1], [0, -3, 1]],
+            [[-1, 0, -0.4], [1, 0, -0.4], [0, -1, -0.4], [0, 1, -0.4]],
+            "+z",
+        ),
+        (
+            [[3, 1, 0], [-3, 1, 0], [0, 1, 3], [0, 1, -3]],
+            [[-1, -0.4, 0], [1, -0.4, 0], [0, -0.4, -1], [0, -0.4, 1]],
+            "+y",
+        ),
+        ([[3, 0, 0], [-3, 0, 0], [0, 0, 3], [0, 0, -3]], [[-1, 0, 0], [1, 0, 0], [0, 0, -1], [0, 0, 1]], "-y"),
+        ([[3, 0, 0], [-3, 0, 0], [0, 3, 0], [0, -3, 0]], [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]], "+z"),
+        ([[1, 1, 1]], [[0, 1, 0]], "+z"),
+        ([[1, 1, 1]], [[0, 0, 1]], "-y"),
+    ],
+)
+def test_up(places: list[list[float]], directions: list[list[float]], name: str) -> None:
+    lines = np.array(directions, float)
+    up, found = up_axis(np.array(places, float), lines / np.linalg.norm(lines, axis=1, keepdims=True))
+    assert found == name and np.abs(up).sum() == 1
+
+
+def test_a_camera_looks_where_it_is_told() -> None:
+    for forward in ([1.0, 2.0, -0.5], [0.0, 0.0, 1.0], [0.0, 0.0, -3.0]):
+        camera = look("a", np.array([1.0, 2.0, 3.0]), np.array(forward), np.array([0.0, 0.0, 1.0]), 64, 48, 50.0)
+        np.testing.assert_allclose(camera.center, [1.0, 2.0, 3.0], atol=1e-12)
+        np.testing.assert_allclose(camera.rotation[2], np.array(forward) / np.linalg.norm(forward), atol=1e-12)
+        assert np.linalg.det(camera.rotation) == pytest.approx(1)
+        assert camera.rotation[1] @ [0, 0, 1] <= 1e-12  # down is never up
+
+
+def test_weighted_quantiles() -> None:
+    values = np.array([[3.0, 1.0, 2.0], [0.0, 0.0, 5.0]])
+    np.testing.assert_array_equal(weighted_quantiles(values, np.array([1.0, 1.0, 1.0]), [0.5]), [[2.0, 0.0]])
+    np.testing.assert_array_equal(weighted_quantiles(values, np.array([0.0, 0.0, 1.0]), [0.1, 0.9]), [[2.0, 5.0]] * 2)
+
+
+def test_the_grid_sees_matter() -> None:
+    scene = gather_witnesses(ball())
+    np.testing.assert_allclose(scene.middle, 0, atol=0.1)
+    through = scene.transmittance(np.array([3.0, 0, 0]), np.array([[-3.0, 3.0], [0.0, 3.0], [0.0, 0.0]]))
+    assert through[0] < 0.2 and through[1] == 1.0
+    np.testing.assert_array_equal(scene.optical_depth(np.array([[9.0, -9.0], [0.0, 0.0], [0.0, 0.0]])), 0)
+
+
+def test_sh_basis_is_orthonormal() -> None:
+    basis = sh_basis(fibonacci(4000).T, 15)
+    np.testing.assert_allclose(basis @ basis.T * 4 * math.pi / 4000, np.eye(15), atol=5e-3)
+
+
+def held_out_drop(
+    source: SceneSource, photos: Photos, held: list[int], scores: np.ndarray, choice: Choice
+) -> tuple[float, float]:
+    """Drop in PSNR (dB) against the photos, and PLY bytes over coded bytes."""
+    renderer = Renderer(open_form("gpu" if default_device().type == "gpu" else "w16"), large_budget())
+
+    def psnr(images: list[np.ndarray]) -> float:
+        errors = [np.mean((np.clip(image, 0, 1) - photos.load(i)) ** 2) for image, i in zip(images, held)]
+        return float(np.mean([-10 * math.log10(error) for error in errors]))
+
+    with renderer.load(source) as scene:
+        before = psnr([renderer.render(scene, photos.cameras[i]) for i in held])
+    rows = select_rows(ranks_from_order(order_from_scores(scores)), choice, nonzero_sh(source))
+    quantized = quantize_scene(source, *rows, PAPER)
+    with renderer.load_quantized(quantized) as scene:
+        after = psnr([renderer.render(scene, photos.cameras[i]) for i in held])
+    renderer.release()
+    size = quantized_bytes(quantized.count, quantized.sh_count, quantized.sh_degree, PAPER)
+    return before - after, source.count * 248 / size
+
+
+@pytest.mark.parametrize("scene", ["fox", "still_life"])
+def test_real_scenes_are_ranked_nearly_as_by_their_own_poses(request: pytest.FixtureRequest, scene: str) -> None:
+    folder: Path = request.getfixturevalue("fox_dir" if scene == "fox" else "sample_dir")
+    source = PlySource(folder / "point_cloud.ply")
+    photos = Photos.open(folder / "images", read_cameras(folder))
+    train, held = split_views(len(photos.cameras))
+    rig, _ = automatic_rig(source)
+    scores = []
+    for cameras in ([rig[i] for i in split_views(len(rig))[0]], [photos.cameras[i] for i in train]):
+        renderer = Renderer(open_form("w16"), large_budget())
+        with renderer.load(source) as loaded:
+            scores.append(score_scene(renderer, loaded, source, cameras))
+        renderer.release()
+    drops = [held_out_drop(source, photos, held, score, Choice(200, 400)) for score in scores]
+    assert drops[0][1] > 8 and drops[0][0] < 1.2, f"automatic {drops[0]}, by the real poses {drops[1]}"
+    assert drops[0][0] < drops[1][0] + 0.4

@@ -1,0 +1,280 @@
+"""Version 2 of the container: round trips through files, row ranges, layers, trimming, sizes and the golden file."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import educational_decoder2
+from flexgs_edge.codec.open_fgs import file_version, open_fgs, read_header, verify
+from flexgs_edge.codec.v1.container import write_container
+from flexgs_edge.codec.v1.packed_source import FgsSource
+from flexgs_edge.codec.v2.container import GridContainer, channel_bytes, coded_size, trim_container, write_grid
+from flexgs_edge.codec.v2.encode import encode_grid
+from flexgs_edge.codec.v2.grid_source import GridSource
+from flexgs_edge.commands.decompress import decompress
+from flexgs_edge.errors import InputError, TargetError
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.values import from_grid
+from flexgs_edge.run.open_scene import open_scene
+from flexgs_edge.scene.check import check_scene
+from flexgs_edge.scene.fields import FIELDS
+from grid_scenes import assert_same_grid, make_grid
+from quantized_scenes import make_scene, quantize_all
+
+NAMES = [field.name for field in FIELDS]
+GOLDEN = Path(__file__).parents[2] / "golden"
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    st.integers(0, 700),
+    st.integers(0, 4),
+    st.integers(1, 4),
+    st.sampled_from([64, 300, 65536]),
+    st.dictionaries(st.text(max_size=5), st.text(max_size=900), max_size=4),
+)
+def test_round_trip_and_size(tmp_path_factory, count, degree, layers, chunk_rows, record) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path_factory.mktemp("size") / "a.fgs"
+    grid = make_grid(count, degree, layers=layers)
+    size = write_grid(path, grid, record, chunk_rows=chunk_rows)
+    assert size == path.stat().st_size == coded_size(grid, record, chunk_rows)
+    source = GridSource(path)
+    assert source.settings == record
+    assert_same_grid(source.grid(), grid)
+    assert sum(section.length for section in verify(path)) == size
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 500])
+def test_values(tmp_path: Path, count: int) -> None:
+    path = tmp_path / "a.fgs"
+    grid = make_grid(count, 2, layers=2)
+    write_grid(path, grid, {}, chunk_rows=100)
+    source = open_scene(path)
+    assert isinstance(source, GridSource)
+    assert (source.count, source.sh_degree) == (count, grid.sh_degree)
+    np.testing.assert_array_equal(source.origin, [1234.5, -0.1, 1e-7])
+    expected = from_grid(grid)
+    got = source.read(slice(0, count), NAMES)
+    for name, plane in expected.items():
+        assert got[name].tobytes() == plane.tobytes()
+
+
+def test_parts_of_a_scene(tmp_path: Path) -> None:
+    path = tmp_path / "a.fgs"
+    grid = make_grid(500, 2)
+    write_grid(path, grid, {}, chunk_rows=64)
+    expected, source = from_grid(grid), GridSource(path)
+    rng = np.random.default_rng(0)
+    parts = [slice(0, 0), slice(499, 500), slice(63, 65), slice(64, 128), slice(10, 400), np.array([], np.int64)]
+    parts += [np.array([0, 63, 64, 499]), np.array([5, 5]), np.sort(rng.choice(500, 90, replace=False))]
+    for rows in parts:
+        for names in (NAMES, ["means"], ["sh_rest", "quats"]):
+            for name, plane in source.read(rows, names).items():
+                np.testing.assert_array_equal(plane, expected[name][:, rows])
+    out = {"means": np.empty((3, 7), np.float32)}
+    assert source.read(slice(60, 67), ["means"], out)["means"] is out["means"]
+    with pytest.raises(IndexError):
+        source.read(slice(0, 501), NAMES)
+    shuffled = rng.permutation(500)
+    got = source.select(shuffled).read(slice(0, 500), ["quats"])["quats"]
+    np.testing.assert_array_equal(got, expected["quats"][:, shuffled])
+
+
+def test_only_touched_chunks_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.fgs"
+    write_grid(path, make_grid(500), {}, chunk_rows=64)
+    source = GridSource(path)
+    decoded: list[tuple[str, bool]] = []
+    plain = source.container.decode
+
+    def counted(model, chunk, entry, base_only=False):  # type: ignore[no-untyped-def]
+        decoded.append((entry.section.name, base_only))
+        return plain(model, chunk, entry, base_only)
+
+    monkeypatch.setattr(source.container, "decode", counted)
+    for row in range(130, 150):
+        source.read(slice(row, row + 1), ["means"])
+    source.read(slice(130, 131), ["sh_rest"])
+    source.read(slice(131, 132), ["means"])
+    assert decoded == [("chunk 2", True), ("chunk 2", False)]
+
+
+def test_a_scene_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From file to PLY: the check of values has nothing to find in a grid."""
+    path = tmp_path / "a.fgs"
+    write_grid(path, make_grid(300, 1), {}, chunk_rows=100)
+    decoded: list[str] = []
+    plain = GridContainer.decode
+
+    def counted(self, model, chunk, entry, base_only=False):  # type: ignore[no-untyped-def]
+        decoded.append(entry.section.name)
+        return plain(self, model, chunk, entry, base_only)
+
+    monkeypatch.setattr(GridContainer, "decode", counted)
+    decompress(path, tmp_path / "a.ply")
+    assert decoded == ["chunk 0", "chunk 1", "chunk 2"]
+
+
+@pytest.mark.parametrize(
+    ("rotation", "colour", "fault"),
+    [(2.0**38, 2.0**20, None), (2.0**70, 2.0**20, "quats of norm zero"), (2.0**38, 2.0**30, "beyond .* in sh_dc")],
+)
+def test_the_largest_codes_are_valid_values(tmp_path: Path, rotation: float, colour: float, fault: str | None) -> None:
+    """A grid is taken unchecked only where every code gives a value that the check would pass."""
+    path = tmp_path / "a.fgs"
+    steps = Steps(*[2.0**80] * 4, colour, (colour,) * 4, 2.0**4)
+    grid = make_grid(20, 1)
+    for plane in (grid.position, grid.scale, grid.rotation, grid.opacity, grid.dc, *grid.sh):
+        plane[:] = 2**24
+    write_grid(path, replace(grid, steps=replace(steps, rotation=rotation, sh=steps.sh[:1])), {})
+    source = GridSource(path)
+    assert source.valid == (fault is None)
+    source.valid = False
+    if fault is None:
+        assert check_scene(source) is source
+    else:
+        with pytest.raises(InputError, match=fault), np.errstate(over="ignore"):
+            check_scene(source)
+
+
+def test_real_chunk_boundary(tmp_path: Path) -> None:
+    path = tmp_path / "a.fgs"
+    grid = make_grid(65536 + 9, 0)
+    write_grid(path, grid, {})
+    names = [section.name for section in verify(path)]
+    assert names == ["preamble", "header", "model", "chunk 0", "chunk 1", "chunk table"]
+    near = GridSource(path).read(slice(65530, 65545), ["quats"])["quats"]
+    np.testing.assert_array_equal(near, from_grid(grid, slice(65530, 65545))["quats"])
+
+
+def test_trim_keeps_whole_layers(tmp_path: Path) -> None:
+    path, cut, again = tmp_path / "a.fgs", tmp_path / "b.fgs", tmp_path / "c.fgs"
+    grid = make_grid(900, 2, layers=4)
+    size = write_grid(path, grid, {"a": 1}, chunk_rows=100)
+    expected = from_grid(grid)
+    counts = np.bincount(grid.layer)
+    largest = size
+    for layers in (3, 2, 1):
+        written = trim_container(path if layers == 3 else cut, again, largest - 1)
+        again.replace(cut)
+        assert written == cut.stat().st_size < largest
+        largest = written
+        verify(cut)
+        source = GridSource(cut)
+        assert source.count == counts[:layers].sum()
+        assert source.container.header.layers == tuple(counts[:layers])
+        assert source.container.header.cut_from == {"bytes": size, "count": 900, "layers": 4}
+        assert source.settings == {"a": 1}
+        for name, plane in source.read(slice(0, source.count), NAMES).items():
+            np.testing.assert_array_equal(plane, expected[name][:, : source.count])
+    with pytest.raises(TargetError, match="first layer needs"):
+        trim_container(cut, again, 100)
+    assert not again.exists()
+
+
+def test_trim_to_enough_room_copies(tmp_path: Path) -> None:
+    path, copy = tmp_path / "a.fgs", tmp_path / "b.fgs"
+    size = write_grid(path, make_grid(50, layers=2), {})
+    assert trim_container(path, copy, size) == size
+    assert copy.read_bytes() == path.read_bytes()
+    with pytest.raises(InputError, match="exists"):
+        trim_container(path, copy, size)
+    trim_container(path, copy, size, force=True)
+    with pytest.raises(InputError, match="another file"):
+        trim_container(path, path, size, force=True)
+
+
+def test_channel_bytes_add_up(tmp_path: Path) -> None:
+    path = tmp_path / "a.fgs"
+    size = write_grid(path, make_grid(3000, 2), {}, chunk_rows=1024)
+    table = channel_bytes(path)
+    assert sum(table.values()) == pytest.approx(size)
+    assert min(table.values()) >= 0
+    assert 0 < table["sh 2 Cg"] < table["position"]
+
+
+def test_both_versions_by_one_door(tmp_path: Path) -> None:
+    one, two = tmp_path / "one.fgs", tmp_path / "two.fgs"
+    write_container(one, quantize_all(make_scene(9)), {})
+    write_grid(two, make_grid(9), {})
+    assert (file_version(one), file_version(two)) == (1, 2)
+    assert isinstance(open_fgs(one), FgsSource) and isinstance(open_fgs(two), GridSource)
+    for path in (one, two):
+        assert read_header(path).count == 9
+        assert all(section.ok for section in verify(path))
+    with pytest.raises(InputError, match="cannot read it"):
+        read_header(tmp_path / "none.fgs")
+
+
+@pytest.mark.parametrize("value", [float("nan"), {1, 2}, b"x", "x" * (1 << 20)])
+def test_settings_that_json_cannot_hold(tmp_path: Path, value: object) -> None:
+    with pytest.raises(InputError, match="settings"):
+        write_grid(tmp_path / "a.fgs", make_grid(3), {"a": value})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("count", "degree", "layers", "chunk_rows"),
+    [(0, 0, 1, 64), (1, 0, 1, 64), (300, 0, 2, 200), (300, 1, 1, 65536), (280, 2, 3, 128), (600, 3, 2, 400)],
+)
+def test_the_written_format(tmp_path: Path, count: int, degree: int, layers: int, chunk_rows: int) -> None:
+    """A decoder written from docs/format.md alone finds the same values, escapes and raw bits among them."""
+    path = tmp_path / "a.fgs"
+    grid = make_grid(count, degree, layers=layers)
+    rng = np.random.default_rng(0)
+    grid.dc[1] = rng.integers(-(2**13), 2**13, count)
+    grid.scale[0, :1] = 2**24
+    write_grid(path, grid, {}, chunk_rows=chunk_rows)
+    check_written_format(path)
+
+
+def check_written_format(path: Path) -> None:
+    header, values = educational_decoder2.decode(path.read_bytes())
+    source = GridSource(path)
+    assert header["settings"] == source.settings
+    for name, plane in source.read(slice(0, source.count), NAMES).items():
+        np.testing.assert_array_equal(values[name], plane, name)
+
+
+def regenerator() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("regenerate_v2", GOLDEN / "regenerate_v2.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_golden_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = regenerator()
+    monkeypatch.setattr(module, "FOLDER", tmp_path)
+    module.main()
+    assert (tmp_path / "tiny.fgs").read_bytes() == (GOLDEN / "v2" / "tiny.fgs").read_bytes()
+    check_written_format(GOLDEN / "v2" / "tiny.fgs")
+
+
+@pytest.mark.parametrize("name", ["tiny", "early"])
+def test_golden_files_are_read(name: str) -> None:
+    source = GridSource(GOLDEN / "v2" / f"{name}.fgs")
+    with np.load(GOLDEN / "v2" / "tiny.npz") as expected:
+        for field, plane in source.read(slice(0, source.count), NAMES).items():
+            assert plane.tobytes() == expected[field].tobytes()
+    assert source.settings == regenerator().SETTINGS
+    assert source.container.header.layers == (200, 200)
+    assert (source.container.header.channels is None) == (name == "early")
+
+
+def test_the_share_of_sh_is_what_leaving_them_out_saves() -> None:
+    grid = make_grid(2000, 2)
+    bare = replace(
+        grid, sh_degree=0, steps=replace(grid.steps, sh=()), sh_degrees=np.zeros_like(grid.sh_degrees), sh=()
+    )
+    assert coded_size(grid, {}) - encode_grid(grid).sh_bytes == pytest.approx(coded_size(bare, {}), rel=0.005)
+    assert encode_grid(bare).sh_bytes == 0

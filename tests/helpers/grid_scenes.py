@@ -1,0 +1,39 @@
+"""Grid scenes for the tests of the real coder."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.scene.fields import FIELDS
+
+STEPS = Steps(0.05, 0.25, 0.05, 0.4, 0.1, (0.2, 0.25, 0.3, 0.3))
+
+
+def make_planes(count: int, sh_degree: int = 2, seed: int = 0) -> dict[str, np.ndarray]:
+    """Values that vary slowly along x, with noise: something to predict."""
+    rng = np.random.default_rng(seed)
+    planes = {f.name: rng.normal(size=(f.width(sh_degree), count)).astype(np.float32) for f in FIELDS}
+    for name in ("sh_dc", "log_scales", "opacity_logits"):
+        planes[name] += 3 * planes["means"][:1]
+    return planes
+
+
+def make_grid(count: int, sh_degree: int = 2, seed: int = 0, layers: int = 1, steps: Steps = STEPS) -> GridScene:
+    """Rows of every degree up to `sh_degree`, in `layers` layers."""
+    rng = np.random.default_rng(seed + 1)
+    degrees = rng.integers(0, sh_degree + 1, count)
+    layer = rng.integers(0, layers, count)
+    return to_grid(make_planes(count, sh_degree, seed), degrees, steps, (1234.5, -0.1, 1e-7), layer)[0]
+
+
+def assert_same_grid(one: GridScene, two: GridScene) -> None:
+    """Equal codes, steps and layers."""
+    assert (one.count, one.sh_degree, one.steps) == (two.count, two.sh_degree, two.steps)
+    for name in ("origin", "position", "scale", "rotation", "opacity", "dc", "sh_degrees", "layer"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name), name)
+    assert len(one.sh) == len(two.sh)
+    for a, b in zip(one.sh, two.sh, strict=True):
+        np.testing.assert_array_equal(a, b)

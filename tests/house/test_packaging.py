@@ -1,0 +1,138 @@
+"""What is shipped: the file lists of wheel and sdist, and an installed copy that finds its kernels."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+from setuptools import find_packages
+from setuptools.config.setupcfg import read_configuration
+
+import flexgs_edge
+
+
+@pytest.fixture(scope="module")
+def archives(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """(sdist, wheel built from that sdist)."""
+    # Built from a copy: setuptools leaves build/ and *.egg-info where it works, and a stale one can hide a missing file.
+    tree, out = tmp_path_factory.mktemp("tree"), tmp_path_factory.mktemp("dist")
+    for name in (
+        "setup.cfg",
+        "pyproject.toml",
+        "MANIFEST.in",
+        "LICENSE",
+        "README.md",
+        "CHANGELOG.md",
+        "constraints.txt",
+    ):
+        (tree / name).write_bytes((repository / name).read_bytes())
+    for name in ("flexgs_edge", "cl_kernels", "docs", "tests", "samples", "benchmarks", "deploy"):
+        (tree / name).symlink_to(repository / name)
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(tree)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return next(out.glob("*.tar.gz")), next(out.glob("*.whl"))
+
+
+def files_of(archive: Path) -> set[str]:
+    if archive.suffix == ".whl":
+        return {name for name in zipfile.ZipFile(archive).namelist() if not name.endswith("/")}
+    with tarfile.open(archive) as tar:  # without the leading folder
+        return {name.partition("/")[2] for name in (member.name for member in tar if member.isfile())}
+
+
+def kernel_files(repository: Path) -> set[str]:
+    return {path.name for path in (repository / "cl_kernels").iterdir() if path.suffix in (".cl", ".clh")}
+
+
+def python_files(repository: Path) -> set[str]:
+    return {str(path.relative_to(repository)) for path in (repository / "flexgs_edge").rglob("*.py")}
+
+
+def test_every_package_is_listed_in_setup_cfg(repository: Path) -> None:
+    listed = set(read_configuration(repository / "setup.cfg")["options"]["packages"])
+    found = {*find_packages(str(repository), include=["flexgs_edge*"]), "flexgs_edge.cl_kernels"}
+    assert listed == found, "correct [options] packages in setup.cfg"
+
+
+def test_the_wheel_holds_the_package_and_the_kernels(repository: Path, archives: tuple[Path, Path]) -> None:
+    files = {name for name in files_of(archives[1]) if ".dist-info/" not in name}
+    assert files == python_files(repository) | {f"flexgs_edge/cl_kernels/{name}" for name in kernel_files(repository)}
+
+
+def test_the_sdist_can_be_built_from_and_holds_no_tests(repository: Path, archives: tuple[Path, Path]) -> None:
+    files = files_of(archives[0])
+    assert python_files(repository) <= files
+    assert {f"cl_kernels/{name}" for name in kernel_files(repository)} <= files
+    assert {"LICENSE", "README.md", "CHANGELOG.md", "constraints.txt", "setup.cfg", "pyproject.toml"} <= files
+    assert {"docs/design.md", "docs/format.md"} <= files
+    assert [name for name in files if name.startswith(("tests/", "samples/", "benchmarks/", "deploy/"))] == []
+
+
+def test_name_version_licence_and_command(archives: tuple[Path, Path]) -> None:
+    wheel = zipfile.ZipFile(archives[1])
+    info = f"flexgs_edge-{flexgs_edge.__version__}.dist-info"
+    metadata = wheel.read(f"{info}/METADATA").decode()
+    assert f"\nName: flexgs-edge\nVersion: {flexgs_edge.__version__}\n" in metadata
+    assert "Requires-Python: >=3.10" in metadata
+    assert re.search(r"^License(-Expression)?: Apache-2\.0$", metadata, re.MULTILINE)
+    assert "flexgs-edge = flexgs_edge.cli:main" in wheel.read(f"{info}/entry_points.txt").decode()
+    assert any(name.endswith("LICENSE") for name in wheel.namelist())
+
+
+def run_in(folder: Path, script: str, **environment: str) -> list[str]:
+    """Output lines of `script` in an interpreter outside the checkout."""
+    variables = {name: value for name, value in os.environ.items() if not name.startswith(("FLEXGS", "PYTHONPATH"))}
+    result = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=folder,
+        env={**variables, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout.splitlines()
+
+
+FIND_KERNELS = """
+import flexgs_edge
+from flexgs_edge.kernels.cl_sources import kernel_dir, load_source
+print(flexgs_edge.__file__)
+print(kernel_dir())
+for path in sorted(kernel_dir().glob("*.cl")):
+    load_source(path.name)
+    print(path.name)
+"""
+
+
+def test_an_installed_wheel_finds_its_kernels(repository: Path, archives: tuple[Path, Path], tmp_path: Path) -> None:
+    target = tmp_path / "site"
+    command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--no-compile"]
+    subprocess.run([*command, "--target", str(target), str(archives[1])], check=True, capture_output=True)
+    package, kernels, *files = run_in(tmp_path, FIND_KERNELS, PYTHONPATH=str(target))
+    assert Path(package) == target / "flexgs_edge" / "__init__.py"
+    assert Path(kernels) == target / "flexgs_edge" / "cl_kernels"
+    assert set(files) == {name for name in kernel_files(repository) if name.endswith(".cl")}
+
+
+def test_an_editable_install_finds_the_kernels_of_the_checkout(repository: Path, tmp_path: Path) -> None:
+    # setuptools' own hook makes the editable wheel; installing it is unzipping it into a folder of site-packages.
+    tree, site = tmp_path / "tree", tmp_path / "site"
+    tree.mkdir()
+    for name in ("setup.cfg", "pyproject.toml", "LICENSE", "README.md", "flexgs_edge", "cl_kernels"):
+        (tree / name).symlink_to(repository / name)
+    build = f"import setuptools.build_meta as b; print(b.build_editable({str(tmp_path)!r}))"
+    wheel = run_in(tree, build)[-1]
+    zipfile.ZipFile(tmp_path / wheel).extractall(site)
+    script = f"import site; site.addsitedir({str(site)!r})\n{FIND_KERNELS}"
+    package, kernels, *files = run_in(tmp_path, script)
+    assert Path(package).resolve() == repository / "flexgs_edge" / "__init__.py"
+    assert Path(kernels) == repository / "cl_kernels"
+    assert files

@@ -1,0 +1,144 @@
+"""Opening scenes by path, and finding what lies beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flexgs_edge.errors import FormatError, InputError
+from flexgs_edge.io import model_folder as model_module
+from flexgs_edge.io.model_folder import find_companions
+from flexgs_edge.io.ply import PlySource
+from flexgs_edge.run.open_scene import open_scene, register_reader
+from flexgs_edge.scene.source import SceneSource
+from scene_files import random_rows, write_rows
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    for iteration, count in ((7000, 2), (30000, 3), (900, 1)):
+        folder = tmp_path / "point_cloud" / f"iteration_{iteration}"
+        folder.mkdir(parents=True)
+        write_rows(folder / "point_cloud.ply", random_rows(count))
+    (tmp_path / "point_cloud" / "iteration_best").mkdir()
+    (tmp_path / "point_cloud" / "iteration_99999").mkdir()  # without a scene in it
+    return tmp_path
+
+
+def test_a_model_folder_gives_its_latest_iteration_by_number(model: Path) -> None:
+    source = open_scene(model)
+    assert source.count == 3 and "iteration_30000" in source.name
+
+
+def test_a_ply_by_any_case_of_its_suffix(tmp_path: Path) -> None:
+    source = open_scene(str(write_rows(tmp_path / "A.PLY", random_rows(2))))
+    assert isinstance(source, PlySource) and source.count == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("none.ply", "no such file or folder; supported: .*ply"),
+        ("a.splat", "unknown kind of scene '.splat'; supported"),
+    ],
+)
+def test_paths_that_are_no_scene(tmp_path: Path, name: str, words: str) -> None:
+    (tmp_path / "a.splat").touch()
+    with pytest.raises(InputError, match=words):
+        open_scene(tmp_path / name)
+
+
+def test_a_folder_that_is_no_model(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no point_cloud/iteration"):
+        open_scene(tmp_path)
+
+
+def test_a_registered_reader_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(model_module, "_READERS", dict(open_scene._READERS))
+    marker = object()
+
+    def opener(path: Path) -> SceneSource:
+        assert path == tmp_path / "a.xyz"
+        return marker  # type: ignore[return-value]
+
+    (tmp_path / "a.xyz").touch()
+    register_reader(".XYZ", opener)
+    assert open_scene(tmp_path / "a.xyz") is marker
+    with pytest.raises(InputError, match=r"\.ply.*\.xyz"):
+        open_scene(tmp_path / "b.none")
+
+
+def test_companions_beside_a_ply(tmp_path: Path) -> None:
+    found = find_companions(tmp_path / "a.ply")
+    assert (found.cameras, found.images, found.white_background) == (None, None, None)
+    (tmp_path / "cameras.json").touch()
+    (tmp_path / "images").mkdir()
+    found = find_companions(tmp_path / "a.ply")
+    assert (found.cameras, found.images) == (tmp_path / "cameras.json", tmp_path / "images")
+
+
+def test_companions_of_a_bare_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "cameras.json").touch()
+    monkeypatch.chdir(tmp_path)
+    assert find_companions("a.ply").cameras == Path("cameras.json")
+
+
+def test_companions_of_a_model_folder_and_of_a_ply_inside_it(model: Path) -> None:
+    (model / "cameras.json").touch()
+    photos = model / "data" / "images_4"
+    photos.mkdir(parents=True)
+    (model / "cfg_args").write_text(
+        f"Namespace(data_device='cuda', eval=True, images='images_4', sh_degree=3, source_path={str(model / 'data')!r}, "
+        "white_background=True)"
+    )
+    for path in (model, model / "point_cloud" / "iteration_7000" / "point_cloud.ply"):
+        found = find_companions(path)
+        assert (found.cameras, found.images, found.white_background) == (model / "cameras.json", photos, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "antialiased"), [("antialiasing=True", True), ("antialiasing=False", False), ("antialiasing='yes'", None)]
+)
+def test_cfg_args_may_say_that_the_model_is_antialiased(model: Path, words: str, antialiased: bool | None) -> None:
+    assert find_companions(model).antialiased is None
+    (model / "cfg_args").write_text(f"Namespace({words})")
+    assert find_companions(model).antialiased is antialiased
+
+
+def test_photos_beside_the_model_when_the_source_path_is_elsewhere(model: Path) -> None:
+    (model / "images").mkdir()
+    (model / "cfg_args").write_text("Namespace(images='images', source_path='/no/such/place', white_background=False)")
+    found = find_companions(model)
+    assert (found.images, found.white_background) == (model / "images", False)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "Namespace(",
+        "__import__('os').system('touch hacked')",
+        "[1]",
+        "a.b(c=1)",
+        "(" * 5000,
+        "\0",
+        "Namespace(a=1) + 2",
+    ],
+)
+def test_a_cfg_args_that_is_no_namespace(model: Path, text: str) -> None:
+    (model / "cfg_args").write_text(text)
+    with pytest.raises(FormatError, match=r"cfg_args: expected the text Namespace"):
+        find_companions(model)
+
+
+def test_nothing_in_cfg_args_is_evaluated(model: Path) -> None:
+    (model / "cfg_args").write_text("Namespace(white_background=print('hacked'), images=[1], source_path=3, **x)")
+    found = find_companions(model)
+    assert (found.images, found.white_background) == (None, None)
+
+
+def test_a_cfg_args_that_is_not_text(model: Path) -> None:
+    (model / "cfg_args").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FormatError, match="cfg_args"):
+        find_companions(model)

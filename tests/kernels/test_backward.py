@@ -1,0 +1,152 @@
+"""Gradients of a view's squared error against float64 finite differences, and kernels against twins along a descent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_kernels_twins import padded_target
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.grid.values import from_grid
+from flexgs_edge.methods.best.refit.descent import ORDER, Descent
+from flexgs_edge.methods.best.refit.distil import FIELD_RATES
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.scene.fields import FIELD
+from kernel_fixtures import ALL_FORMS, FORMS, PairedBackend, large_budget, open_form, same_bits
+from reference_gradients import DIFFERENCES, View, allowed_errors, expected_gradients
+from synthetic import look_from, make_camera, random_scene
+
+Planes = dict[str, np.ndarray]
+BACKGROUND = (0.1, 0.5, 0.9)
+RATES = {"means": 1e-2, **FIELD_RATES}
+STEPS = Steps(0.01, 0.1, 0.03, 0.2, 0.05, (0.04, 0.05, 0.06, 0.07))
+CHANGE = 1e-5
+"""Of a value, for finite differences in float64: their own error is about its square."""
+
+
+def view(seed: int, width: int = 45, height: int = 37) -> Camera:
+    rotation, translation = look_from(seed)
+    return make_camera(width, height, rotation=rotation, translation=translation)
+
+
+def planes_of(count: int, seed: int, degree: int, size: float = -1.3, opacity: float = 0.0) -> Planes:
+    return random_scene(count, seed, degree, size, opacity).read(slice(0, count), list(FIELD))
+
+
+def measured(form: str, planes: Planes, camera: Camera, target: np.ndarray, antialiased: bool) -> Planes:
+    count, degree = planes["means"].shape[1], {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}[len(planes["sh_rest"])]
+    renderer = Renderer(open_form(form), large_budget(), background=BACKGROUND, antialiased=antialiased)
+    with Descent(renderer, planes, np.full(count, degree), np.zeros(3), camera) as descent:
+        descent.differentiate(camera, target)
+        gradients = descent.gradients()
+    renderer.release()
+    return gradients
+
+
+SCENES = 50
+SEEN_SHARE = 0.03
+"""Of the bound: it adds up the worst case, and roundings behave like noise (1.4 % of it is the most that was seen)."""
+
+
+def scene_of(number: int, attempt: int) -> tuple[Planes, int, View]:
+    """A small scene, its SH degree and a view of it.
+
+    One splat lies beyond the Jacobian's clamp, one is held at the cap of alpha, one has a colour cut off at zero.
+    """
+    degree = number % 5
+    planes = planes_of(9, 400 + number + SCENES * attempt, degree, opacity=1.0)
+    planes["means"][:, 0], planes["log_scales"][:, 0] = (4.0, 0.3, 2.5), (0.6, 0.2, -0.5)
+    planes["opacity_logits"][0, :2] = 2, 9
+    planes["sh_dc"][0, 2] = -9
+    camera = view(number, 21, 18)
+    return planes, degree, View(camera, padded_target(camera, number), BACKGROUND, number // 5 % 2 == 1)
+
+
+@pytest.mark.parametrize("number", range(SCENES))
+def test_gradients_are_those_of_float64(number: int) -> None:
+    """Every value of every row, at every width, within what the roundings of the written forms add up to."""
+    for attempt in range(8):
+        planes, degree, seen = scene_of(number, attempt)
+        allowed = allowed_errors(planes, degree, seen)
+        # In one scene of six a decision lies within rounding of its threshold and may fall either way; in one of four nothing is
+        # seen of the first splat.
+        if allowed is not None and (expected := expected_gradients(planes, degree, seen))["means"][:, 0].any():
+            break
+    assert allowed is not None
+    for form in ("w16", "w8", "w4", "w1"):
+        found = measured(form, planes, seen.camera, seen.target, seen.antialiased)
+        for name, wanted in expected.items():
+            largest = abs(wanted).max(initial=0.0)
+            most = SEEN_SHARE * allowed[name] + DIFFERENCES * largest
+            assert (abs(found[name] - wanted) <= most).all(), (name, form, (abs(found[name] - wanted) / most).max())
+            assert not wanted.size or (largest > 0 and np.median(allowed[name]) < 0.15 * largest), name
+        assert found["sh_dc"][0, 2] == 0
+
+
+@pytest.mark.parametrize("form", ALL_FORMS)
+def test_forms_give_the_same_gradients(form: str) -> None:
+    planes, camera = planes_of(65, 3, 2, -2.0), view(3)
+    target = padded_target(camera, 3)
+    expected = measured("w16", planes, camera, target, False)
+    for name, values in measured(form, planes, camera, target, False).items():
+        assert values.any() and same_bits(values, expected[name]), name
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("form", FORMS)
+def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every launch compared: in batches, two chunks, off and on a grid, rows of all degrees, one unseen, one beyond the clamp."""
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 64)
+    monkeypatch.setattr("flexgs_edge.render.device_scene.CHUNK_ROWS", 40)
+    monkeypatch.setattr("flexgs_edge.render.device_scene.MIN_CHUNK_ROWS", 16)
+    paired = PairedBackend(open_form(form), 2)
+    cameras = [view(2, 33, 20), make_camera(33, 20)]
+    planes = planes_of(65, 18, 4, -1.8)
+    planes["means"][2, 50] = -3
+    planes["means"][:, 3], planes["log_scales"][:, 3] = (2.2, 0.3, 2.5), (0.9, 0.5, -0.5)
+    planes["opacity_logits"][0, 3] = 3
+    planes["opacity_logits"][0, 5:20] = 9  # alpha at its cap
+    degrees = np.repeat([4, 1, 2, 3, 0], 13)
+    planes["sh_rest"][:, degrees == 0] = 0
+    renderer = Renderer(paired, large_budget(), background=BACKGROUND, antialiased=antialiased)
+    with Descent(renderer, planes, degrees, np.zeros(3), cameras[0]) as descent:
+        for k, steps in enumerate((None, STEPS)):
+            descent.put_on(steps)
+            descent.step(cameras[k], padded_target(cameras[k], k), RATES)
+        moved = descent.planes()
+    renderer.release()
+    assert paired.launched["blend_backward"] > 3 and paired.launched["adam"] == 2 * 3
+    for name, before in planes.items():
+        assert not same_bits(moved[name], before) and same_bits(moved[name][:, 50], before[:, 50]), name
+    for degree in range(1, 5):
+        lower = np.flatnonzero(degrees < degree)
+        band = [c * 24 + k for c in range(3) for k in range(degree**2 - 1, (degree + 1) ** 2 - 1)]
+        assert same_bits(moved["sh_rest"][band][:, lower], planes["sh_rest"][band][:, lower])
+
+
+def test_views_are_drawn_from_what_a_file_gives_back() -> None:
+    """Values on the grid on the device are those of `from_grid`, but where float32 divides to the other side of a half."""
+    planes = planes_of(300, 5, 3)
+    fine = Steps(1e-5, 1e-6, 1e-6, 1e-6, 1e-6, (1e-6,) * 3)
+    degrees = np.full(300, 3, np.uint8)
+    planes = from_grid(to_grid(planes, degrees, fine, np.zeros(3))[0])  # quaternions in the grid's own form
+    steps = replace(STEPS, sh=STEPS.sh[:3])
+    grid, order = to_grid(planes, degrees, steps, np.zeros(3))
+    expected = from_grid(grid)
+    renderer, camera = Renderer(open_form("w16"), large_budget()), make_camera()
+    with Descent(renderer, planes, degrees, np.zeros(3), camera) as descent:
+        descent.put_on(steps)
+        (part,) = descent._parts
+        drawn = dict(
+            zip(("log_scales", "quats", "opacity_logits"), map(renderer.backend.read, part.stored), strict=True)
+        )
+        drawn |= {name: renderer.backend.read(getattr(part.chunk, name)) for name in ("means", "sh_dc", "sh_rest")}
+        assert same_bits(descent.planes()["quats"], planes["quats"])
+    renderer.release()
+    for name in ORDER:
+        same = (drawn[name][:, :300][:, order] == expected[name]).mean()
+        assert same > 0.995, (name, same)

@@ -1,0 +1,251 @@
+"""Arrays in memory and in scratch files: the same values, room given back, and errors before anything breaks."""
+
+from __future__ import annotations
+
+import errno
+import gc
+import mmap
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.memory import rows as mapped
+from flexgs_edge.memory import storage
+from flexgs_edge.memory.ordered import stable_order
+from flexgs_edge.memory.rows import copy_rows, put_rows, read_rows
+from flexgs_edge.memory.storage import MEMORY, Room, Scratch, file_system_of
+from flexgs_edge.methods.best.checkpoint import Checkpoint
+from flexgs_edge.methods.best.rounds import lowest
+
+COUNT = 40_000
+
+
+@pytest.fixture(params=["memory", "files"])
+def room(request: pytest.FixtureRequest, tmp_path: Path) -> Room:
+    return MEMORY if request.param == "memory" else Scratch(tmp_path)
+
+
+def test_take_and_copy(room: Room) -> None:
+    rng = np.random.default_rng(1)
+    rows = np.sort(rng.choice(COUNT, 30_000, replace=False))
+    for values in (rng.normal(size=COUNT), rng.normal(size=(3, 4, COUNT)), rng.normal(size=(2, COUNT))):
+        np.testing.assert_array_equal(room.take(values, rows), values[..., rows])
+        copied = room.copy(values[..., ::2])
+        np.testing.assert_array_equal(copied, values[..., ::2])
+        assert copied.flags.c_contiguous and copied.flags.writeable
+    assert room.take(np.zeros((0, COUNT)), rows).shape == (0, len(rows))
+    assert room.empty((3, 0), np.float32).shape == (3, 0)
+
+
+@pytest.mark.parametrize("shape", [(COUNT,), (3, COUNT), (2, 4, COUNT)])
+def test_copied_rows_are_those_of_the_array(room: Room, shape: tuple[int, ...]) -> None:
+    """Of a whole array and of some of its planes, into planes that are not next to each other, and into every second element."""
+    held = room.copy(np.random.default_rng(2).normal(size=shape).astype(np.float32))
+    held[..., 7] = 5  # not on the disk yet
+    for values in (held, held[1:]) if held.ndim > 1 else (held,):
+        for start, stop in ((0, COUNT), (5, 4097), (COUNT - 1, COUNT), (9, 9)):
+            wide = np.full((*values.shape[:-1], 3 * COUNT), -1, np.float32)
+            for out in (wide[..., : stop - start], wide[..., COUNT : COUNT + 2 * (stop - start) : 2]):
+                copy_rows(values, slice(start, stop), out)
+                np.testing.assert_array_equal(out, values[..., start:stop])
+            assert (wide[..., stop - start : COUNT] == -1).all() and (wide[..., COUNT + 1 :: 2] == -1).all()
+
+
+@pytest.mark.parametrize("cached", [True, False])
+@pytest.mark.parametrize("shape", [(COUNT,), (3, COUNT), (2, 4, COUNT)])
+def test_rows_that_are_put_are_read(
+    room: Room, shape: tuple[int, ...], cached: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether they are in the kernel's cache or not, by the accessors and through the pages."""
+    monkeypatch.setattr(mapped, "is_cached", lambda address, size: cached)
+    expected = np.random.default_rng(3).normal(size=shape).astype(np.float32)
+    held = room.copy(expected)
+    for start, stop in ((0, COUNT), (5, 4097), (COUNT - 1, COUNT), (9, 9)):
+        rows = slice(start, stop)
+        np.testing.assert_array_equal(read_rows(held, rows), expected[..., rows])
+        part = np.arange(np.prod(expected[..., rows].shape)).reshape(expected[..., rows].shape)
+        for values in (part, 5):
+            put_rows(held, rows, values)  # of another type, or one for all
+            expected[..., rows] = values
+            np.testing.assert_array_equal(read_rows(held, rows), expected[..., rows])
+            np.testing.assert_array_equal(held, expected)
+    if held.ndim > 1:
+        np.testing.assert_array_equal(read_rows(held[1:], slice(3, 8)), expected[1:, ..., 3:8])
+        put_rows(held[1:], slice(3, 8), 7)
+        expected[1:, ..., 3:8] = 7
+        np.testing.assert_array_equal(held, expected)
+
+
+def test_rows_in_any_order_are_taken(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a plane that is read as a whole, where memory holds it; else rows far apart are looked up through the pages."""
+    values = room.copy(np.random.default_rng(4).normal(size=(3, COUNT)))
+    fetched = []
+    monkeypatch.setattr(mapped, "fetch", lambda plane, rows: fetched.append(rows))
+    for whole in (storage.WHOLE_BYTES, 0):
+        monkeypatch.setattr(room, "whole_bytes", whole)
+        for rows, apart in (
+            (np.arange(0, COUNT, 2), False),
+            (np.array([5, COUNT - 1, 7]), True),
+            (np.arange(0), False),
+        ):
+            fetched.clear()
+            np.testing.assert_array_equal(room.take(values, rows), values[:, rows])
+            assert bool(fetched) is (apart and room.spills and not whole)
+            np.testing.assert_array_equal(mapped.read_listed(values, rows), values[:, rows])
+
+
+def test_larger_planes_are_held_where_the_limit_is_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(storage, "WHOLE_BYTES", 0)
+    monkeypatch.setattr(mapped, "fetch", lambda *_: pytest.fail("looked up through the pages"))
+    room = Scratch(tmp_path, 16 * 8 * COUNT)
+    values, rows = room.copy(np.random.default_rng(5).normal(size=(2, COUNT))), np.array([5, COUNT - 1, 7])
+    np.testing.assert_array_equal(room.take(values, rows), values[:, rows])
+
+
+def test_a_part_is_fetched_plane_by_plane(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    advise = mapped.MappedFile.madvise
+
+    def note(self: mapped.MappedFile, *words: int) -> None:
+        asked.append(words)
+        advise(self, *words)
+
+    values = Scratch(tmp_path).empty((3, 4, 10_000), np.float32)
+    numbers = values.reshape(-1)
+    numbers[:] = np.arange(numbers.size)
+    monkeypatch.setattr(mapped.MappedFile, "madvise", note)
+    for view in (values, values[1:, ::2, 5:], values.reshape(12, -1)[3:5], numbers):
+        asked.clear()
+        mapped.fetch(view, slice(2_100, 5_000))
+        pieces = [numbers[start // 4 : (start + length) // 4] for _, start, length in asked]
+        got = set(np.concatenate(pieces).astype(int).tolist())
+        part = view[..., 2_100:5_000]
+        assert got >= set(part.reshape(-1).astype(int).tolist())
+        assert len(got) <= part.size + len(pieces) * mmap.PAGESIZE // 4
+    asked.clear()
+    mapped.fetch(np.zeros((3, 4)), slice(0, 4))
+    mapped.fetch(values[:, :0], slice(0, 4))
+    assert not asked
+
+
+def test_files_are_gone_with_their_arrays(tmp_path: Path) -> None:
+    room = Scratch(tmp_path)
+    first, second = room.empty((1 << 17,), np.uint8), room.empty((1 << 18,), np.float64)
+    part = second[100:]
+    assert room.used == room.peak == 17 << 17 and not list(tmp_path.iterdir())
+    first[:] = 7
+    del first, second
+    gc.collect()
+    assert room.used == 1 << 21, "a view keeps its file"
+    del part
+    gc.collect()
+    assert room.used == 0 and room.peak == 17 << 17
+    room.close()
+
+
+def test_small_arrays_stay_in_memory(tmp_path: Path) -> None:
+    room = Scratch(tmp_path)
+    room.empty((100,), np.float64)
+    assert room.peak == 0
+
+
+def test_a_kill_leaves_nothing(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys; from flexgs_edge.memory.storage import Scratch; room = Scratch(sys.argv[1])\n"
+        "values = room.empty((1 << 20,), 'f8'); values[:] = 1; file = room.file(); file.write(bytes(1 << 20)); file.flush()\n"
+        "os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
+    assert done.returncode == -9 and not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    room = Scratch(tmp_path)
+    held = room.empty((1 << 20,), np.uint8)
+
+    def full(descriptor: int, offset: int, size: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(
+        BudgetError, match=r"disk is full: scratch files hold 1\.05 MB there, 2\.10 MB more .*--scratch"
+    ):
+        room.empty((1 << 21,), np.uint8)
+    assert room.used == len(held) and not list(tmp_path.iterdir())
+
+
+def test_other_failures_are_errors_of_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    room = Scratch(tmp_path)
+
+    def broken(descriptor: int, offset: int, size: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "posix_fallocate", broken)
+    with pytest.raises(InputError, match="cannot make a scratch file of 2097152 bytes"):
+        room.empty((1 << 21,), np.uint8)
+
+
+def test_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no scratch file can be made there"):
+        Scratch(tmp_path / "nothing")
+
+
+def test_a_folder_in_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(storage, "file_system_of", lambda folder: "tmpfs")
+    with pytest.raises(InputError, match="lies in memory itself"):
+        Scratch(tmp_path)
+
+
+def test_kinds_of_file_systems(tmp_path: Path) -> None:
+    mounts = tmp_path / "mounts"
+    mounts.write_text(
+        "/dev/a / ext4 rw 0 0\ntmpfs /tmp tmpfs rw 0 0\n/dev/b /tmp/big\\040disk xfs rw 0 0\n/dev/c /data ext4 rw 0 0\n"
+        "ramfs /data ramfs rw 0 0\n"
+    )
+    found = [
+        file_system_of(Path(place), mounts) for place in ("/home/x", "/tmp/x", "/tmpx", "/tmp/big disk/x", "/data")
+    ]
+    assert found == ["ext4", "tmpfs", "ext4", "xfs", "ramfs"]
+    assert file_system_of(Path("/tmp"), tmp_path / "nothing") is None
+    assert file_system_of(Path("/dev/shm")) in ("tmpfs", None)
+
+
+@pytest.mark.parametrize("values", [1, 7, 1000, 1 << 40])
+def test_orders_in_parts_are_stable(tmp_path: Path, values: int) -> None:
+    keys = np.random.default_rng(values).integers(0, values, COUNT).astype(np.uint64)
+    expected = np.argsort(keys, kind="stable")
+    np.testing.assert_array_equal(stable_order(keys, Scratch(tmp_path), rows=1000), expected)
+    np.testing.assert_array_equal(stable_order(keys), expected)
+
+
+@pytest.mark.parametrize("values", [2, 50, 1 << 40])
+def test_the_lowest_are_those_that_a_stable_sort_puts_first(values: int) -> None:
+    costs = np.random.default_rng(values).integers(0, values, 3000).astype(np.float64)
+    costs[::7] = np.inf
+    for count in (-1, 0, 1, 2, 1500, 2999, 3000, 4000):
+        expected = np.zeros(3000, bool)
+        expected[np.argsort(costs, kind="stable")[: max(count, 0)]] = True
+        np.testing.assert_array_equal(lowest(costs, count), expected)
+
+
+def test_checkpoints(room: Room, tmp_path: Path) -> None:
+    checkpoint = Checkpoint(tmp_path / "kept")
+    arrays = {"a": np.arange(12.0).reshape(2, 2, 3), "b": np.arange(5), "c": np.zeros((0, 7), np.float32)}
+    assert checkpoint.rounds == 0
+    for number in range(2):
+        checkpoint.save(number, arrays.items())
+    (checkpoint.folder / "round-1" / "done").unlink()
+    again = Checkpoint(tmp_path / "kept")
+    assert again.rounds == 1 and not again.has(1)
+    for name, values in again.load(0, room).items():
+        np.testing.assert_array_equal(values, arrays[name])
+        assert values.dtype == arrays[name].dtype and values.shape == arrays[name].shape
+    again.remove()
+    assert not (tmp_path / "kept").exists()
+    with pytest.raises(InputError, match="cannot keep the state"):
+        Checkpoint(tmp_path / "no" / "folder")

@@ -1,0 +1,213 @@
+"""The descent of all values towards the original's renders, its targets, and the search that ends with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.cameras.made import poses_between
+from flexgs_edge.commands.compress import compress
+from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.grid.values import from_grid
+from flexgs_edge.kernels.backend import TwinBackend
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.methods.best.refit.colour import refit_colours
+from flexgs_edge.methods.best.refit.distil import FIELD_RATES, HELD, Schedule, distil
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.references import TargetViews
+from kernel_fixtures import large_budget, open_form, same_bits
+from synthetic import look_from, make_camera, random_scene
+from tiny_project import make_project
+
+Planes = dict[str, np.ndarray]
+KEPT = 150
+SEEN = 6
+STEPS = Steps(0.03, 0.25, 0.06, 0.5, 0.15, (0.12, 0.12))
+RATES = {"means": 5e-3, **FIELD_RATES}
+
+
+def view(seed: int, width: int = 45, height: int = 37) -> Camera:
+    rotation, translation = look_from(seed)
+    return make_camera(width, height, rotation=rotation, translation=translation, name=f"v{seed}")
+
+
+class Bench:
+    """A scene, the largest of its Gaussians, and poses to learn from."""
+
+    def __init__(self, form: str = "w16") -> None:
+        whole = random_scene(300, 71, 2, size=-1.8).read(slice(0, 300), list(FIELD))
+        rank = np.argsort(-(whole["log_scales"].sum(axis=0) + whole["opacity_logits"][0]), kind="stable")
+        self.kept = {name: np.ascontiguousarray(values[:, np.sort(rank[:KEPT])]) for name, values in whole.items()}
+        self.degrees = np.arange(KEPT) % 3
+        self.kept["sh_rest"] = self._without_higher(self.kept["sh_rest"])
+        self.kept["means"][:, 0] = (0, 0, -50)  # behind every camera
+        self.renderer = Renderer(open_form(form), large_budget())
+        self.cameras = [view(seed) for seed in range(SEEN)]
+        with self.renderer.load(MemorySource(whole)) as scene:
+            self.targets = TargetViews.of(self.renderer, scene, self.cameras)
+            self.original = [self.renderer.render(scene, camera) for camera in self.cameras]
+
+    def _without_higher(self, rest: np.ndarray) -> np.ndarray:
+        planes = rest.reshape(3, 8, KEPT).copy()
+        planes[:, :3] *= self.degrees >= 1
+        planes[:, 3:] *= self.degrees >= 2
+        return planes.reshape(24, KEPT)
+
+    def fidelity(self, planes: Planes) -> float:
+        """At the poses that it learns from: in a random cloud others tell nothing."""
+        with self.renderer.load(MemorySource(planes)) as scene:
+            images = [self.renderer.render(scene, camera) for camera in self.cameras]
+        errors = [np.mean(np.square(a - b)) for a, b in zip(images, self.original, strict=True)]
+        return float(-10 * np.log10(np.mean(errors)))
+
+    def distil(self, steps: int, grid: Steps | None = None, **words: Any) -> Planes:
+        shared = (self.degrees, np.zeros(3), self.cameras, self.targets)
+        return distil(self.renderer, self.kept, *shared, Schedule(steps, **words), grid, rates=RATES)
+
+    def rounded(self, planes: Planes) -> Planes:
+        return from_grid(to_grid(planes, self.degrees, STEPS, np.zeros(3))[0])
+
+    def close(self) -> None:
+        self.targets.close()
+        self.renderer.release()
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    made = Bench()
+    yield made
+    made.close()
+
+
+def test_a_descent_gets_closer_than_a_refit_of_colours(bench: Bench) -> None:
+    shared = (bench.degrees, np.zeros(3), bench.cameras, bench.targets)
+    refitted = refit_colours(bench.renderer, bench.kept, *shared, rounds=4, subsets=2)
+    before, refit, short, long = map(bench.fidelity, (bench.kept, refitted, bench.distil(12), bench.distil(360)))
+    assert long > refit + 2 > before + 4 and long > short > before, (before, refit, short, long)
+
+
+def test_rows_keep_their_places_and_degrees(bench: Bench) -> None:
+    moved = bench.distil(2)
+    assert same_bits(moved["sh_rest"], bench._without_higher(moved["sh_rest"]))
+    for name in ("means", "log_scales", "opacity_logits", "sh_dc"):
+        # Nobody sees it; and two steps take no value far from where it was.
+        assert name == "log_scales" or same_bits(moved[name][:, :1], bench.kept[name][:, :1])
+        distance = abs(np.sort(moved[name], axis=0) - np.sort(bench.kept[name], axis=0)).max()
+        assert 0 < distance < 3 * RATES[name], name
+    norms = np.square(moved["quats"]).sum(axis=0)
+    assert abs(norms - 1).max() < 0.01
+
+
+def test_steps_on_the_grid_repair_it(bench: Bench) -> None:
+    blind, aware = bench.distil(120), bench.distil(180, STEPS)  # 120 of them before the grid
+    assert bench.fidelity(bench.rounded(aware)) > bench.fidelity(bench.rounded(blind)) + 0.2
+
+
+def test_every_run_and_width_gives_the_same_bits(bench: Bench) -> None:
+    first = bench.distil(5, STEPS)
+    for form in ("w16", "w4", "numpy"):
+        other = Bench(form)
+        again = other.distil(5, STEPS)
+        other.close()
+        assert all(same_bits(first[name], again[name]) for name in first), form
+
+
+def test_each_view_comes_once_in_each_round() -> None:
+    order = Schedule(23).order(7)
+    assert len(order) == 23 and same_bits(order, Schedule(23).order(7))
+    for start in (0, 7, 14):
+        assert sorted(order[start : start + 7]) == list(range(7))
+    assert not same_bits(order[:7], order[7:14])
+
+
+def test_parts_of_a_descent(bench: Bench) -> None:
+    assert [len(part) for part in Schedule(8).parts(True)] == [4, 2, 2]
+    assert [len(part) for part in Schedule(8).parts(False)] == [8, 0, 0]
+    moving, held = bench.distil(9, STEPS, on_grid=0.0, holding=1 / 3), bench.distil(3, STEPS, on_grid=0.0, holding=1.0)
+    for name in moving:
+        assert same_bits(moving[name], held[name]) == (name in HELD), name
+
+
+def test_too_little_memory_is_said_and_leaves_nothing_taken(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1 << 10)
+    monkeypatch.setattr("flexgs_edge.render.device_scene.MIN_CHUNK_ROWS", 16)
+    shared = (bench.degrees, np.zeros(3), bench.cameras, bench.targets)
+    refused = []
+    for limit in range(200_000, 4_000_000, 50_000):
+        budget = MemoryBudget(limit)
+        renderer = Renderer(TwinBackend(budget), budget)
+        try:
+            distil(renderer, bench.kept, *shared, Schedule(1))
+        except BudgetError as error:
+            refused.append(str(error))
+        else:
+            break
+        finally:
+            renderer.release()
+            assert budget.used == 0
+    assert limit < 3_000_000 and all("--memory-limit" in words for words in refused)
+    assert any("keeps all of them in memory at once" in words for words in refused)
+
+
+def test_poses_between() -> None:
+    apart = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (3.0, 0.0, 0.0)
+    cameras = [make_camera(translation=place, name=str(k)) for k, place in enumerate(apart)]
+    middles = poses_between(cameras)
+    assert [camera.name for camera in middles] == ["0 to 1", "1 to 2"]
+    np.testing.assert_allclose([camera.center for camera in middles], [(-0.5, 0, 0), (-2, 0, 0)], atol=1e-12)
+    turned, around = np.diag([-1.0, 1, -1]), np.array([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
+    assert poses_between([cameras[0], make_camera(rotation=turned, translation=(1.0, 0, 0))]) == []
+    (middle,) = poses_between([cameras[0], make_camera(rotation=around, translation=(1.0, 0, 0))])
+    np.testing.assert_allclose(middle.rotation @ middle.rotation.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(middle.rotation @ middle.rotation, around, atol=1e-12)
+    assert poses_between(cameras[:1]) == poses_between([]) == poses_between([cameras[0], cameras[0]]) == []
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_project(tmp_path_factory.mktemp("tiny") / "scene")
+
+
+def test_distilled_files_lose_less_in_the_same_bytes(project: Path, tmp_path: Path) -> None:
+    words: dict[str, Any] = {"effort": "fast", "holdout": 4, "cameras": str(project / "cameras.json")}
+    # How far below its limit a search ends is partly chance, and 1 % of the bytes are 0.15 dB here.
+    plain = compress(project / "point_cloud.ply", tmp_path / "plain.fgs", distil=0, max_size=7500, **words)
+    found = compress(project / "point_cloud.ply", tmp_path / "a.fgs", distil=60, max_size=7500, **words)
+    again = compress(project / "point_cloud.ply", tmp_path / "b.fgs", distil=60, max_size=7500, **words)
+    assert found.size <= 7500 and abs(found.size - plain.size) < 0.01 * found.size
+    assert found.training_fidelity is not None and plain.training_fidelity is not None
+    # Not of held-out views: of this scene they are worse at 8500 bytes than at 7500, whatever is done.
+    assert found.training_fidelity > plain.training_fidelity + 0.5, (found.training_fidelity, plain.training_fidelity)
+    assert again.training_fidelity == found.training_fidelity
+    assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"effort": "max", "method": "paper"}, "--effort max distils, which --method paper does not"),
+        ({"distil": 10, "method": "paper"}, "--distil belongs to --method best"),
+        ({"distil": -1}, "--distil -1: expected 0"),
+        ({"distil": 10, "refit": False}, "--no-refit with --distil 10"),
+        ({"effort": "max", "refit": False}, "--no-refit with --effort max"),
+    ],
+)
+def test_words_that_make_no_sense(words: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        CompressOptions(**words)
+
+
+@pytest.mark.parametrize("words", [{"distil": 10}, {"effort": "max"}])
+def test_other_formats_have_grids_of_their_own(project: Path, tmp_path: Path, words: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match="distilling ends on the grid of a .fgs"):
+        compress(project / "point_cloud.ply", tmp_path / "a.spz", **words)

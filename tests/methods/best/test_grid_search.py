@@ -1,0 +1,365 @@
+"""The search over one multiplier, on a world whose size and loss are known functions of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flexgs_edge.errors import TargetError
+from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, MinFidelity, Target
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.to_grid import to_grid as grid
+from flexgs_edge.memory.storage import MEMORY
+from flexgs_edge.methods.best import multiplier as search_module
+from flexgs_edge.methods.best.candidates import RateResult, RateStep
+from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
+from flexgs_edge.methods.best.costs import RemovalCosts
+from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses
+from flexgs_edge.methods.best.grid_search import DISTILLED, RateSearch, rate_from
+from flexgs_edge.methods.best.kept import Mended
+from flexgs_edge.methods.best.multiplier import EXTRA_STEPS
+from flexgs_edge.methods.best.rounds import Snapshot, take_rows
+from flexgs_edge.scene.fields import FIELD
+from synthetic import make_camera, random_scene
+
+SLOPES = Slopes(dict.fromkeys(GEOMETRY, 100.0))
+UNIT = choose_steps(SLOPES, np.ones(1), np.zeros(1), 0, 1.0).opacity
+EFFORT = Effort(keep=0.8, refit_rounds=1, subsets=2, steps=4, close=0.03, few=8, views=8, pixels=24)
+AT = 1e-4
+BYTES = 4000
+"""The multiplier at which the worlds lose 1 dB, and the bytes that they take there (53 bits for each of 600 Gaussians)."""
+
+
+class FakePath:
+    """A path whose costs are known: descending removes the cheapest and changes no cost."""
+
+    renderer = origin = targets = None
+    cameras: tuple[object, ...] = ()
+    room = MEMORY
+
+    def __init__(self, count: int = 600, degree: int = 1, unseen: int = 0, scale: float = 1.0) -> None:
+        rng = np.random.default_rng(81)
+        planes = random_scene(count, 82, degree).read(slice(0, count), list(FIELD))
+        weight2 = np.where(np.arange(count) < unseen, 0.0, 1.0)
+        removal = rng.lognormal(math.log(scale * AT * 50), 3, count) * (weight2 > 0)
+        sh = rng.lognormal(math.log(scale * AT * 10), 2, (degree, count)) * (weight2 > 0)
+        costs = RemovalCosts(removal, weight2, sh, np.zeros((degree, 3, count), np.float32))
+        self.origin = np.zeros(3)
+        self.snapshots = [Snapshot(np.arange(count), planes, costs)]
+        self.shares: list[float] = []
+
+    def descend(self, share: float) -> Snapshot:
+        self.shares.append(share)
+        last = self.snapshots[-1]
+        keep = np.flatnonzero(last.cheapest(last.count - round(last.count * share)))
+        c = last.costs
+        costs = RemovalCosts(c.removal[keep], c.weight2[keep], c.sh[:, keep], c.sh_mean[:, :, keep])
+        self.snapshots.append(Snapshot(last.rows[keep], take_rows(last.planes, keep), costs))
+        return self.snapshots[-1]
+
+
+class World:
+    """Size and loss as functions of the multiplier, which is read back from the steps of the grid made last."""
+
+    multiplier: float | None = None
+
+    def __init__(self, loss: Callable[[float], float], size: Callable[[float], float], floor: float = 0.0) -> None:
+        self.loss, self.size, self.floor = loss, size, floor
+        self.grids: list[GridScene] = []
+        self.path = FakePath()
+
+    def size_of(self, grid: GridScene) -> int:
+        self.grids.append(grid)
+        assert self.multiplier is not None
+        return round(self.size(self.multiplier))
+
+    def measure(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
+        if self.multiplier is None:  # the walk down, before anything was coded: pruning alone
+            costs = self.path.snapshots[-1].costs
+            least = costs.removal[costs.weight2 > 0].min(initial=1e9)
+            drop = 0.45 * max(self.loss(max(least / 50, 1e-30)), self.floor)
+        else:
+            drop = max(self.loss(self.multiplier), self.floor)
+        return Measurement(drop, 42 - 10 * math.log10(max(drop, 1e-9)), drop)
+
+
+def powers(loss: float = 0.6, size: float = -0.45) -> World:
+    return World(lambda m: (m / AT) ** loss, lambda m: BYTES * (m / AT) ** size)
+
+
+@pytest.fixture(autouse=True)
+def _known_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def to_grid(planes: Any, degrees: Any, steps: Steps, origin: Any, **words: Any) -> Any:
+        World.multiplier = (steps.opacity / UNIT) ** 2
+        return grid.to_grid(planes, degrees, steps, origin, **words)
+
+    monkeypatch.setattr(World, "multiplier", None)
+    monkeypatch.setattr(search_module, "to_grid", to_grid)
+    monkeypatch.setattr(search_module, "probe_slopes", lambda *_: SLOPES)
+
+
+def search(
+    world: World, target: Target, path: FakePath | None = None, best_effort: bool = False, **words: Any
+) -> RateResult[GridScene]:
+    words = {"effort": EFFORT, "refit": False, **words}
+    World.multiplier = None
+    world.path = path or FakePath()
+    found = RateSearch(world.path, world.size_of, world.measure, **words)  # type: ignore[arg-type]
+    return found.run(target, best_effort)
+
+
+def best_of(steps: tuple[RateStep, ...]) -> RateStep:
+    """The smallest step that holds."""
+    return min((step for step in steps if step.holds), key=lambda step: step.size)
+
+
+@pytest.mark.parametrize("target", [MaxDrop(1.0), MaxDrop(0.1), MaxDrop(3.0), MinFidelity(42.0), MinFidelity(48.0)])
+@pytest.mark.parametrize("loss", [0.5, 0.6, 0.8, 1.2])
+def test_smooth_worlds_are_met_closely_with_few_steps(loss: float, target: Target) -> None:
+    found = search(powers(loss), target)
+    assert found.reached and found.chosen.holds and found.chosen == best_of(found.steps)
+    assert -0.15 < found.chosen.excess <= 0, [step.excess for step in found.steps]
+    assert found.chosen.excess > -EFFORT.close and len(found.steps) <= 3
+
+
+def test_a_world_with_a_shallow_slope_is_met_as_well() -> None:
+    assert search(powers(0.35), MaxDrop(0.1), best_effort=True).reached
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_the_unit_of_errors_does_not_matter(scale: float) -> None:
+    world = World(lambda m: (m / (scale * AT)) ** 0.6, lambda m: BYTES * (m / (scale * AT)) ** -0.45)
+    found = search(world, MaxDrop(1.0), FakePath(scale=scale))
+    assert found.reached and found.chosen.excess > -EFFORT.close
+    assert found.chosen.multiplier == pytest.approx(scale * AT, rel=0.1)
+
+
+@pytest.mark.parametrize("wiggle", [0.1, 0.3])
+@pytest.mark.parametrize("pace", [3.0, 11.0])
+def test_a_rough_world_gives_the_best_point_that_was_seen(pace: float, wiggle: float) -> None:
+    """The loss falls again in places, as it does where another snapshot is taken."""
+    world = World(
+        lambda m: (m / AT) ** 0.6 * (1 + wiggle * math.sin(pace * math.log(m))), lambda m: BYTES * (m / AT) ** -0.45
+    )
+    found = search(world, MaxDrop(1.0))
+    assert found.reached and found.chosen == best_of(found.steps)
+    assert found.chosen.size < 1.3 * BYTES
+    assert len(found.steps) <= EFFORT.steps + EXTRA_STEPS
+
+
+def test_steps_are_not_asked_twice() -> None:
+    world = World(lambda m: 0.5 if m < AT else 2.0, lambda m: BYTES * (m / AT) ** -0.45)  # a cliff: nothing is close
+    found = search(world, MaxDrop(1.0))
+    multipliers = [step.multiplier for step in found.steps]
+    assert found.reached and len(set(multipliers)) == len(multipliers) == EFFORT.steps + EXTRA_STEPS
+    assert found.chosen.multiplier == pytest.approx(AT, rel=0.5)
+
+
+def test_out_of_reach_names_the_closest_point() -> None:
+    world = powers()
+    world.floor = 2.0
+    with pytest.raises(TargetError, match=r"drop <= 1 dB is out of reach.*drop 2\.000 dB at .*--best-effort"):
+        search(world, MaxDrop(1.0))
+    found = search(powers_with_floor(2.0), MaxDrop(1.0), best_effort=True)
+    assert not found.reached and not found.chosen.holds and len(found.steps) == EFFORT.steps + EXTRA_STEPS
+    assert found.chosen.excess == min(step.excess for step in found.steps)
+    assert found.product.count > 0
+
+
+def powers_with_floor(floor: float) -> World:
+    world = powers()
+    world.floor = floor
+    return world
+
+
+@pytest.mark.parametrize("limit", [1000, 2000, 4000, 8000])
+def test_size_targets_give_the_best_quality_that_fits(limit: int) -> None:
+    found = search(powers(), MaxSize(limit, "drop"))
+    assert found.reached and found.chosen.size <= limit
+    assert found.chosen.size > 0.85 * limit, [step.size for step in found.steps]
+    fitting = [step for step in found.steps if step.size <= limit]
+    assert found.chosen.measurement.drop == min(step.measurement.drop for step in fitting)  # type: ignore[type-var]
+
+
+def test_a_size_that_nothing_fits_into() -> None:
+    world = World(lambda m: (m / AT) ** 0.6, lambda m: 2000 + 10 * (m / AT) ** -0.45)
+    with pytest.raises(TargetError, match=r"size <= 900 B is out of reach"):
+        search(world, MaxSize(900, "drop"))
+    assert search(world, MaxSize(900, "drop"), best_effort=True).chosen.size == pytest.approx(2000, rel=0.05)
+
+
+def test_the_file_is_the_chosen_step_s() -> None:
+    world = powers()
+    seen: list[RateStep] = []
+    found = search(world, MaxDrop(1.0), on_step=seen.append)
+    assert tuple(seen) == found.steps
+    assert any(found.product is grid for grid in world.grids)
+    assert (found.product.count, found.product.sh_count) == (found.chosen.count, found.chosen.sh_count)
+    assert found.product.steps.opacity == pytest.approx(UNIT * math.sqrt(found.chosen.multiplier), rel=1e-5)
+
+
+def test_the_same_search_every_time() -> None:
+    one, two = (search(powers(), MaxDrop(1.0)) for _ in range(2))
+    assert [replace(s, seconds=0.0) for s in one.steps] == [replace(s, seconds=0.0) for s in two.steps]
+    for name in ("position", "scale", "rotation", "opacity", "dc", "sh_degrees"):
+        np.testing.assert_array_equal(getattr(one.product, name), getattr(two.product, name))
+
+
+def test_the_path_is_walked_down_by_the_effort_s_share() -> None:
+    path = FakePath()
+    found = search(powers(), MaxDrop(1.0), path, effort=replace(EFFORT, keep=0.7))
+    assert set(path.shares) == {0.7} and found.chosen.count <= path.snapshots[0].count
+    counts = [snapshot.count for snapshot in path.snapshots]
+    assert counts == sorted(counts, reverse=True)
+
+
+def test_larger_multipliers_keep_fewer() -> None:
+    found = search(powers(), MaxDrop(1.0))
+    steps = sorted(found.steps, key=lambda step: step.multiplier)
+    assert all(a.count >= b.count for a, b in zip(steps, steps[1:]))
+
+
+def test_unseen_gaussians_stay() -> None:
+    path = FakePath(unseen=60)
+    found = search(powers(), MaxDrop(1.0), path)
+    positions = np.rint(path.snapshots[0].planes["means"][:, :60] / found.product.steps.position).astype(int)
+    kept = {tuple(p) for p in found.product.position.T.tolist()}
+    assert found.reached and all(tuple(p) in kept for p in positions.T.tolist())
+
+
+def test_unseen_gaussians_that_would_coarsen_the_grid_go() -> None:
+    calm, astray = FakePath(unseen=60), FakePath(unseen=60)
+    astray.snapshots[0].planes["means"][:, 7] = 1e7
+    steps, counts = zip(
+        *(
+            (found.product.steps, found.product.count)
+            for found in (search(powers(), MaxDrop(1.0), path) for path in (calm, astray))
+        )
+    )
+    assert steps[0] == steps[1] and counts[1] == counts[0] - 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 15, 17])
+@pytest.mark.parametrize("target", [MaxDrop(1.0), MaxSize(3000, "drop")])
+def test_few_gaussians(count: int, target: Target) -> None:
+    found = search(powers(), target, FakePath(count))
+    assert found.reached and found.product.count <= count
+
+
+def test_nothing_that_any_pose_sees() -> None:
+    found = search(powers(), MaxDrop(1.0), FakePath(40, unseen=40), best_effort=True)
+    assert found.product.count == 40 and found.product.sh_count == 0
+
+
+def test_efforts_grow() -> None:
+    fast, balanced, thorough = (EFFORTS[name] for name in ("fast", "balanced", "thorough"))
+    for name in ("keep", "refit_rounds", "steps", "views"):
+        assert getattr(fast, name) <= getattr(balanced, name) <= getattr(thorough, name)
+        assert getattr(fast, name) < getattr(thorough, name)
+    assert fast.close > balanced.close > thorough.close
+    assert EFFORTS["max"].passes > 0 == fast.passes == balanced.passes == thorough.passes
+
+
+def test_descents_with_less_to_mend_go_at_smaller_rates() -> None:
+    assert rate_from(30.0) == rate_from(41.0) == rate_from(None) == 1.0
+    assert rate_from(47.0) == pytest.approx(0.5, abs=0.002)  # half the error of 41 dB
+    assert rate_from(53.0) == pytest.approx(0.25, abs=0.002) and rate_from(90.0) == 0.25
+
+
+@pytest.mark.parametrize("found", [0.2, 0.33, 0.5])
+def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: float) -> None:
+    """The first whole result takes all steps, the next ones a part; values go on where they were, also those of geometry."""
+    seen: list[tuple[int, float, float]] = []
+
+    def distil(renderer: Any, planes: Any, *rest: Any, **_: Any) -> Any:
+        schedule = rest[-2]
+        seen.append((schedule.steps, schedule.rate, float(planes["opacity_logits"].max())))
+        return {**planes, "opacity_logits": np.full_like(planes["opacity_logits"], 9.0)}
+
+    monkeypatch.setattr(search_module, "distil", distil)
+    monkeypatch.setattr(search_module, "refit_colours", lambda renderer, planes, *_, **__: planes)
+    monkeypatch.setattr(search_module, "rate_from", lambda fidelity: 1.0)
+    world = World(lambda m: found / DISTILLED * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
+    path = FakePath()
+    path.cameras, path.between, path.progress = [], [], None  # type: ignore[attr-defined]
+    result = search(world, MaxDrop(1.0), path, refit=True, steps=100)
+    assert result.reached and len(seen) == len(result.steps)
+    tried: list[float] = []
+    for step, call in zip(result.steps, seen, strict=True):
+        # From a descent that kept as much or more; else from the beginning.
+        expected = (40, 0.5) if any(multiplier <= step.multiplier for multiplier in tried) else (100, 1.0)
+        assert call[:2] == expected and (call[2] == 9.0) == (expected[0] == 40)
+        tried.append(step.multiplier)
+    assert len(seen) > 1 and 40 in [steps for steps, *_ in seen]
+
+
+@pytest.mark.parametrize(("steps", "after"), [(100, 1), (100, 0), (0, 1)])
+def test_an_interrupted_search_with_descents_keeps_the_best(
+    monkeypatch: pytest.MonkeyPatch, steps: int, after: int
+) -> None:
+    done: list[int] = []
+
+    def whole(self: RateSearch, multiplier: float, target: Target) -> Any:
+        if len(done) == after:
+            raise KeyboardInterrupt
+        done.append(1)
+        grid = self._unmended(multiplier)
+        measurement = Measurement(0.5, 42.0, 0.5)
+        return RateStep(multiplier, 1, 0, 4000, measurement, target.excess(4000, measurement), 0.0), grid
+
+    monkeypatch.setattr(RateSearch, "_whole", whole)
+    if steps and after:
+        assert search(powers(), MaxDrop(1.0), steps=steps).chosen.size == 4000
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            search(powers(), MaxDrop(1.0), steps=steps)
+
+
+def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> None:
+    rng = np.random.default_rng(5)
+    mended = {"sh_dc": rng.normal(size=(3, 3)).astype(np.float32), "sh_rest": np.ones((9, 3), np.float32)}
+    last = Mended.of(np.array([2, 5, 7]), np.array([0, 1, 1]), np.array([2, 0, 1]), mended)
+    planes = {"sh_dc": np.zeros((3, 4), np.float32), "sh_rest": np.zeros((24, 4), np.float32), "means": np.ones((3, 4))}
+    found = last.apply(np.array([1, 2, 5, 7]), np.array([1, 1, 1, 1]), planes)
+    np.testing.assert_array_equal(
+        found["sh_dc"], np.stack([0 * mended["sh_dc"][:, 0]] * 2 + [*mended["sh_dc"].T[[2, 0]]], 1)
+    )
+    # Three coefficients of eight a channel were there before; row 2 had another degree, row 1 was not kept.
+    expected = np.zeros((3, 8, 4))
+    expected[:, :3, 2:] = 1
+    np.testing.assert_array_equal(found["sh_rest"].reshape(3, 8, 4), expected)
+    assert not planes["sh_dc"].any() and found["means"] is planes["means"]
+
+
+@pytest.mark.parametrize(("count", "step"), [(10, LARGEST_STEP), (100, 3), (240, 2), (260, 1), (10**6, 1)])
+def test_poses_have_no_more_pixels_than_the_rows_need(count: int, step: int) -> None:
+    cameras = [make_camera(64, 48) for _ in range(8)]
+    sampled = sampled_poses(cameras, 24 * count)
+    assert {camera.width for camera in sampled} == {-(-64 // step)} | ({64 // step} if 64 % step else set())
+    if 1 < step < LARGEST_STEP:
+        pixels = sum(camera.width * camera.height for camera in sampled)
+        assert pixels >= 24 * count
+    # Not the same lattice in every view.
+    assert len({(camera.cx, camera.cy) for camera in sampled}) == min(step**2, 8)
+
+
+def test_large_scenes_are_scored_from_more_poses() -> None:
+    effort = replace(EFFORT, few=3, views=6, pixels=10)
+    pixels = [100] * 9
+    assert [effort.poses_of(pixels, count) for count in (1, 30, 31, 40, 41, 60, 1000)] == [3, 3, 4, 4, 5, 6, 6]
+    assert effort.poses_of(pixels[:2], 1) == effort.poses_of(pixels[:2], 1000) == 2
+
+
+def test_geometry_goes_on_whatever_the_degree() -> None:
+    moved = {"sh_dc": np.ones((3, 2), np.float32), "means": np.array([[1, 2]] * 3, np.float32)}
+    last = Mended.of(np.array([2, 7]), np.array([0, 1]), np.array([1, 0]), moved, fields=tuple(moved))
+    planes = {"sh_dc": np.zeros((3, 3), np.float32), "means": np.zeros((3, 3), np.float32)}
+    found = last.apply(np.array([1, 2, 7]), np.array([1, 1, 1]), planes)
+    np.testing.assert_array_equal(found["means"], [[0, 2, 1]] * 3)
+    np.testing.assert_array_equal(found["sh_dc"], [[0, 0, 1]] * 3)

@@ -1,0 +1,393 @@
+"""Scenes that do not fit into memory: the same pictures, sums and bytes as those that do, also after a kill."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.commands import compress as compress_module
+from flexgs_edge.commands.compress import compress
+from flexgs_edge.constants import CULLED
+from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.io.ply import write_ply
+from flexgs_edge.kernels.backend import TwinBackend
+from flexgs_edge.memory.storage import Scratch
+from flexgs_edge.methods.best.costs import measure_costs
+from flexgs_edge.methods.best.refit.colour import refit_colours
+from flexgs_edge.methods.best.rounds import sums_room
+from flexgs_edge.render import device_scene
+from flexgs_edge.render.camera_record import camera_record
+from flexgs_edge.render.chunk_bounds import ChunkBounds
+from flexgs_edge.render.chunks import SourcePlanes
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.scene.curve import near_rows
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.references import TargetViews
+from kernel_fixtures import FORMS, large_budget, open_form
+from synthetic import joined, look_from, make_camera, random_scene
+from tiny_project import make_project, write_cameras
+
+SCENE = joined(random_scene(700, 5, 2), random_scene(300, 6, 2, size=-1.0))
+TINY: dict[str, Any] = {"effort": "fast", "holdout": 4, "min_fidelity": 35.0, "best_effort": True}
+
+
+def cameras() -> list[Camera]:
+    """Views of two sizes; one sees nothing."""
+    views = []
+    for seed, (width, height) in enumerate([(40, 30), (40, 30), (64, 20)]):
+        rotation, translation = look_from(seed)
+        views.append(make_camera(width, height, rotation=rotation, translation=translation, name=f"v{seed}"))
+    rotation, _ = look_from(1)
+    return [*views, make_camera(40, 30, rotation=rotation, translation=(0.0, 0.0, -50.0), name="nothing")]
+
+
+def found_by(form: str, room: Scratch | None) -> dict[str, np.ndarray]:
+    """Pictures, statistics, costs and refitted colours of the scene."""
+    drawer = Renderer(open_form(form), large_budget())
+    if room is not None:
+        drawer.room = room
+    statistics = Statistics.zeros(SCENE.count)
+    found: dict[str, np.ndarray] = {}
+    with drawer.load(SCENE) as scene:
+        for camera in cameras():
+            found[camera.name] = drawer.render(scene, camera)
+            drawer.add_statistics(scene, camera, statistics)
+        assert (scene.shown is not None) == (room is not None)
+    found |= {"hits": statistics.hits, "weights": statistics.weights}
+    with drawer.load(SCENE, 100) as scene, TargetViews() as targets:
+        costs = measure_costs(drawer, scene, cameras())
+        found |= {name: getattr(costs, name) for name in ("removal", "weight2", "sh", "sh_mean")}
+        planes = SCENE.read(slice(0, SCENE.count), list(FIELD))
+        for view, camera in enumerate(cameras()):
+            targets.add(view, drawer.render_planes(scene, camera))
+        planes["sh_dc"] = planes["sh_dc"] + np.float32(0.1)
+        degrees = np.arange(SCENE.count) % 3
+        moved = refit_colours(drawer, planes, degrees, SCENE.origin, cameras(), targets, 2, subsets=2)
+    drawer.release()
+    return {**found, "moved": moved["sh_dc"], "rest": moved["sh_rest"]}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_compact_views_give_the_same_bits(
+    form: str, compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spilled = found_by(form, Scratch(tmp_path))
+    # Some chunks stay in memory.
+    asked = itertools.count()
+    monkeypatch.setattr(DeviceScene, "_may_stay", lambda *_: next(asked) % 3 == 0)
+    for name, values in found_by(form, Scratch(tmp_path)).items():
+        np.testing.assert_array_equal(values, spilled[name], err_msg=name)
+    # One chunk, so that it is the last one that shows more than there is room for.
+    monkeypatch.setattr(device_scene, "COMPACT_ROWS", 4096)
+    for name, values in found_by(form, Scratch(tmp_path)).items():
+        np.testing.assert_array_equal(values, spilled[name], err_msg=name)
+    monkeypatch.undo()
+    plain = found_by(form, None)
+    assert plain["removal"].any() and plain["hits"].any()
+    for name, values in plain.items():
+        np.testing.assert_array_equal(spilled[name], values, err_msg=name)
+
+
+def test_sums_of_a_chunk_take_the_place_of_a_view(
+    compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the limit, costs are measured and colours refitted, or a view is refused before, with a limit that does."""
+    monkeypatch.setattr(device_scene, "COMPACT_ROWS", 512)
+    planes, degrees = SCENE.read(slice(0, SCENE.count), list(FIELD)), np.full(SCENE.count, 2)
+    views, drawn = cameras()[:2], list[int]()
+    budget = large_budget()
+    drawer = Renderer(TwinBackend(budget), budget)
+    drawer.room, held = Scratch(tmp_path), budget.used
+    with TargetViews() as targets:
+        with drawer.load(SCENE) as scene:
+            for view, camera in enumerate(views):
+                targets.add(view, drawer.render_planes(scene, camera))
+        drawer.release()
+        for limit in range(250_000, 750_000, 20_011):
+            budget.limit = held + limit
+            try:
+                with drawer.load(SCENE, sums_room(SCENE.sh_degree), view_sums=2) as scene:
+                    measure_costs(drawer, scene, views)
+                refit_colours(drawer, planes, degrees, SCENE.origin, views, targets, 1)
+                drawn.append(limit)
+            except BudgetError as error:
+                assert not drawn and "a view" in str(error)
+            drawer.release()
+            assert budget.used == held
+    assert drawn and drawn[0] > 250_000
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_chunks_that_stay_give_way(seed: int, compact: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are read once, unless memory is wanted for something else, at any moment; the one that is used is never taken."""
+    rng, backend, budget, read = np.random.default_rng(seed), open_form("w8"), large_budget(), []
+    monkeypatch.setattr(DeviceScene, "_may_stay", lambda *_: rng.random() < 0.8)
+    plain_read, used = MemorySource.read, budget.used
+
+    def note(self: MemorySource, rows: slice, *words: Any) -> Any:
+        read.append(rows.start)
+        return plain_read(self, rows, *words)
+
+    monkeypatch.setattr(MemorySource, "read", note)
+    planes = SCENE.read(slice(0, SCENE.count), ["means", "sh_rest"])
+    starts = list(range(0, SCENE.count, 64))
+    with DeviceScene(backend, SourcePlanes(backend, SCENE), budget) as scene:
+        scene.be_compact(100)
+        for turn in range(12):
+            stayed = set(scene._pinned)
+            read.clear()
+            found = []
+            for chunk in scene.chunks():
+                if turn % 2:
+                    (reclaim,) = budget.reclaimers
+                    reclaim(int(rng.integers(0, 60_000)))
+                rows = slice(chunk.base, chunk.base + chunk.count)
+                for name, array in (("means", chunk.means), ("sh_rest", chunk.sh_rest)):
+                    np.testing.assert_array_equal(backend.read(array)[:, : chunk.count], planes[name][:, rows])
+                found.append(chunk.base)
+            assert found == starts
+            if turn % 2 == 0:
+                assert read == [start for start in starts if start not in stayed]
+            assert len(read) == len(set(read)) and len(scene._pinned) <= len(starts)
+        for chunk in scene.chunks():  # left in the middle
+            if chunk.base > SCENE.count // 2:
+                break
+    assert not budget.reclaimers and budget.used == used
+
+
+def wide_scene() -> MemorySource:
+    """Small splats along a curve, far wider than a view, a few large ones among them."""
+    wide = joined(random_scene(2900, 7, 1, size=-3.0, spread=15.0), random_scene(12, 8, 1, size=0.0, spread=15.0))
+    planes = wide.read(slice(0, wide.count), list(FIELD))
+    order = near_rows(planes["means"])
+    return MemorySource({name: values[:, order] for name, values in planes.items()})
+
+
+@pytest.mark.parametrize(
+    ("form", "extent", "antialiased"),
+    [("w8", "exact", False), ("w8", "inria", False), ("w8", "exact", True), ("numpy", "inria", True)],
+)
+def test_views_read_the_chunks_that_they_see(
+    form: str, extent: str, antialiased: bool, compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, views = wide_scene(), cameras()
+    read: list[slice] = []
+
+    def drawn(room: Scratch | None) -> list[np.ndarray]:
+        drawer = Renderer(open_form(form), large_budget(), extent=extent, antialiased=antialiased)
+        if room is not None:
+            drawer.room = room
+        found = []
+        with drawer.load(source) as scene:
+            for camera in views:
+                read.clear()
+                found.append(drawer.render(scene, camera))
+                counts.append(len(read))
+                statistics = Statistics.zeros(source.count)
+                drawer.add_statistics(scene, camera, statistics)
+                found += [statistics.hits, statistics.weights]
+        drawer.release()
+        return found
+
+    def note(self: MemorySource, rows: slice, *words: Any) -> Any:
+        read.append(rows)
+        return plain_read(self, rows, *words)
+
+    plain_read, counts = MemorySource.read, []
+    monkeypatch.setattr(MemorySource, "read", note)
+    spilled = drawn(Scratch(tmp_path))
+    chunks = -(-source.count // 64)
+    # The first view of the scene looks at every chunk, and the one that sees nothing at none.
+    assert counts[0] >= chunks and counts[-1] == 0
+    assert 0 < counts[1] < chunks and 0 < counts[2] < chunks, counts
+    monkeypatch.undo()
+    for values, expected in zip(spilled, drawn(None), strict=True):
+        np.testing.assert_array_equal(values, expected)
+
+
+def test_chunks_are_seen_where_any_of_their_splats_is() -> None:
+    """Single rows, so that every bound is as tight as it can be; and what is left out is most of what shows nothing."""
+    source = wide_scene()
+    planes = source.read(slice(0, source.count), list(FIELD))
+    bounds = [ChunkBounds.of(planes["means"][:, [i]], planes["log_scales"][:, [i]]) for i in range(source.count)]
+    for inria in (False, True):
+        drawer = Renderer(open_form("numpy"), large_budget(), extent="inria" if inria else "exact")
+        with drawer.load(source) as scene:
+            for camera in cameras():
+                drawer.render(scene, camera)
+                assert drawer._buffers is not None
+                shown = np.asarray(drawer.backend.read(drawer._buffers.keys))[: source.count] != CULLED
+                record = camera_record(camera, source.origin, drawer.near)
+                seen = np.array([some.seen(record, inria) for some in bounds])
+                assert not (shown & ~seen).any()
+                assert (~seen).sum() > 0.7 * (~shown).sum()
+        drawer.release()
+
+
+def test_numbers_beyond_all_bounds_are_seen() -> None:
+    record = camera_record(cameras()[-1], np.zeros(3), 0.2)  # the one that sees nothing
+    means, scales = np.zeros((3, 2), np.float32), np.zeros((3, 2), np.float32)
+    assert not ChunkBounds.of(means, scales).seen(record, False)
+    scales[1, 1] = 1e4
+    assert ChunkBounds.of(means, scales).extent == np.inf
+    for inria in (False, True):
+        assert not ChunkBounds.of(means, scales).seen(record, inria), "behind the camera, whatever the size"
+    assert ChunkBounds.of(np.full((3, 2), np.nan, np.float32), scales).seen(record, False)
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_project(tmp_path_factory.mktemp("tiny") / "scene", photos=False)
+
+
+@pytest.fixture(scope="module")
+def expected(project: Path) -> bytes:
+    compress(project / "point_cloud.ply", project / "plain.fgs", layers=2, **TINY)
+    return (project / "plain.fgs").read_bytes()
+
+
+@pytest.fixture
+def spilled(compact: None, monkeypatch: pytest.MonkeyPatch) -> list[Scratch]:
+    """Every scene goes to scratch files, however small."""
+    rooms: list[Scratch] = []
+
+    def choose(renderer: Any, source: Any, cameras: Any, options: Any, budget: Any, folder: Path) -> Scratch:
+        rooms.append(Scratch(folder))
+        return rooms[-1]
+
+    monkeypatch.setattr(compress_module, "choose_room", choose)
+    monkeypatch.setattr("flexgs_edge.memory.storage._SMALL", 1)
+    return rooms
+
+
+def test_the_bytes_are_those_of_a_run_in_memory(
+    project: Path, expected: bytes, spilled: list[Scratch], tmp_path: Path
+) -> None:
+    result = compress(project / "point_cloud.ply", tmp_path / "a.fgs", layers=2, **TINY)
+    assert (tmp_path / "a.fgs").read_bytes() == expected
+    assert result.run.scratch == spilled[0].peak > 0 and result.run.peak_anonymous
+    assert os.listdir(tmp_path) == ["a.fgs"]
+
+
+class Stop(BaseException):
+    """What ends a run in the middle, as a kill does."""
+
+
+def test_a_run_goes_on_from_its_last_round(
+    project: Path, expected: bytes, spilled: list[Scratch], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = {**TINY, "layers": 2, "resume": True, "scratch": str(tmp_path / "kept")}
+    (tmp_path / "kept").mkdir()
+    drawn = []
+    both = Renderer.residual_and_removal_sums
+
+    def stop_after(most: int) -> None:
+        def draw(self: Renderer, *arguments: Any) -> Any:
+            if len(drawn) == most:
+                raise Stop
+            drawn.append(1)
+            return both(self, *arguments)
+
+        drawn.clear()
+        monkeypatch.setattr(Renderer, "residual_and_removal_sums", draw)
+
+    for views in (0, 9):  # in the first round, and in a later one
+        stop_after(views)
+        with pytest.raises(Stop):
+            compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
+        assert not (tmp_path / "a.fgs").exists()
+    (kept,) = (tmp_path / "kept").iterdir()
+    rounds = len(list(kept.glob("round-*/done")))
+    assert rounds >= 2
+    # Other poses, or a descent to follow, which wants views from between them: not what was kept.
+    for folders, change in enumerate(({"holdout": 3}, {"distil": 10, "layers": 1}), start=2):
+        stop_after(0)
+        with pytest.raises(Stop):
+            compress(project / "point_cloud.ply", tmp_path / "b.fgs", **{**words, **change})
+        assert len(list((tmp_path / "kept").iterdir())) == folders
+    stop_after(10**6)
+    compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
+    resumed = len(drawn)
+    assert (tmp_path / "a.fgs").read_bytes() == expected and not kept.exists()
+    drawn.clear()
+    compress(project / "point_cloud.ply", tmp_path / "a.fgs", **{**words, "force": True})
+    assert (tmp_path / "a.fgs").read_bytes() == expected and len(drawn) > resumed
+
+
+def test_a_full_disk_leaves_nothing_behind(
+    project: Path, spilled: list[Scratch], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reserve = os.posix_fallocate
+    calls = []
+
+    def full(descriptor: int, offset: int, size: int) -> None:
+        calls.append(size)
+        if len(calls) > 40:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        reserve(descriptor, offset, size)
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(BudgetError, match="the disk is full"):
+        compress(project / "point_cloud.ply", tmp_path / "a.fgs", **TINY)
+    assert not os.listdir(tmp_path)
+
+
+def test_other_formats_stay_in_memory(project: Path, tmp_path: Path) -> None:
+    for words in ({"resume": True}, {"scratch": str(tmp_path)}):
+        with pytest.raises(InputError, match=r"\.fgs files alone"):
+            compress(project / "point_cloud.ply", tmp_path / "a.spz", **{**TINY, **words})
+
+
+def run(folder: Path, *words: str, seconds: float | None = None) -> subprocess.CompletedProcess[str] | None:
+    """`compress` in a process of its own, killed after some seconds (then None)."""
+    command = [
+        sys.executable,
+        "-m",
+        "flexgs_edge",
+        "compress",
+        str(folder / "point_cloud.ply"),
+        "-o",
+        str(folder / "a.fgs"),
+    ]
+    command += ["--effort", "fast", "--min-fidelity", "38", "--best-effort", *words]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    try:
+        return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:  # subprocess kills it then
+        return None
+
+
+def test_kills_lose_no_bytes(tmp_path: Path) -> None:
+    """Killed twice at any moment, and resumed (what lies in scratch files alone is gone with the process: test_scratch.py)."""
+    write_ply(tmp_path / "point_cloud.ply", random_scene(6000, 8, 3, size=-4.0))
+    write_cameras(tmp_path / "cameras.json")
+    started = time.perf_counter()
+    done = run(tmp_path)
+    took = time.perf_counter() - started
+    assert done is not None and done.returncode == 0, done
+    expected = (tmp_path / "a.fgs").read_bytes()
+    (tmp_path / "a.fgs").unlink()
+    for share in (0.5, 0.8):
+        if run(tmp_path, "--resume", seconds=share * took) is None:
+            # Killed at its very end, it had given the file its name.
+            assert not (tmp_path / "a.fgs").exists() or (tmp_path / "a.fgs").read_bytes() == expected
+            others = set(os.listdir(tmp_path)) - {"a.fgs"}
+            assert all(name.startswith((".flexgs-", "point", "cameras")) for name in others)
+            (tmp_path / "a.fgs").unlink(missing_ok=True)
+    done = run(tmp_path, "--resume", "-f")
+    assert done is not None and done.returncode == 0, done
+    assert (tmp_path / "a.fgs").read_bytes() == expected
+    assert sorted(os.listdir(tmp_path)) == ["a.fgs", "cameras.json", "point_cloud.ply"]

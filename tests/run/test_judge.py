@@ -1,0 +1,142 @@
+"""The views that judge: what they keep, and what they need not draw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+
+import numpy as np
+import pytest
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.run.companions import companions_of
+from flexgs_edge.run.inputs import load_scene, resolve_drawing
+from flexgs_edge.run.judge import Judge
+from flexgs_edge.run.open_bench import Workspace
+from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.view_set import find_views
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import MemorySource, SceneSource
+from tiny_project import COUNT, make_project
+
+VIEWS = [0, 3, 8]
+Judged = tuple[Judge, SceneSource, Renderer, MemoryBudget]
+MakeJudge = Callable[..., AbstractContextManager[Judged]]
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory: pytest.TempPathFactory) -> MakeJudge:
+    """Makes a judge over three views of the tiny scene."""
+    project = make_project(tmp_path_factory.mktemp("tiny") / "scene")
+    companions, scene = companions_of(project / "point_cloud.ply"), load_scene(project / "point_cloud.ply")
+    options = resolve_drawing(ViewOptions(device="numpy"), scene, companions)
+    views = find_views(options, companions, scene.source)
+    assert views is not None
+
+    @contextmanager
+    def open_judge(**words: bool) -> Iterator[Judged]:
+        budget = MemoryBudget(2**28)
+        with Workspace(options, budget, Stopwatch()) as workspace:
+            before = budget.used
+            judge = Judge(workspace.renderer, scene.source, views, VIEWS, budget, **words)
+            with workspace.renderer.load(scene.source) as loaded:
+                judge.prepare(loaded)
+            yield judge, scene.source, workspace.renderer, budget
+            workspace.renderer.release()
+            judge.close()
+            assert budget.used == before
+
+    return open_judge
+
+
+def half_of(source: SceneSource) -> dict[str, np.ndarray]:
+    return source.select(np.arange(0, COUNT, 2)).read(slice(0, COUNT // 2), list(FIELD))
+
+
+def count_images(monkeypatch: pytest.MonkeyPatch) -> list[None]:
+    """Gets longer whenever a scene's views are drawn from now on."""
+    drawn: list[None] = []
+    images = Renderer.images
+
+    def counted(self: Renderer, *words: object) -> object:
+        drawn.append(None)
+        return images(self, *words)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Renderer, "images", counted)
+    return drawn
+
+
+class Workers:
+    """A cluster of one renderer."""
+
+    ready = True
+
+    def __init__(self, renderer: Renderer) -> None:
+        self._renderer = renderer
+
+    def planes(self, source: SceneSource, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
+        with self._renderer.load(source) as scene:
+            yield from (self._renderer.render_planes(scene, camera) for camera in cameras)
+
+    def close(self) -> None:
+        pass
+
+
+def test_references_that_do_not_fit_are_drawn_again(judged: MakeJudge, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for share in (4, 10**9):
+        monkeypatch.setattr("flexgs_edge.run.judge.SHARE", share)
+        with judged() as (judge, source, renderer, _):
+            with renderer.load(source.select(np.arange(0, COUNT, 2))) as loaded:
+                found.append(judge.compare(loaded))
+            assert judge.kept == (3 if share == 4 else 0)
+    assert found[0] == found[1]
+
+
+def test_one_that_reports_draws_nothing_twice(judged: MakeJudge, monkeypatch: pytest.MonkeyPatch) -> None:
+    with judged(reports=True) as (judge, source, renderer, _):
+        drawn, planes = count_images(monkeypatch), half_of(source)
+
+        def compare(planes: dict[str, np.ndarray], resident: bool = True, with_ssim: bool = True) -> object:
+            with renderer.load(MemorySource(planes)) as loaded:
+                if resident:
+                    renderer.render(loaded, judge.cameras[0])
+                return judge.compare(loaded, with_ssim=with_ssim)
+
+        first = compare(planes)
+        assert len(drawn) == 1 and compare(planes) == first and len(drawn) == 1
+        # Not on the backend yet: nobody knows what it is.
+        assert compare(planes, resident=False) == first and len(drawn) == 2
+        assert compare(planes, with_ssim=False) != first and len(drawn) == 3
+        # A bit of one number is another scene.
+        planes["log_scales"][0, 5] = np.nextafter(planes["log_scales"][0, 5], np.float32(9))
+        compare(planes)
+        assert len(drawn) == 4
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_scenes_that_are_not_on_the_backend_are_known_again(
+    elsewhere: bool, judged: MakeJudge, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that are streamed once they have been drawn, those that others draw at once."""
+    if not elsewhere:
+        monkeypatch.setattr(Renderer, "_fits", lambda *_: False)
+    with judged(reports=True) as (judge, source, renderer, _):
+        if elsewhere:
+            renderer.cluster = Workers(renderer)  # type: ignore[assignment]
+        drawn, planes = count_images(monkeypatch), half_of(source)
+
+        def compare(planes: dict[str, np.ndarray]) -> object:
+            with renderer.load(MemorySource(planes)) as loaded:
+                if not elsewhere:
+                    renderer.render(loaded, judge.cameras[0])
+                return judge.compare(loaded, with_ssim=True)
+
+        first = compare(planes)
+        assert len(drawn) == 1 and compare(planes) == first and len(drawn) == 1
+        planes["sh_dc"][0, 5] = np.nextafter(planes["sh_dc"][0, 5], np.float32(9))
+        compare(planes)
+        assert len(drawn) == 2

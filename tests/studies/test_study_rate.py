@@ -1,0 +1,353 @@
+"""`study rate` on a tiny scene: points against the pipeline's own runs, parts taken away, bytes and losses read off a curve."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+
+from flexgs_edge.cli import app
+from flexgs_edge.cli.study.rate import RATIOS, command
+from flexgs_edge.commands.compress import compress
+from flexgs_edge.errors import InputError
+from flexgs_edge.goals.target import min_ratio
+from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.io.exchange import read_foreign, write_foreign
+from flexgs_edge.io.formats import FORMATS
+from flexgs_edge.methods.best.allocation import BitModel, choose
+from flexgs_edge.methods.best.costs import RemovalCosts
+from flexgs_edge.methods.best.method import open_path
+from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.methods.paper.prune import ranks_from_order
+from flexgs_edge.progress import SILENT
+from flexgs_edge.report.plots import LineChart, Series, draw, picture
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.studies.rate import ablations, coders
+from flexgs_edge.studies.rate import study as rate
+from flexgs_edge.studies.rate.curves import Curve
+from flexgs_edge.studies.rate.points import best_points, paper_points
+from flexgs_edge.studies.rate.study import RateStudy, study_rate
+from flexgs_edge.studies.rate.trade import CODERS
+from flexgs_edge.studies.study_scene import Bench, open_bench
+from synthetic import random_scene
+from tiny_project import COUNT, make_project
+
+pytestmark = pytest.mark.usefixtures("short_searches")
+
+OPTIONS = CompressOptions(method="best", holdout=4, effort="fast")
+RATIO = 3.0
+
+
+@pytest.fixture(scope="module")
+def project(short_searches: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_project(tmp_path_factory.mktemp("rate") / "cloud")
+
+
+@pytest.fixture(scope="module")
+def bench(project: Path) -> Iterator[Bench]:
+    with open_bench(project / "point_cloud.ply", "cloud", OPTIONS, SILENT) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def study(project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RateStudy, Path]:
+    out = tmp_path_factory.mktemp("written") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        # One format of another program and every other part: what is left out goes the same way.
+        patch.setattr("flexgs_edge.studies.rate.points.FORMATS", {".spz": FORMATS[".spz"]})
+        patch.setattr("flexgs_edge.studies.rate.study.parts_of", lambda *words: ablations.parts_of(*words)[::2])
+        found = study_rate(
+            project / "point_cloud.ply",
+            out,
+            OPTIONS,
+            ratios=[RATIO],
+            ablations=[RATIO],
+            ablation_effort="fast",
+            distilled=[RATIO],
+        )
+    return found, out
+
+
+def rows_of(study: tuple[RateStudy, Path], key: str) -> list[dict[str, object]]:
+    return json.loads((study[1] / f"{key}.json").read_text())["rows"]
+
+
+def test_points_are_those_of_compress(study: tuple[RateStudy, Path], project: Path) -> None:
+    rows = rows_of(study, "rate")
+    # The first point of a curve starts from a path of its own, as a run of `compress` does.
+    for method, variant in (("best", "whole"), ("paper", "nothing pruned")):
+        words = {"min_ratio": RATIO} if method == "best" else {"prune_rate": 0.0, "sh_rate": 0.0}
+        made = compress(project / "point_cloud.ply", None, replace(OPTIONS, method=method, **words), dry_run=True)
+        (row,) = (r for r in rows if (r["method"], r["variant"]) == (method, variant) and r["effort"] != "max")
+        assert (row["size"], row["kept"]) == (made.size, made.count)
+        assert made.quality is not None
+        assert row["drop"] == pytest.approx(made.quality.drop, abs=1e-4)
+        assert row["psnr"] == pytest.approx(made.quality.psnr, abs=1e-4)
+        assert row["ssim"] == pytest.approx(made.quality.ssim_photo, abs=1e-5)
+        assert row["bits"] == pytest.approx(8 * made.size / made.count, abs=0.01)
+
+
+def test_paper_searches_every_ratio_that_its_bits_alone_miss(bench: Bench) -> None:
+    least, *others = paper_points(bench, [2.0, 5.0, 6.0]).points
+    assert (least.variant, least.kept) == ("nothing pruned", COUNT) and bench.scene.ply_bytes / least.size > 2
+    assert [point.wanted for point in others] == [5.0, 6.0]
+    assert all(bench.scene.ply_bytes / point.size >= (point.wanted or 0) for point in others)
+    assert others[0].size == bench.adapt(min_ratio(5.0, bench.scene.ply_bytes, "drop")).chosen.size
+
+
+def test_every_variant_is_there_and_keeps_to_the_ratio(study: tuple[RateStudy, Path], bench: Bench) -> None:
+    rows = [row for row in rows_of(study, "rate") if row["method"] == "best"]
+    assert [row["variant"] for row in rows] == ["whole", *CODERS, "whole", "gs ranks", "no refit", "full SH"]
+    assert [row["effort"] for row in rows if row["variant"] == "whole"] == ["fast", "max"]
+    for row in rows:
+        if row["variant"] not in CODERS:
+            assert float(str(row["ratio"])) >= RATIO
+    sizes = [row["size"] for row in rows if row["variant"] not in CODERS]
+    assert len(set(sizes)) == len(sizes), "nothing was taken away somewhere"
+    names = [variant.name for variant in ablations.parts_of(bench.orders["gs"], 0)]
+    assert names == ["gs ranks", "one pass", "no refit"], "no SH, nothing to choose of them"
+
+
+def test_a_coder_changes_the_size_alone(study: tuple[RateStudy, Path]) -> None:
+    rows = rows_of(study, "rate")
+    whole, _ = (row for row in rows if row["variant"] == "whole" and row["method"] == "best")
+    recoded = [row for row in rows if row["variant"] in CODERS]
+    assert {row["wanted_ratio"] for row in recoded} == {RATIO}
+    same = ("kept", "psnr", "ssim", "drop", "fidelity")
+    assert all(row[name] == whole[name] for row in recoded for name in same)
+    for row in rows_of(study, "parts"):
+        if row["variant"] in CODERS:
+            (size,) = (r["size"] for r in recoded if r["variant"] == row["variant"])
+            assert row["more_bytes"] == pytest.approx(
+                100 * (float(str(size)) / float(str(whole["size"])) - 1), abs=0.01
+            )
+
+
+def test_the_whole_method_costs_nothing_against_itself(study: tuple[RateStudy, Path]) -> None:
+    (row,) = (row for row in rows_of(study, "parts") if row["variant"] == "whole")
+    assert (row["more_bytes"], row["more_modelled"], row["more_loss"]) == (0.0, 0.0, 0.0)
+
+
+def test_another_format_holds_the_whole_scene(
+    study: tuple[RateStudy, Path], project: Path, bench: Bench, tmp_path: Path
+) -> None:
+    (row,) = (row for row in rows_of(study, "rate") if row["method"] == "spz")
+    assert row["kept"] == COUNT
+    # Rows in another order than the study's: other bytes, the same values.
+    write_foreign(tmp_path / "a.spz", bench.scene.source)
+    with bench.workspace.renderer.load(read_foreign(tmp_path / "a.spz")) as scene:
+        found = bench.judge.compare(scene)
+    assert row["fidelity"] == pytest.approx(found.fidelity, abs=0.2)
+
+
+def test_csv_page_and_charts_hold_the_same(study: tuple[RateStudy, Path]) -> None:
+    result, out = study
+    keys = ["rate", "fidelity", "parts"]
+    assert [experiment.key for experiment in result.scene.experiments] == keys
+    wanted = {f"{key}.{suffix}" for key in keys for suffix in ("csv", "json", "png", "svg")}
+    assert {path.name for path in out.iterdir()} == {"index.html", *wanted}
+    for experiment in result.scene.experiments:
+        lines = list(csv.DictReader(io.StringIO((out / f"{experiment.key}.csv").read_text())))
+        assert len(lines) == len(rows_of(study, experiment.key)) == len(experiment.table.rows)
+    chart = result.scene.experiments[0].chart
+    assert isinstance(chart, LineChart)
+    drawn = {series.label: [round(1e6 * x) for x in series.x] for series in chart.series}
+    rows = rows_of(study, "rate")
+    # Only what is whole is drawn: points without a part have a chart of their own.
+    assert drawn["best"] + drawn["best, distilled"] == [
+        row["size"] for row in rows if row["method"] == "best" and row["variant"] == "whole"
+    ]
+    assert drawn["paper"] == [row["size"] for row in rows if row["method"] == "paper"]
+    assert "Left out or not reached" not in result.to_text()
+
+
+def test_without_photos_and_without_the_converter(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flexgs_edge.io.converter.CONVERTER", "a_package_that_is_not_there")
+    found = study_rate(
+        project / "point_cloud.ply",
+        tmp_path / "out",
+        replace(OPTIONS, images="none"),
+        ratios=[RATIO],
+        ablations=[],
+        distilled=[],
+    )
+    (experiment,) = found.scene.experiments
+    assert isinstance(experiment.chart, LineChart) and "fidelity" in experiment.chart.y_label
+    assert set(experiment.table.values("drop")) == {None} and None not in experiment.table.values("fidelity")
+    assert set(experiment.table.values("method")) == {"best", "paper"}
+    assert all(f"{name} (" in experiment.findings[-1] for name in ("spz", "sog", "compressed.ply"))
+    assert "flexgs-edge[formats]" in experiment.findings[-1]
+
+
+def test_a_ratio_out_of_reach_is_said(bench: Bench, project: Path) -> None:
+    # A header of 2 kB is more than a thousandth of the scene.
+    found = best_points(bench, ablations.WHOLE, "fast", [1000.0])
+    assert found.points == () and found.missing == ("best (whole, fast) at 1000x",)
+
+
+def test_ranks_decide_who_goes_and_costs_how_many(bench: Bench) -> None:
+    order = np.random.default_rng(5).permutation(COUNT)
+
+    def walk(make: object) -> PrunePath:
+        cameras = bench.views.of(bench.views.train)
+        workspace = bench.workspace
+        with open_path(
+            workspace.renderer, bench.scene.source, cameras, OPTIONS, workspace.budget, workspace.clock, make=make
+        ) as path:  # type: ignore[arg-type]
+            path.descend(0.8)
+        return path
+
+    path = walk(PrunePath)
+    measured, ranks = path.snapshots, ranks_from_order(order)[path.rows]
+    ranked = walk(lambda *w, **m: ablations.RankedPath(*w, order=order, **m)).snapshots
+    seen = measured[0].costs.weight2 > 0
+    assert np.array_equal(np.sort(ranked[0].costs.removal[seen]), np.sort(measured[0].costs.removal[seen]))
+    by_rank = np.argsort(ranks[measured[0].rows[seen]])
+    assert (np.diff(ranked[0].costs.removal[seen][by_rank]) >= 0).all()
+    gone = np.setdiff1d(ranked[0].rows, ranked[1].rows)
+    stayed = np.intersect1d(ranked[0].rows[seen], ranked[1].rows)
+    assert len(gone) == len(measured[0].rows) - measured[1].count and ranks[gone].max() < ranks[stayed].min()
+
+    once = walk(ablations.OnePassPath).snapshots
+    assert np.array_equal(once[1].rows, measured[1].rows)
+    at = np.searchsorted(once[0].rows, once[1].rows)
+    assert np.array_equal(once[1].costs.removal, once[0].costs.removal[at])
+    assert not np.array_equal(measured[1].costs.removal, measured[0].costs.removal[at])
+    assert np.array_equal(once[1].costs.weight2, measured[1].costs.weight2)
+
+
+def test_choosing_among_all_degrees_is_the_methods_own_choice() -> None:
+    rng = np.random.default_rng(11)
+    count, top = 500, 3
+    weight2 = np.where(np.arange(count) < 20, 0.0, 1.0)
+    costs = RemovalCosts(
+        rng.lognormal(0, 3, count),
+        weight2,
+        -np.sort(-rng.lognormal(-1, 2, (top, count)), axis=0),
+        np.zeros((top, 3, count)),
+    )
+    bits, multiplier = BitModel(), 0.05
+    for found, own in zip(
+        ablations.choose_among(costs, bits, multiplier, range(top + 1)), choose(costs, bits, multiplier), strict=True
+    ):
+        assert np.array_equal(found, own)
+    keep, degrees = ablations.choose_among(costs, bits, multiplier, (0, top))
+    assert set(degrees[weight2 > 0]) == {0, top} and keep[:20].all() and not degrees[:20].any()
+    full, degrees = ablations.choose_among(costs, bits, multiplier, (top,))
+    assert set(degrees[weight2 > 0]) == {top}
+    # Gaussians that must bring all their SH along are worth keeping less often.
+    assert 0 < full.sum() < keep.sum() < count
+
+
+def test_coders_sizes() -> None:
+    count = 600
+    planes = random_scene(count, 12, 1).read(slice(0, count), list(FIELD))
+    steps = Steps(position=0.01, scale=0.1, rotation=0.05, opacity=0.2, dc=0.05, sh=(0.1,))
+    degrees = (np.arange(count) % 2).astype(np.uint8)
+    grid, _ = to_grid(planes, degrees, steps, np.zeros(3))
+    sizes = coders.plane_sizes(grid)
+    every = [*grid.position, *grid.scale, *grid.rotation, grid.opacity, *grid.dc, *grid.sh[0], grid.sh_degrees]
+    bits = [math.ceil(len(plane) * math.ceil(math.log2(int(np.ptp(plane.astype(int))) + 1)) / 8) for plane in every]
+    assert len(every) == 23 and sizes["fixed bits"] == sum(bits)
+    entropy = 0.0
+    for plane in every:
+        both = plane.tolist(), [0, *np.diff(plane.astype(int)).tolist()]
+        entropy += min(-sum(n * math.log2(n / len(v)) for n in Counter(v).values()) / 8 for v in both)
+    assert sizes["order-0 entropy"] == pytest.approx(entropy, abs=1)
+    assert sizes["order-0 entropy"] < sizes["zlib"] < sizes["fixed bits"]
+    assert sizes["order-0 entropy"] < sizes["lzma"], "random values repeat nothing"
+
+
+def test_bytes_of_a_coder_hold_the_integers() -> None:
+    values = np.array([-3, 70000, 5, -3], np.int64)
+    data = np.frombuffer(coders._byte_planes(values), np.uint8).reshape(3, 4)
+    assert np.array_equal((data * np.array([[1], [256], [65536]])).sum(axis=0) - 3, values)
+    assert coders._entropy_bytes(np.array([7, 7, 9, 9])) == 4 / 8 and coders._entropy_bytes(np.full(9, 3)) == 0
+
+
+def test_a_curve_reads_power_laws_and_ends_at_its_points() -> None:
+    curve = Curve((size, 40 / size) for size in (400, 100, 200, 50))
+    assert curve.loss(150) == pytest.approx(40 / 150) and curve.size(0.16) == pytest.approx(250)
+    assert curve.loss(50) == pytest.approx(0.8) and curve.size(0.1) == pytest.approx(400)
+    assert curve.loss(49) is None and curve.loss(401) is None and curve.size(0.81) is None and curve.size(-0.1) is None
+    # The larger of two files is the worse one: nobody would take it.
+    assert Curve([(100, 1.0), (200, 2.0), (400, 0.5)]).size(1.0) == pytest.approx(100)
+    assert Curve([]).size(1.0) is None and Curve([]).loss(1) is None
+
+
+def test_a_chart_over_megabytes_has_a_log_axis_and_need_not_start_at_zero() -> None:
+    series = (Series("best", [0.03, 0.5, 1.1], [38.0, 45.0, 51.0], notes=["256x", "", "8x"]),)
+    chart = LineChart("t", "MB", "dB", series, megabytes=True, floating=True)
+    (axes,) = draw(chart).axes
+    assert axes.get_xscale() == "log" and axes.get_ylim()[0] > 30
+    assert {0.05, 0.1, 0.2, 0.5, 1.0} <= {round(float(tick), 6) for tick in axes.get_xticks()}
+    assert picture(chart) == picture(chart)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ({"ratios": [0.5]}, "--ratios 0.5: expected ratios of 1 or more"),
+        ({"ratios": []}, "--ratios: expected one ratio or more"),
+        ({"ablations": [math.nan]}, "--ablations nan"),
+        ({"distilled": [0.1]}, "--distilled 0.1: expected ratios of 1 or more"),
+        ({"ablation_effort": "lazy"}, "--ablation-effort 'lazy': expected one of fast"),
+    ],
+)
+def test_ratios_are_checked_before_any_work(tmp_path: Path, words: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError, match=said.replace("'", ".")):
+        study_rate(tmp_path / "none.ply", tmp_path / "out", **words)  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_line_hands_on_what_it_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], study: tuple[RateStudy, Path]
+) -> None:
+    told: dict[str, object] = {}
+
+    def told_study(scene: str, output: str, options: CompressOptions, progress: object, **words: object) -> RateStudy:
+        told.update(words, effort=options.effort, scene=scene)
+        return study[0]
+
+    monkeypatch.setattr("flexgs_edge.studies.rate.study.study_rate", told_study)
+    words = ["study", "rate", "a.ply", "-o", str(tmp_path / "out"), "--ratios", "10,20", "--ablations", "none", "-q"]
+    with pytest.raises(SystemExit) as left:
+        app.main([*words, "--json", "-"])
+    assert left.value.code == 0
+    assert told == {
+        "ratios": (10.0, 20.0), "ablations": (), "ablation_effort": "fast", "effort": "balanced", "scene": "a.ply",
+        "distilled": (32.0, 64.0, 128.0),
+    }  # fmt: skip
+    out = capsys.readouterr()
+    assert json.loads(out.out)["command"] == "study rate" and "Each part earns its place" in out.err
+    with pytest.raises(SystemExit) as left:
+        app.main([*words, "--ratios", "10;20"])
+    assert left.value.code == 2 and "expected ratios such as 8,16,32, or none" in capsys.readouterr().err
+
+
+def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        app.main(["study", "rate", "--help"])
+    text = capsys.readouterr().out
+    assert left.value.code == 0 and "flexgs-edge study rate point_cloud.ply -o rate" in text
+    options = [option for option in command.params if isinstance(option, click.Option)]
+    assert all(option.help and option.help.endswith(".") for option in options)
+    # Written twice: the library is not loaded to show the help.
+    defaults = {option.name: option.default for option in options}
+    assert RATIOS.convert(defaults["ratios"], None, None) == rate.RATIOS
+    assert RATIOS.convert(defaults["ablations"], None, None) == rate.ABLATED
+    assert RATIOS.convert(defaults["distilled"], None, None) == rate.DISTILLED
+    assert defaults["ablation_effort"] == rate.ABLATION_EFFORT
