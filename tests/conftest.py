@@ -10,12 +10,8 @@ from typing import Any
 
 import pytest
 
+from fits import use_fit
 from flexgs_edge.methods.best.effort import EFFORTS
-from flexgs_edge.render import compact as compact_module
-from flexgs_edge.render import device_scene
-from flexgs_edge.render import renderer as renderer_module
-from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.render.renderer import Renderer
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -55,11 +51,7 @@ def fox_dir(scenes_dir: Path) -> Path:
 @pytest.fixture
 def compact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Views hold what they show, with room for few rows at first, in chunks of 64 rows."""
-    monkeypatch.setattr(Renderer, "_fits", lambda *_: False)
-    monkeypatch.setattr(compact_module, "CAPACITY_STEP", 32)
-    monkeypatch.setattr(renderer_module, "FIRST_SHARE", 100)
-    monkeypatch.setattr(device_scene, "COMPACT_ROWS", 64)
-    monkeypatch.setattr(DeviceScene, "_may_stay", lambda *_: False)
+    use_fit(monkeypatch, whole_views=False, capacity_step=32, first_share=100, compact_rows=64, spare_share=1)
 
 
 @pytest.fixture(scope="module")

@@ -24,8 +24,6 @@ from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import chunk_shapes, shapes_bytes
 from flexgs_edge.render.view_buffers import ViewBuffers
 
-AHEAD = 3
-"""Views that are projected with the one whose turn it is."""
 AHEAD_ROW_BYTES = shapes_bytes(chunk_shapes(1)) + 4
 """Bytes of the scratch file for each splat that such a view shows, the number of its row among them."""
 
@@ -98,8 +96,8 @@ class WaitingView:
 class ViewsAhead:
     """Projects compact views, and those that come next where reading the scene costs more than to keep them."""
 
-    def __init__(self, backend: Backend) -> None:
-        self._backend = backend
+    def __init__(self, backend: Backend, ahead: int) -> None:
+        self._backend, self._most = backend, ahead
         self._scene: tuple[DeviceScene, int] | None = None
         """The scene whose views are drawn in turn, and its `changes` when these began to wait."""
         self._coming: Sequence[Camera] = ()
@@ -112,7 +110,7 @@ class ViewsAhead:
                 if self._scene != (scene, scene.changes):
                     self.drop()
                     self._scene = scene, scene.changes
-                self._coming = cameras[place + 1 : place + 1 + AHEAD]
+                self._coming = cameras[place + 1 : place + 1 + self._most]
                 yield camera
         finally:
             self.drop()

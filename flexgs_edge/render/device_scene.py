@@ -16,13 +16,11 @@ from flexgs_edge.render.chunk_loads import ChunkLoads
 from flexgs_edge.render.chunks import Chunk, ChunkArrays, QuantizedPlanes, SourcePlanes
 from flexgs_edge.render.fit import (
     AHEAD_SHARE,
-    CHUNK_ROWS,
-    COMPACT_ROWS,
-    MIN_CHUNK_ROWS,
+    DEFAULT,
     MOST_SUMS,
     RAW_BYTES,
-    SPARE_SHARE,
     SUM_BYTES,
+    Fit,
     padded,
     plane_bytes,
     streamed_bytes,
@@ -52,6 +50,8 @@ class DeviceScene:
         Views will be compared with targets on the backend: room for these is taken with the view's.
     view_sums : int
         Planes of sums that a view has at most.
+    fit : Fit
+        How it shares memory with its views.
     """
 
     def __init__(
@@ -63,6 +63,7 @@ class DeviceScene:
         sum_bytes: int = SUM_BYTES,
         targets: bool = False,
         view_sums: int = MOST_SUMS,
+        fit: Fit = DEFAULT,
     ) -> None:
         self.backend = backend
         self.count = planes.count
@@ -74,6 +75,7 @@ class DeviceScene:
         self.targets = targets
         self.sum_bytes = sum_bytes
         self.view_sums = view_sums
+        self.fit = fit
         self.changes = 0
         """Times that its values have changed."""
         self.shown: int | None = None
@@ -87,7 +89,7 @@ class DeviceScene:
         """First row of the one that is being used."""
         self._rows = 0
         self._chunk_row_bytes = streamed_bytes(planes.sh_degree)
-        self._least_rows = min(MIN_CHUNK_ROWS, max(self.count, 1))
+        self._least_rows = min(fit.least_rows, max(self.count, 1))
 
     @property
     def source(self) -> SceneSource | None:
@@ -107,7 +109,7 @@ class DeviceScene:
     @property
     def compact_rows(self) -> int:
         """Rows that a chunk of it has room for once it is compact."""
-        return padded(min(COMPACT_ROWS, max(self.count, 1)))
+        return padded(min(self.fit.compact_rows, max(self.count, 1)))
 
     @property
     def compact_chunk_bytes(self) -> int:
@@ -147,7 +149,7 @@ class DeviceScene:
         if source is not None and (of_source or self._streamed):
             words = source.count, source.sh_count, source.sh_degree, source.origin.tolist(), self.antialiased
             digest = hashlib.sha256(repr(words).encode())
-            for rows in source.chunks(COMPACT_ROWS):
+            for rows in source.chunks(self.fit.compact_rows):
                 for values in source.read(rows, list(FIELD)).values():
                     digest.update(np.ascontiguousarray(values).data)
             return digest.digest()
@@ -164,7 +166,7 @@ class DeviceScene:
         """From now on views have room for the rows that they show alone, for so many at first; the scene is streamed."""
         self.evict()
         self.shown = shown
-        self._least_rows = min(COMPACT_ROWS, max(self.count, 1))
+        self._least_rows = min(self.fit.compact_rows, max(self.count, 1))
         if self.give_way not in self._budget.reclaimers:
             self._budget.reclaimers.insert(0, self.give_way)  # before what had to be drawn
 
@@ -180,9 +182,9 @@ class DeviceScene:
         if self.shown is not None:
             self._rows, self._streamed = self._least_rows, True
             return
-        most = min(CHUNK_ROWS, max(self.count, 1))
+        most = min(self.fit.chunk_rows, max(self.count, 1))
         whole = self.whole_bytes + later
-        fits = budget.free >= whole + padded(self._rows or self._least_rows) * RAW_BYTES
+        fits = self.fit.resident and budget.free >= whole + padded(self._rows or self._least_rows) * RAW_BYTES
         if not self._rows:
             spare = budget.free - whole if fits else budget.free - later
             per_row = RAW_BYTES if fits else self._chunk_row_bytes
@@ -210,7 +212,7 @@ class DeviceScene:
 
     def _may_stay(self, rows: int) -> bool:
         """Whether memory has room for one more chunk of a compact scene."""
-        return self._leaves_free(rows, SPARE_SHARE)
+        return self._leaves_free(rows, self.fit.spare_share)
 
     def _may_add(self, rows: int) -> bool:
         """The same for the time that one view is projected."""

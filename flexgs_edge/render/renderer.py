@@ -15,26 +15,24 @@ from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.storage import MEMORY, Room
 from flexgs_edge.packed.quantize import QuantizedScene
+from flexgs_edge.render import fit as fit_module
 from flexgs_edge.render.ahead import ViewsAhead
 from flexgs_edge.render.camera_record import camera_record
 from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import (
-    FIRST_SHARE,
     GROWTH,
     GUESS,
     MOST_SUMS,
     SORT_DIGIT_BITS,
     SORT_DIGITS,
     SUM_BYTES,
-    capacity,
-    chunk_shapes,
-    shapes_bytes,
-    target_bytes,
-    view_bytes,
+    Fit,
+    fits_whole,
+    saves_bytes,
 )
 from flexgs_edge.render.statistics import Statistics
-from flexgs_edge.render.view_buffers import ViewBuffers, view_key
+from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
 from flexgs_edge.scene.source import SceneSource
 
 if TYPE_CHECKING:
@@ -75,6 +73,8 @@ class Renderer:
         Pixels that a splat may reach: the ellipse of alpha >= 1/255, or the reference rasteriser's tiles of ceil(3 sigma).
     antialiased : bool
         Multiply opacities by sqrt(det before / det after) the dilation of the 2D covariance, as the model was trained.
+    fit : Fit, optional
+        How scenes and views share memory.
 
     Attributes
     ----------
@@ -94,6 +94,7 @@ class Renderer:
         background: Sequence[float] = (0.0, 0.0, 0.0),
         extent: str = "exact",
         antialiased: bool = False,
+        fit: Fit | None = None,
     ) -> None:
         if extent not in EXTENTS:
             raise InputError(f"extent {extent!r}: expected one of {', '.join(EXTENTS)}")
@@ -103,6 +104,7 @@ class Renderer:
         self.background = tuple(float(np.float32(c)) for c in background)
         self.inria_extent = int(extent == "inria")
         self.antialiased = antialiased
+        self.fit = fit or fit_module.DEFAULT
         self.room: Room = MEMORY
         self.largest: Camera | None = None
         self.cluster: Cluster | None = None
@@ -111,7 +113,7 @@ class Renderer:
         """[m] u32, rows of the scene that the sums of the view drawn last belong to; None: all of them."""
         self._share = 0.0
         """Largest part of its rows that a compact view has shown of a scene so far."""
-        self._ahead = ViewsAhead(backend)
+        self._ahead = ViewsAhead(backend, self.fit.ahead)
         self._buffers: ViewBuffers | None = None
         self._aimed: Any = None
         self._words = np.empty(0, np.uint32)
@@ -150,12 +152,13 @@ class Renderer:
         """
         self.release()
         planes = SourcePlanes(self.backend, source)
-        return DeviceScene(self.backend, planes, self.budget, self.antialiased, sum_bytes, targets, view_sums)
+        return DeviceScene(self.backend, planes, self.budget, self.antialiased, sum_bytes, targets, view_sums, self.fit)
 
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
         """Bring a quantized scene to the backend, dequantized there."""
         self.release()
-        return DeviceScene(self.backend, QuantizedPlanes(self.backend, quantized), self.budget, self.antialiased)
+        planes = QuantizedPlanes(self.backend, quantized)
+        return DeviceScene(self.backend, planes, self.budget, self.antialiased, fit=self.fit)
 
     def render(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
         """The image of `scene` from `camera` (world coordinates).
@@ -339,7 +342,7 @@ class Renderer:
                 self._share = max(self._share, count / max(scene.count, 1))
                 return buffers, rows
             assert buffers.rows is not None
-            scene.shown = capacity(scene, GROWTH * max(count / max(seen, 1), buffers.rows / scene.count))
+            scene.shown = self.fit.capacity(scene.count, GROWTH * max(count / max(seen, 1), buffers.rows / scene.count))
             scene.drop_statistics()
             self.release()
             self._buffers = buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
@@ -359,42 +362,31 @@ class Renderer:
     def _view_buffers(self, scene: DeviceScene, camera: Camera) -> ViewBuffers:
         if self._buffers is None or self._buffers.key != view_key(scene, camera):
             self.release()
-            shown = capacity(scene, max(1 / FIRST_SHARE, GUESS * self._share))
+            shown = self.fit.capacity(scene.count, max(1 / self.fit.first_share, GUESS * self._share))
             if scene.shown is None and self._may_be_compact(scene, camera, shown) and not self._fits(scene, camera):
                 scene.be_compact(shown)
             try:
                 self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
             except BudgetError:
                 if scene.shown is not None:
-                    scene.shown = capacity(scene, 1 / FIRST_SHARE)
+                    scene.shown = self.fit.capacity(scene.count, 1 / self.fit.first_share)
                 # A larger view than before: the scene gives up its place and is streamed from now on if need be.
                 scene.evict()
                 self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
         return self._buffers
 
     def _may_be_compact(self, scene: DeviceScene, camera: Camera, shown: int) -> bool:
-        """Whether there is a place for sums over views that hold `shown` rows; in memory, whether that takes less at all.
-
-        Sums that take more than a view's own statistics need a file, and all stay where the first view put them.
-        """
+        """Whether there is a place for sums over views that hold `shown` rows; all stay where the first view put them."""
         if scene.statistics or self.room.spills:
             return not scene.statistics
-        saved = view_bytes(self.backend, scene.count, camera) - view_bytes(self.backend, shown, camera)
-        saved += scene.later_bytes - scene.shown_bytes * shown
-        chunks = scene.compact_chunk_bytes + shapes_bytes(chunk_shapes(scene.compact_rows)) - scene.least_chunk_bytes
-        return scene.sum_bytes <= SUM_BYTES and saved > chunks
+        return saves_bytes(scene, view_size(self.backend, camera), shown)
 
     def _fits(self, scene: DeviceScene, camera: Camera) -> bool:
-        """Whether a view has room for all rows of the scene, beside what sums over views will take."""
+        """Whether a view has room for all rows of the scene: this one, or the largest that is to come."""
         if self.largest is not None and self.largest.width * self.largest.height > camera.width * camera.height:
             camera = self.largest
-        size = view_bytes(self.backend, scene.count, camera) + scene.targets * target_bytes(camera) + scene.later_bytes
-        free = self.budget.free + scene.held_bytes
-        if self.room.spills:
-            # Half of the memory is left for pages of the files: with all of it taken by a view and its sums, 1 M Gaussians read
-            # 200 GB under a cap of 512 MiB.
-            return size + scene.whole_bytes <= free // 2
-        return size + scene.least_chunk_bytes <= free
+        size = view_size(self.backend, camera)
+        return self.fit.whole_views and fits_whole(scene, size, self.budget.free, self.room.spills)
 
     def _sort(self, count: int, buffers: ViewBuffers) -> tuple[int, int]:
         """Depth order of the shown splats into `buffers.sorted[0]`; how many there are, and a bound on their pairs."""

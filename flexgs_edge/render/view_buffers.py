@@ -7,20 +7,24 @@ from typing import Any
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.constants import TILE
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import (
     COMPACT_PAIR_SHARE,
-    DEFAULT_PAIRS,
     PAIR_BYTES,
     PAIR_SHARE,
-    TARGET_BYTES,
+    ViewSize,
     chunk_shapes,
     shapes_bytes,
+    target_bytes,
     view_shapes,
 )
+
+
+def view_size(backend: Backend, camera: Camera) -> ViewSize:
+    """What the bytes of a view's buffers depend on, besides its rows."""
+    return ViewSize(camera.width, camera.height, backend.sort_blocks, backend.tile_blocks)
 
 
 def view_key(scene: DeviceScene, camera: Camera) -> tuple[int, int, int]:
@@ -42,17 +46,18 @@ class ViewBuffers:
         _, width, height = self.key
         self.rows = rows
         count = scene.count if rows is None else rows
-        self.tiles_x, self.tiles_y = -(-width // TILE), -(-height // TILE)
-        self.tiles = self.tiles_x * self.tiles_y
-        self.padded_height, self.padded_width = self.tiles_y * TILE, self.tiles_x * TILE
+        self.size = view_size(backend, camera)
+        self.tiles_x, self.tiles = self.size.tiles_x, self.size.tiles
         self.arrays: list[Any] = []
         self._backend = backend
         self._targets: tuple[Any, Any] | None = None
-        shapes = view_shapes(backend, count, width, height)
+        shapes = view_shapes(self.size, count)
         size = shapes_bytes(shapes)
         # One splat may touch every tile, so no batch can be smaller than that. What the scene and the sums of a scoring pass
         # need at the least is checked with the view, so that one message names a limit that does.
-        later = PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + scene.targets * self._target_bytes
+        later = (
+            PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + scene.targets * target_bytes(self.size)
+        )
         what = (
             f"a view of {count} Gaussians" if rows is None else f"a view that shows {count} of {scene.count} Gaussians"
         )
@@ -65,8 +70,8 @@ class ViewBuffers:
             made = {name: self._array(shape, dtype) for name, (shape, dtype) in shapes.items()}
             if scene.targets:
                 self.target_arrays()
-                later -= self._target_bytes
-            share, most = PAIR_SHARE, max(DEFAULT_PAIRS, self.tiles)
+                later -= target_bytes(self.size)
+            share, most = PAIR_SHARE, max(scene.fit.pairs, self.tiles)
             if rows is not None:
                 share = COMPACT_PAIR_SHARE
                 # Chunks that stay take what is left, and the buffers of views that show more come after them.
@@ -85,10 +90,6 @@ class ViewBuffers:
         self.state, self.image = made["state"], made["image"]
         self.chunk = tuple(made[name] for name in chunk_shapes(0)) if rows is not None else ()
 
-    @property
-    def _target_bytes(self) -> int:
-        return TARGET_BYTES * 3 * self.padded_height * self.padded_width
-
     def _array(self, shape: tuple[int, ...], dtype: Any) -> Any:
         made = self._backend.array(shape, dtype)
         self.arrays.append(made)
@@ -97,7 +98,7 @@ class ViewBuffers:
     def target_arrays(self) -> tuple[Any, Any]:
         """A target image in half precision and the residual against it, made when first asked for."""
         if self._targets is None:
-            pixels = 3 * self.padded_height * self.padded_width
+            pixels = 3 * self.size.pixels
             self._targets = (self._array((pixels,), np.float16), self._array((pixels,), np.float32))
         return self._targets
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from test_kernels_twins import padded_target
 
+from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import Steps
 from flexgs_edge.grid.to_grid import to_grid
@@ -100,9 +101,9 @@ def test_forms_give_the_same_gradients(form: str) -> None:
 @pytest.mark.parametrize("form", FORMS)
 def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every launch compared: in batches, two chunks, off and on a grid, rows of all degrees, one unseen, one beyond the clamp."""
-    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 64)
-    monkeypatch.setattr("flexgs_edge.render.device_scene.CHUNK_ROWS", 40)
-    monkeypatch.setattr("flexgs_edge.render.device_scene.MIN_CHUNK_ROWS", 16)
+    use_fit(monkeypatch, pairs=64)
+    use_fit(monkeypatch, chunk_rows=40)
+    use_fit(monkeypatch, least_rows=16)
     paired = PairedBackend(open_form(form), 2)
     cameras = [view(2, 33, 20), make_camera(33, 20)]
     planes = planes_of(65, 18, 4, -1.8)

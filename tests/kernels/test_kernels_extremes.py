@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import reference_renderer
 from extreme_scenes import AHEAD, EXTREMES, changed
+from fits import use_fit
 from flexgs_edge.constants import FIXED_ERROR
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.methods.best.costs import measure_costs
@@ -28,7 +29,7 @@ from synthetic import look_from, make_camera, random_scene
 @pytest.fixture(autouse=True)
 def _small_pair_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every launch compares every array."""
-    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1 << 14)
+    use_fit(monkeypatch, pairs=1 << 14)
 
 
 UNSEEN = ("none in view", "needles of 30 pixels, antialiased")

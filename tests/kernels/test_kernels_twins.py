@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.kernels.backend import KERNELS
 from flexgs_edge.kernels.twins import TWINS
@@ -37,7 +38,7 @@ COUNTS = (0, 1, 15, 16, 17, 63, 64, 65, 2049)
 @pytest.fixture(autouse=True)
 def _small_pair_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every launch compares every array: 32 MB of pairs would be most of it."""
-    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1 << 14)
+    use_fit(monkeypatch, pairs=1 << 14)
 
 
 def test_every_kernel_has_a_twin() -> None:
@@ -77,7 +78,7 @@ def test_blocks_of_the_serial_passes(form: str, blocks: int) -> None:
 @pytest.mark.parametrize("form", FORMS)
 def test_batches(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A pair buffer as small as it can be: colour and transmittance are carried from batch to batch."""
-    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1)
+    use_fit(monkeypatch, pairs=1)
     paired = PairedBackend(open_form(form), 3)
     draw(paired, random_scene(60, 5), make_camera(45, 37))
     count(paired, random_scene(60, 5), [make_camera(45, 37)])
@@ -161,7 +162,7 @@ def padded_target(camera: Camera, seed: int) -> np.ndarray:
 @pytest.mark.parametrize("form", FORMS)
 def test_removal_costs_and_residuals(form: str, pairs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Second passes over the same lists, in one batch and in many."""
-    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", pairs)
+    use_fit(monkeypatch, pairs=pairs)
     paired = PairedBackend(open_form(form), 3)
     camera, source = make_camera(45, 37), random_scene(60, 18, 1)
     errors, weights = removal_costs(paired, source, camera, (0.1, 0.5, 1.0))
@@ -186,7 +187,7 @@ def test_removal_costs_and_residuals(form: str, pairs: int, monkeypatch: pytest.
 @pytest.mark.parametrize("form", FORMS)
 def test_moments_of_sh(form: str, degree: int, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Costs of dropping SH degrees and sums of the colour refit, over two views and two chunks."""
-    monkeypatch.setattr("flexgs_edge.render.device_scene.CHUNK_ROWS", 40)
+    use_fit(monkeypatch, chunk_rows=40)
     paired = PairedBackend(open_form(form), 2)
     rotation, translation = look_from(20)
     views = [make_camera(33, 20), make_camera(33, 20, rotation=rotation, translation=translation)]

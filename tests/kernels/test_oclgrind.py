@@ -31,7 +31,7 @@ from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
 from flexgs_edge.quality.ssim import ssims
-from flexgs_edge.render import fit
+from flexgs_edge.render.fit import Fit
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD
@@ -74,9 +74,8 @@ def results(backend: OpenCLBackend | TwinBackend) -> Iterator[np.ndarray]:
     camera = make_camera(19, 16, focal=18)
     # More splats than a batch of the GPU form holds in one batch of pairs; a few in many batches.
     for rows, pairs, extent in ((70, 1 << 8, "exact"), (9, 1, "inria")):
-        fit.DEFAULT_PAIRS = pairs
         source = random_scene(rows, 3, 1, size=-1.2, opacity=-2)
-        drawer = Renderer(counting, large_budget(), background=(0.1, 0.2, 0.3), extent=extent)
+        drawer = Renderer(counting, large_budget(), background=(0.1, 0.2, 0.3), extent=extent, fit=Fit(pairs=pairs))
         with drawer.load(source) as scene:
             yield drawer.render(scene, camera)
             statistics = Statistics.zeros(source.count)
@@ -84,7 +83,7 @@ def results(backend: OpenCLBackend | TwinBackend) -> Iterator[np.ndarray]:
             yield statistics.hits
             yield statistics.weights
         drawer.release()
-    drawer = Renderer(counting, large_budget())
+    drawer = Renderer(counting, large_budget(), fit=Fit(pairs=1, chunk_rows=37))
     with drawer.load_quantized(quantize_all(source, groups=3)) as scene:
         image = drawer.render(scene, camera)
         yield image
@@ -99,7 +98,6 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
 
     As many rows as their planes are padded to: a vector that reads past the last row reads past the buffer.
     """
-    fit.CHUNK_ROWS = 37
     source = random_scene(64, 4, 4, size=-2)
     with drawer.load(source) as scene:
         costs = measure_costs(drawer, scene, [camera])

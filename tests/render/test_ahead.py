@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import Backend, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.storage import Scratch
-from flexgs_edge.render import ahead, device_scene, fit
+from flexgs_edge.render import ahead, fit
 from flexgs_edge.render.chunks import SourcePlanes
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import GROWTH
@@ -72,7 +73,7 @@ def loads(compact: None, monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_the_scene_is_read_once_for_several_views(
     form: str, most: int, loads: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ahead, "AHEAD", most)
+    use_fit(monkeypatch, ahead=most)
     views = cameras(8)
     renderer = spilling(tmp_path, form)
     used = renderer.budget.used
@@ -102,7 +103,7 @@ def test_a_view_without_room_is_counted_before_it_gets_some(loads: list[int], tm
             assert renderer.view_rows is not None
             rows.append(len(renderer.view_rows))
         assert len(loads) <= 2 * CHUNKS
-        assert scene.shown is not None and max(rows) <= scene.shown <= GROWTH * max(rows) + fit.CAPACITY_STEP
+        assert scene.shown is not None and max(rows) <= scene.shown <= GROWTH * max(rows) + fit.DEFAULT.capacity_step
         assert 100 < max(rows) < wide.count / GROWTH
     for image, expected in zip(found, alone(views, wide), strict=True):
         np.testing.assert_array_equal(image, expected)
@@ -197,8 +198,8 @@ def test_systems_without_such_calls_read_again(
 
 def test_lists_of_tiles_leave_room_for_chunks(compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the limit, a view is drawn, or refused with one that does: chunks were forgotten, and failed in its middle."""
-    monkeypatch.setattr(device_scene, "MIN_CHUNK_ROWS", 16)
-    monkeypatch.setattr(device_scene, "COMPACT_ROWS", 256)
+    use_fit(monkeypatch, least_rows=16)
+    use_fit(monkeypatch, compact_rows=256)
     camera, drawn = cameras(1)[0], []
     least = large_budget()
     renderer = spilling(tmp_path, budget=least)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import Backend, TwinBackend
@@ -78,14 +79,14 @@ def test_repeated_runs(form: str) -> None:
 @pytest.mark.parametrize("form", ALL_FORMS)
 @pytest.mark.parametrize("pairs", [1, 777, 20000])
 def test_pair_capacity(form: str, pairs: int, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", pairs)
+    use_fit(monkeypatch, pairs=pairs)
     assert digest(open_form(form), large_budget()) == expected
 
 
 @pytest.mark.parametrize("form", ALL_FORMS)
 @pytest.mark.parametrize("rows", [1024, 1000, 4999])
 def test_chunk_rows(form: str, rows: int, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flexgs_edge.render.device_scene.CHUNK_ROWS", rows)
+    use_fit(monkeypatch, chunk_rows=rows)
     assert digest(open_form(form), large_budget()) == expected
 
 

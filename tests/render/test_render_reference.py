@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import reference_renderer
+from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import FIXED_ERROR
 from flexgs_edge.errors import InputError
@@ -25,7 +26,7 @@ NEAR = np.float32(0.2)
 @pytest.fixture(autouse=True)
 def _small_pair_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hundreds of small scenes: getting 32 MB for the pairs of each would be most of it."""
-    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1 << 12)
+    use_fit(monkeypatch, pairs=1 << 12)
 
 
 def assert_matches(

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, contextmanager
 import numpy as np
 import pytest
 
+from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.renderer import Renderer
@@ -123,7 +124,7 @@ def test_scenes_that_are_not_on_the_backend_are_known_again(
 ) -> None:
     """Those that are streamed once they have been drawn, those that others draw at once."""
     if not elsewhere:
-        monkeypatch.setattr(Renderer, "_fits", lambda *_: False)
+        use_fit(monkeypatch, whole_views=False)
     with judged(reports=True) as (judge, source, renderer, _):
         if elsewhere:
             renderer.cluster = Workers(renderer)  # type: ignore[assignment]

@@ -14,11 +14,8 @@ from flexgs_edge.memory.storage import MEMORY, Room, Scratch
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
 from flexgs_edge.methods.best.refit.descent import descent_bytes
 from flexgs_edge.methods.best.rounds import PARTS, sums_room
-from flexgs_edge.render.ahead import AHEAD, AHEAD_ROW_BYTES
+from flexgs_edge.render.ahead import AHEAD_ROW_BYTES
 from flexgs_edge.render.fit import (
-    COMPACT_ROWS,
-    FIRST_SHARE,
-    MIN_CHUNK_ROWS,
     MOST_SUMS,
     chunk_shapes,
     padded,
@@ -30,6 +27,7 @@ from flexgs_edge.render.fit import (
     view_bytes,
 )
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.view_buffers import view_size
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
@@ -95,13 +93,13 @@ def choose_room(
     room = Scratch(folder, budget.limit)
     budget.take("reading scratch files", READING_BYTES)  # as long as the process lives
     renderer.largest = largest
-    spooled = SPOOL_ROW_BYTES * rows * len(scored) + AHEAD * AHEAD_ROW_BYTES * rows
+    spooled = SPOOL_ROW_BYTES * rows * len(scored) + renderer.fit.ahead * AHEAD_ROW_BYTES * rows
     LOG.info(
         "%d Gaussians and the path of their search need %s in memory, %s are free: they go to scratch files in %s "
         "(at most about %s; --scratch names another folder), %d rows at a time; %d bytes of each Gaussian and views of the "
         "Gaussians that they show stay in memory; %d passes over %d poses",
-        rows, format_size(size + least), format_size(budget.free), room.folder, format_size(whole + spooled), COMPACT_ROWS,
-        SPILLED_ROW_BYTES, 2 + EFFORTS[options.effort].refit_rounds, len(scored),
+        rows, format_size(size + least), format_size(budget.free), room.folder, format_size(whole + spooled),
+        renderer.fit.compact_rows, SPILLED_ROW_BYTES, 2 + EFFORTS[options.effort].refit_rounds, len(scored),
     )  # fmt: skip
     return room
 
@@ -119,17 +117,18 @@ def needed_bytes(
 
 
 def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:
-    """Bytes that the first view of a search in scratch files needs; one that shows more than `FIRST_SHARE` says needs more."""
-    rows, shown = padded(min(COMPACT_ROWS, source.count)), -(-source.count // FIRST_SHARE)
+    """Bytes that the first view of a search in scratch files needs; one that shows more rows than expected needs more."""
+    fit, size = renderer.fit, view_size(renderer.backend, largest)
+    rows, shown = padded(min(fit.compact_rows, source.count)), -(-source.count // fit.first_share)
     chunk = rows * streamed_bytes(source.sh_degree) + shapes_bytes(chunk_shapes(rows))
-    return view_bytes(renderer.backend, shown, largest) + target_bytes(largest) + sum_bytes(MOST_SUMS) * shown + chunk
+    return view_bytes(size, shown) + target_bytes(size) + sum_bytes(MOST_SUMS) * shown + chunk
 
 
 def _least_bytes(renderer: Renderer, source: SceneSource, camera: Camera, sum_bytes: int) -> int:
     """Bytes that a view of `source` with targets and sums of `sum_bytes` a row needs at the least, nothing being loaded."""
-    chunk = padded(min(MIN_CHUNK_ROWS, source.count)) * streamed_bytes(source.sh_degree)
-    view = view_bytes(renderer.backend, source.count, camera) + target_bytes(camera)
-    return view + sum_bytes * source.count + chunk
+    chunk = padded(min(renderer.fit.least_rows, source.count)) * streamed_bytes(source.sh_degree)
+    size = view_size(renderer.backend, camera)
+    return view_bytes(size, source.count) + target_bytes(size) + sum_bytes * source.count + chunk
 
 
 def stored_bytes(sh_degree: int) -> int:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from benchmarks.removal_exactness import compare_in_float64, kernels_without_ending, spread_over_range
+from fits import use_fit
 from flexgs_edge.cameras.camera import Camera, split_views
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.constants import FIXED_ERROR, SH_C0, TRANSMITTANCE_MIN
@@ -257,7 +258,7 @@ def test_nothing_is_measured_of_nothing() -> None:
 @pytest.mark.parametrize("degree", [0, 1, 4])
 def test_every_form_measures_the_same_bits(degree: int, pairs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Vector widths, the GPU form and the twins, in one batch and in many, on an odd image."""
-    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", pairs)
+    use_fit(monkeypatch, pairs=pairs)
     source, cameras = random_scene(77, 37, degree, size=-1.8), poses(2, 33, 19)
     expected = costs_of(open_form("numpy"), source, cameras)
     assert expected.removal.any() and expected.sh.any() == (degree > 0)
@@ -275,7 +276,7 @@ def assert_same(one: RemovalCosts, two: RemovalCosts) -> None:
 def test_chunks_change_nothing(form: str, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     source, cameras = random_scene(128, 38, 3, size=-1.8), poses(2, 17, 33)
     whole = costs_of(open_form(form), source, cameras)
-    monkeypatch.setattr("flexgs_edge.render.device_scene.CHUNK_ROWS", rows)
+    use_fit(monkeypatch, chunk_rows=rows)
     assert_same(costs_of(open_form(form), source, cameras), whole)
 
 
@@ -283,11 +284,7 @@ def test_a_scene_that_is_streamed_costs_the_same(monkeypatch: pytest.MonkeyPatch
     """Chunks that are loaded again for every view: the moments stay with their rows."""
     source, cameras = random_scene(300, 40, 3, size=-2), poses(3, 33, 17)
     whole = costs_of(open_form("w16"), source, cameras)
-
-    def stream(scene: DeviceScene) -> None:
-        scene._rows, scene.resident = 128, False
-
-    monkeypatch.setattr(DeviceScene, "_decide", stream)
+    use_fit(monkeypatch, resident=False, chunk_rows=128, least_rows=128)
     assert_same(costs_of(open_form("w16"), source, cameras), whole)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.made import poses_between
 from flexgs_edge.commands.compress import compress
@@ -139,8 +140,8 @@ def test_parts_of_a_descent(bench: Bench) -> None:
 
 
 def test_too_little_memory_is_said_and_leaves_nothing_taken(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1 << 10)
-    monkeypatch.setattr("flexgs_edge.render.device_scene.MIN_CHUNK_ROWS", 16)
+    use_fit(monkeypatch, pairs=1 << 10)
+    use_fit(monkeypatch, least_rows=16)
     shared = (bench.degrees, np.zeros(3), bench.cameras, bench.targets)
     refused = []
     for limit in range(200_000, 4_000_000, 50_000):

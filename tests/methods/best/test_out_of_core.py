@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.commands import compress as compress_module
 from flexgs_edge.commands.compress import compress
@@ -25,7 +26,6 @@ from flexgs_edge.memory.storage import Scratch
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.rounds import sums_room
-from flexgs_edge.render import device_scene
 from flexgs_edge.render.camera_record import camera_record
 from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.chunks import SourcePlanes
@@ -91,7 +91,7 @@ def test_compact_views_give_the_same_bits(
     for name, values in found_by(form, Scratch(tmp_path)).items():
         np.testing.assert_array_equal(values, spilled[name], err_msg=name)
     # One chunk, so that it is the last one that shows more than there is room for.
-    monkeypatch.setattr(device_scene, "COMPACT_ROWS", 4096)
+    use_fit(monkeypatch, compact_rows=4096)
     for name, values in found_by(form, Scratch(tmp_path)).items():
         np.testing.assert_array_equal(values, spilled[name], err_msg=name)
     monkeypatch.undo()
@@ -105,7 +105,7 @@ def test_sums_of_a_chunk_take_the_place_of_a_view(
     compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever the limit, costs are measured and colours refitted, or a view is refused before, with a limit that does."""
-    monkeypatch.setattr(device_scene, "COMPACT_ROWS", 512)
+    use_fit(monkeypatch, compact_rows=512)
     planes, degrees = SCENE.read(slice(0, SCENE.count), list(FIELD)), np.full(SCENE.count, 2)
     views, drawn = cameras()[:2], list[int]()
     budget = large_budget()

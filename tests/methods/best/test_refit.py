@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import FIXED_ERROR
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
@@ -190,7 +190,7 @@ def test_each_row_keeps_its_degree() -> None:
 
 
 def test_the_same_bits_every_time_on_every_form(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1 << 14)
+    use_fit(monkeypatch, pairs=1 << 14)
     planes, found = bright_planes(2, 60), []
     for form in ("w16", "w16", "w4", "gpu", "numpy"):
         found.append(Bench(planes, 2, form).refit(perturbed(planes), 2, 2))
@@ -202,8 +202,8 @@ def test_the_same_bits_every_time_on_every_form(monkeypatch: pytest.MonkeyPatch)
 def test_chunks_and_batches_change_nothing(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     planes = bright_planes(1, 128)
     expected = Bench(planes, 2).refit(perturbed(planes), 1, 2)
-    monkeypatch.setattr("flexgs_edge.render.device_scene.CHUNK_ROWS", rows)
-    monkeypatch.setattr("flexgs_edge.render.view_buffers.DEFAULT_PAIRS", 1)
+    use_fit(monkeypatch, chunk_rows=rows)
+    use_fit(monkeypatch, pairs=1)
     found = Bench(planes, 2).refit(perturbed(planes), 1, 2)
     assert same_bits(found["sh_dc"], expected["sh_dc"]) and same_bits(found["sh_rest"], expected["sh_rest"])
 
@@ -211,11 +211,7 @@ def test_chunks_and_batches_change_nothing(rows: int, monkeypatch: pytest.Monkey
 def test_a_scene_that_is_streamed_is_refitted_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     planes = bright_planes(1, 300)
     expected = Bench(planes, 2).refit(perturbed(planes), 1, 2)
-
-    def stream(scene: DeviceScene) -> None:
-        scene._rows, scene.resident = 128, False
-
-    monkeypatch.setattr(DeviceScene, "_decide", stream)
+    use_fit(monkeypatch, resident=False, chunk_rows=128, least_rows=128)
     found = Bench(planes, 2).refit(perturbed(planes), 1, 2)
     assert same_bits(found["sh_dc"], expected["sh_dc"]) and same_bits(found["sh_rest"], expected["sh_rest"])
 
