@@ -109,17 +109,6 @@ def _weighed(steps: list[Step]) -> list[tuple[int, float]]:
     return [(step.choice.prune, step.excess * (1.0 if step.holds == side else far)) for step in steps]
 
 
-def better(step: Step, other: Step, target: Target) -> bool:
-    """Whether `step` is the better answer: holding before missing, then fewer bytes (a size target: less loss)."""
-    if step.holds != other.holds:
-        return step.holds
-    if not step.holds:
-        return step.excess < other.excess
-    if target.limit_bytes is not None and step.measurement is not None and other.measurement is not None:
-        return step.measurement.loss(target.judge) < other.measurement.loss(target.judge)
-    return step.size < other.size
-
-
 def _position(prune: int, by_size: bool) -> float:
     # Sizes are about proportional to what is kept: their log is linear in this.
     return -math.log(1 - prune / 1000) if by_size else prune / 1000

@@ -3,31 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 from flexgs_edge.errors import TargetError
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.target import Measurement, Target
-from flexgs_edge.methods.best.candidates import RateStep
-
-
-def step_words(step: Step, target: Target | None) -> str:
-    """A step of a search in a line."""
-    figure = target.report(step.size, step.measurement) if target else ""
-    figure += " (estimated)" if step.estimated else ""
-    return f"{step.phase}: prune {step.choice.prune / 1000:g}, SH {step.choice.sh / 1000:g}: {figure}, {step.seconds:.1f} s"
-
-
-def better(step: RateStep, other: RateStep, target: Target) -> bool:
-    """Whether `step` is the better answer: holding before missing, then fewer bytes (a size target: less loss)."""
-    if step.holds != other.holds:
-        return step.holds
-    if not step.holds:
-        return step.excess < other.excess
-    if target.limit_bytes is not None:
-        return step.measurement.loss(target.judge) < other.measurement.loss(target.judge)
-    return step.size < other.size
-
 
 Phase = Literal["list", "refine", "confirm", "fixed", "line", "multiplier"]
 MAX_PRUNE = 980
@@ -111,6 +91,44 @@ class SearchResult:
     reached: bool
     steps: tuple[Step, ...]
     scored: Scored | None = None
+
+
+class Point(Protocol):
+    """A measured point of any search."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+
+    @property
+    def measurement(self) -> Measurement | None:
+        """Quality."""
+
+    @property
+    def excess(self) -> float:
+        """By how much the target was missed."""
+
+    @property
+    def holds(self) -> bool:
+        """The target holds here."""
+
+
+def better(step: Point, other: Point, target: Target) -> bool:
+    """Whether `step` is the better answer: holding before missing, then fewer bytes (a size target: less loss)."""
+    if step.holds != other.holds:
+        return step.holds
+    if not step.holds:
+        return step.excess < other.excess
+    if target.limit_bytes is not None and step.measurement is not None and other.measurement is not None:
+        return step.measurement.loss(target.judge) < other.measurement.loss(target.judge)
+    return step.size < other.size
+
+
+def step_words(step: Step, target: Target | None) -> str:
+    """A step of a search in a line."""
+    figure = target.report(step.size, step.measurement) if target else ""
+    figure += " (estimated)" if step.estimated else ""
+    return f"{step.phase}: prune {step.choice.prune / 1000:g}, SH {step.choice.sh / 1000:g}: {figure}, {step.seconds:.1f} s"
 
 
 def out_of_reach(target: Target, closest: Step) -> TargetError:

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.line import CLOSE, LINE_STEPS, better, next_point, search_line
-from flexgs_edge.goals.steps import MAX_PRUNE, Step
+from flexgs_edge.goals.line import CLOSE, LINE_STEPS, next_point, search_line
+from flexgs_edge.goals.steps import MAX_PRUNE, Step, better
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, Target
 
 

@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.line import LINE_STEPS, START, better, search_line
-from flexgs_edge.goals.steps import MAX_PRUNE, Phase, SearchResult, Step, out_of_reach
+from flexgs_edge.goals.line import LINE_STEPS, START, search_line
+from flexgs_edge.goals.steps import MAX_PRUNE, Phase, SearchResult, Step, better, out_of_reach
 from flexgs_edge.goals.target import Target
 from flexgs_edge.io.exchange import near_order
 from flexgs_edge.methods.foreign.file_maker import LOG, FileMaker, WrittenFile

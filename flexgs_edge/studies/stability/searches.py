@@ -10,8 +10,8 @@ from typing import Any, cast
 import numpy as np
 
 from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.line import LINE_STEPS, START, better, search_line
-from flexgs_edge.goals.steps import MAX_PRUNE, Step
+from flexgs_edge.goals.line import LINE_STEPS, START, search_line
+from flexgs_edge.goals.steps import MAX_PRUNE, Step, better
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.methods.best.candidates import RateStep
