@@ -23,7 +23,7 @@ from flexgs_edge.codec.v2.container import channel_bytes, coded_size, write_grid
 from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.decompress import decompress
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.io.ply import PlySource
@@ -36,7 +36,7 @@ DEGREES = (0.5, 0.65, 0.8)
 """Ranks by the size of their SH from which rows have SH of degree 1, 2 and 3."""
 
 
-def some_rows(path: Path, count: int, steps: Steps) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def some_rows(path: Path, count: int, steps: StepSizes) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Planes of `count` rows (0: once all that are kept), and their SH degrees."""
     source = PlySource(path)
     planes = source.read(slice(0, source.count), list(FIELD))
@@ -70,7 +70,7 @@ def main() -> None:
     )
     backend, _ = backend_of(options)
     bench = Bench(backend.name, options.repeats)
-    steps = Steps(0.0025, 0.25, 0.05, 0.4, 0.08, (0.09, 0.09, 0.09))
+    steps = StepSizes(0.0025, 0.25, 0.05, 0.4, 0.08, (0.09, 0.09, 0.09))
     planes, degrees = some_rows(SCENES[options.scene] / "point_cloud.ply", options.rows, steps)
     count = len(degrees)
     with tempfile.TemporaryDirectory() as folder:

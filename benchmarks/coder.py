@@ -19,7 +19,7 @@ from flexgs_edge.codec.v2.container import channel_bytes, write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import recolour, to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels.open_backend import open_backend
@@ -36,7 +36,7 @@ from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.references import TargetViews
+from flexgs_edge.views.references import References
 
 STEPS = (0.002, 0.2, 0.04, 0.3, 0.06)
 """Of position, scale, rotation, opacity and constant colour, in fox's units."""
@@ -88,7 +88,7 @@ def report(bench: Bench, path: Path, what: str) -> float:
     return whole
 
 
-def base_payload(scene_path: Path, output: Path, steps: Steps, device: str | None, progress: Progress) -> Quality:
+def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str | None, progress: Progress) -> Quality:
     """Write the base of every Gaussian of a scene, and measure it with the scene's own SH."""
     scene, companions = load_scene(scene_path), companions_of(scene_path)
     views = find_views(resolve_drawing(ViewOptions(), scene, companions), companions, scene.source)
@@ -101,7 +101,7 @@ def base_payload(scene_path: Path, output: Path, steps: Steps, device: str | Non
     try:
         with renderer.load(source) as original:
             judge.prepare(original, progress)
-            targets = TargetViews.of(renderer, original, cameras, progress=progress)
+            targets = References.of(renderer, original, cameras, progress=progress)
         planes = source.read(slice(0, source.count), list(FIELD))
         grid, order = to_grid(planes, np.zeros(source.count, np.uint8), steps, source.origin)
         exact = {"sh_rest": np.ascontiguousarray(planes["sh_rest"][:, order])}
@@ -135,7 +135,7 @@ def main() -> None:
         report(bench, options.file, options.file.name)
         return
     kinds = ("position", "scale", "rotation", "opacity", "dc")
-    steps = Steps(**dict(zip(kinds, options.steps, strict=True)), sh=(), chroma=CHROMA)
+    steps = StepSizes(**dict(zip(kinds, options.steps, strict=True)), sh=(), chroma=CHROMA)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "base.fgs"
         quality = base_payload(SCENES[options.scene] / "point_cloud.ply", path, steps, options.device, Progress())

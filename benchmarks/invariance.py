@@ -25,9 +25,9 @@ from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.io.ply import PlySource, write_ply
-from flexgs_edge.methods.best.candidates import RateStep
+from flexgs_edge.methods.best.candidates import Candidate
 from flexgs_edge.methods.best.grid_coder import GridCoder
-from flexgs_edge.methods.best.grid_search import RateSearch
+from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.method import grid_search
 from flexgs_edge.progress import Progress
 from flexgs_edge.run.options import CompressOptions
@@ -52,7 +52,7 @@ def write_project(folder: Path, source: SceneSource, cameras: Sequence[Camera], 
 class Found:
     """A search's answer: the multiplier, the rows it keeps (ascending), and the bytes of the file."""
 
-    search: RateSearch
+    search: GridSearch
     multiplier: float
     rows: np.ndarray
     size: int
@@ -60,19 +60,19 @@ class Found:
 
 def compress_and_look(path: Path, output: Path, near: float, progress: Progress, **words: Any) -> Found:
     """What `--method best` keeps, and the bytes of the file."""
-    searches: list[RateSearch] = []
-    steps: list[RateStep] = []
+    searches: list[GridSearch] = []
+    steps: list[Candidate] = []
 
     def recording(options: CompressOptions, coder: GridCoder) -> Any:
         make = grid_search(options, coder)
 
         def recorded(path: Any, measure: Any, report: Any) -> Any:
-            def noted(step: RateStep) -> None:
+            def noted(step: Candidate) -> None:
                 steps.append(step)
                 report(step)
 
             search = make(path, measure, noted)
-            assert isinstance(search, RateSearch)
+            assert isinstance(search, GridSearch)
             searches.append(search)
             return search
 

@@ -26,13 +26,13 @@ from flexgs_edge.grid.values import values_of
 from flexgs_edge.io.exchange import read_foreign
 from flexgs_edge.io.formats import Format
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.checkpoint import open_checkpoint
 from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.keep import kept_as_it_is
 from flexgs_edge.methods.best.method import grid_search, layered, search_best
 from flexgs_edge.methods.best.poses import scored_poses
-from flexgs_edge.methods.best.spill import choose_room, prepare_memory
+from flexgs_edge.methods.best.spill import choose_storage, prepare_memory
 from flexgs_edge.methods.foreign.file_maker import WrittenFile, open_files, publish
 from flexgs_edge.methods.foreign.method import search_files
 from flexgs_edge.methods.paper.auto_bits import bits_by_sensitivity
@@ -62,7 +62,7 @@ from flexgs_edge.run.outputs import check_outputs, foreign_format
 from flexgs_edge.run.plan import Plan
 from flexgs_edge.run.reporter import Reporter
 from flexgs_edge.run.settings import make_settings
-from flexgs_edge.run.view_set import Views, find_views, views_info
+from flexgs_edge.run.view_set import ViewSet, find_views, views_info
 from flexgs_edge.scene.source import MemorySource, SceneSource
 from flexgs_edge.units import format_size
 
@@ -141,7 +141,7 @@ class _Job:
         held: ExitStack,
         options: CompressOptions,
         scene: Scene,
-        views: Views | None,
+        views: ViewSet | None,
         plan: Plan,
         budget: MemoryBudget,
         clock: Stopwatch,
@@ -157,7 +157,7 @@ class _Job:
         self.groups = options.bit_spec()[1]
         self.sensitivity: list[Sensitivity] = []
         self.scores_reused = False
-        self.room: Room = MEMORY
+        self.storage: Storage = IN_MEMORY
         self.training: TrainingPoses | None = None
         self.trained: float | None = None
 
@@ -229,8 +229,8 @@ class _Job:
             return self._run_files(self.format, output, None, decide, report)
         poses = scored_poses(self.views.of(self.views.train), options, renderer, self.source)
         folder = Path(options.scratch or (tempfile.gettempdir() if output is None else output.parent))
-        room = choose_room(renderer, self.source, poses.cameras, options, self.budget, folder)
-        self.room = renderer.room = room
+        storage = choose_storage(renderer, self.source, poses.cameras, options, self.budget, folder)
+        self.storage = renderer.storage = storage
         self._look_at_original(decide, report, None)
         kept = None
         if options.resume:
@@ -265,7 +265,7 @@ class _Job:
             if self.reporter is not None:
                 self.reporter.read_contents_of(lambda place: coder.write(place, grid, settings))
             size = coder.size(grid, settings)
-            quality = self._measure_source(MemorySource(values_of(grid, room), origin=grid.origin), report)
+            quality = self._measure_source(MemorySource(values_of(grid, storage), origin=grid.origin), report)
         else:
             with temporary_name(output, options.force, None if kept is None else kept.key) as place:
                 with self.clock.stage("write"):
@@ -278,7 +278,7 @@ class _Job:
             LOG.info("wrote %s, %s", output, format_size(size))
         if kept is not None:
             kept.remove()
-        room.close()
+        storage.close()
         return self._result(output, size, search.chosen.choice, grid, search, quality)
 
     def _run_files(
@@ -456,7 +456,7 @@ class _Job:
             scores_saved=options.save_scores,
             score_cache=options.score_cache if plan.computes_scores else None,
             scores_reused=self.scores_reused,
-            run=run_info(self.budget, self.clock, self.workspace.backend if self.workspace else None, self.room),
+            run=run_info(self.budget, self.clock, self.workspace.backend if self.workspace else None, self.storage),
             format=self.format.suffix[1:] if self.format else "fgs",
             file_sh_degree=scene.sh_degree,
             scored=scored,

@@ -44,7 +44,7 @@ class Lesser:
     make: Callable[[], tuple[int, SceneSource]]
 
 
-def lesser_scenes(source: FgsSource | GridSource) -> list[Lesser]:
+def reduced_scenes(source: FgsSource | GridSource) -> list[Lesser]:
     """Every channel of a file, a bit coarser and dropped, in the order of `info`."""
     return list(_of_grid(source) if isinstance(source, GridSource) else _of_packed(source.quantized()))
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.commands.info import info
-from flexgs_edge.commands.reduced import DROPPED, ONE_LESS, lesser_scenes
+from flexgs_edge.commands.reduced import DROPPED, ONE_LESS, reduced_scenes
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
 from flexgs_edge.memory.budget import MemoryBudget
@@ -49,7 +49,7 @@ def worth(
     Returns
     -------
     dict
-        As `info`; `errors` has the views and, for every channel and change of `lesser_scenes`, the bytes of the file that it
+        As `info`; `errors` has the views and, for every channel and change of `reduced_scenes`, the bytes of the file that it
         saves, the fidelity (dB; None where nothing changes) and the modelled drop (dB).
     """
     options = replace(options or ViewOptions(), images=None, **words)
@@ -77,7 +77,7 @@ def worth(
         stack.callback(judge.close)
         with renderer.load(scene.source) as original:
             judge.prepare(original, progress)
-        lessers = lesser_scenes(open_fgs(place))
+        lessers = reduced_scenes(open_fgs(place))
         for item in progress.track(lessers, "taking channels away", len(lessers)):
             saved, less = item.make()
             with renderer.load(less) as drawn:

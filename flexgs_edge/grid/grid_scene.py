@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexgs_edge.grid.step_sizes import Steps
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class GridScene:
         D; 0 when no row has SH.
     origin : np.ndarray
         [3] f64, world: positions are relative to it.
-    steps : Steps
+    steps : StepSizes
         Value = code * step.
     position : np.ndarray
         [3, n] i32.
@@ -45,7 +45,7 @@ class GridScene:
     count: int
     sh_degree: int
     origin: np.ndarray
-    steps: Steps
+    steps: StepSizes
     position: np.ndarray
     scale: np.ndarray
     rotation: np.ndarray
@@ -60,22 +60,22 @@ class GridScene:
         """Rows with SH above degree 0."""
         return int(np.count_nonzero(self.sh_degrees))
 
-    def take(self, rows: np.ndarray, room: Room = MEMORY) -> GridScene:
+    def take(self, rows: np.ndarray, storage: Storage = IN_MEMORY) -> GridScene:
         """The rows `rows` in their order, with the SH degree that is left."""
         rows = np.arange(self.count)[rows]
         degrees = self.sh_degrees[rows]
         top = int(degrees.max(initial=0))
-        bands = tuple(room.take(self.sh[d], _places(self.sh_degrees, rows, d + 1)) for d in range(top))
+        bands = tuple(storage.take(self.sh[d], _places(self.sh_degrees, rows, d + 1)) for d in range(top))
         return GridScene(
             len(rows),
             top,
             self.origin,
             replace(self.steps, sh=self.steps.sh[:top]),
-            room.take(self.position, rows),
-            room.take(self.scale, rows),
-            room.take(self.rotation, rows),
-            room.take(self.opacity, rows),
-            room.take(self.dc, rows),
+            storage.take(self.position, rows),
+            storage.take(self.scale, rows),
+            storage.take(self.rotation, rows),
+            storage.take(self.opacity, rows),
+            storage.take(self.dc, rows),
             degrees,
             bands,
             self.layer[rows],

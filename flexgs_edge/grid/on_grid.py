@@ -11,42 +11,42 @@ import numpy as np
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.step_sizes import Planes, Steps
+from flexgs_edge.grid.step_sizes import Planes, StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.memory.rows import blocks, read_rows
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.fields import sh_rest_count
 
 _COMMENT = "flexgs-edge grid "
 
 
-def grid_comment(steps: Steps) -> str:
+def grid_comment(steps: StepSizes) -> str:
     """What a PLY says of the grid that its values lie on."""
     return f"{_COMMENT}{json.dumps(steps.to_json())}"
 
 
-def steps_of(comments: Sequence[str]) -> Steps | None:
+def steps_of(comments: Sequence[str]) -> StepSizes | None:
     """The steps that such a comment holds; None without one that can be read."""
     for words in comments:
         if words.startswith(_COMMENT):
             try:
                 with np.errstate(over="ignore"):  # a step beyond float32 is infinite, and refused
-                    return Steps.from_json(json.loads(words.removeprefix(_COMMENT)))
+                    return StepSizes.from_json(json.loads(words.removeprefix(_COMMENT)))
             # Anybody may have written it: lists a thousand deep, integers beyond floats.
             except (InputError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError):
                 return None
     return None
 
 
-def on_grid(planes: Planes, steps: Steps, origin: np.ndarray) -> GridScene | None:
+def on_grid(planes: Planes, steps: StepSizes, origin: np.ndarray) -> GridScene | None:
     """The grid that values lie on, if every one of them lies on it to the bit: nothing is lost by taking it.
 
     Parameters
     ----------
     planes : mapping
         {field: [width, n] f32}, finite.
-    steps : Steps
+    steps : StepSizes
         What a comment says: it may be of other values.
     origin : np.ndarray
         [3] f64.
@@ -70,7 +70,7 @@ def on_grid(planes: Planes, steps: Steps, origin: np.ndarray) -> GridScene | Non
     return grid
 
 
-def lowered(grid: GridScene, room: Room = MEMORY) -> GridScene:
+def lowered(grid: GridScene, storage: Storage = IN_MEMORY) -> GridScene:
     """The same values with each row's SH degree as low as its codes allow: what decodes to zero is not in the file.
 
     So the grid of a file is the one that is found again in the values that it decodes to (`on_grid`), to the byte.
@@ -86,7 +86,7 @@ def lowered(grid: GridScene, room: Room = MEMORY) -> GridScene:
         zero &= degrees[rows] == degree
         degrees[rows[zero]] = degree - 1
         if zero.any():
-            bands[degree - 1] = room.take(codes, np.flatnonzero(~zero))
+            bands[degree - 1] = storage.take(codes, np.flatnonzero(~zero))
     top = int(degrees.max(initial=0))
     return replace(
         grid,

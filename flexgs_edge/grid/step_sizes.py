@@ -18,7 +18,7 @@ Planes = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Steps:
+class StepSizes:
     """Grid steps, rounded to float32 once.
 
     Parameters
@@ -65,7 +65,7 @@ class Steps:
         return {**asdict(self), "sh": list(self.sh)}
 
     @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> Steps:
+    def from_json(cls, record: Mapping[str, Any]) -> StepSizes:
         """Inverse of `to_json`."""
         return cls(**{**record, "sh": tuple(record["sh"])})
 

@@ -10,10 +10,10 @@ import numpy as np
 from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.step_sizes import POSITION_BITS, Planes, Steps
+from flexgs_edge.grid.step_sizes import POSITION_BITS, Planes, StepSizes
 from flexgs_edge.memory.ordered import OrderedPlanes, stable_order
 from flexgs_edge.memory.rows import blocks, put_rows, read_ahead, read_rows
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.rotations import canonical_axes
@@ -22,10 +22,10 @@ from flexgs_edge.scene.rotations import canonical_axes
 def to_grid(
     planes: Planes,
     sh_degrees: np.ndarray,
-    steps: Steps,
+    steps: StepSizes,
     origin: np.ndarray | Sequence[float],
     layer: np.ndarray | None = None,
-    room: Room = MEMORY,
+    storage: Storage = IN_MEMORY,
     rename: bool = True,
 ) -> tuple[GridScene, np.ndarray]:
     """Put a scene on its grid.
@@ -39,13 +39,13 @@ def to_grid(
         {field: [width, n] f32}, finite; `means` relative to `origin`.
     sh_degrees : np.ndarray
         [n], the SH degree kept for each row; coefficients above it are left out.
-    steps : Steps
+    steps : StepSizes
         Needs one SH step for each degree kept.
     origin : array_like
         [3] f64.
     layer : np.ndarray, optional
         [n], 0 to 255.
-    room : Room, optional
+    storage : Storage, optional
         Where the grid goes.
     rename : bool
         Look for that form; False leaves rotations and scales as they are.
@@ -65,10 +65,10 @@ def to_grid(
     top = int(degrees.max(initial=0))
     if len(steps.sh) < top or planes["sh_rest"].shape[0] < 3 * sh_rest_count(top):
         raise InputError(f"SH degree {top} asked for: expected a step and coefficients for each degree up to it")
-    position, order = _along_curve(planes["means"], steps.position, layer, room)
-    scale, rotation, dc = (room.empty((3, count), np.int32) for _ in range(3))
-    opacity = room.empty((count,), np.int32)
-    ordered = OrderedPlanes(planes, order, room)
+    position, order = _along_curve(planes["means"], steps.position, layer, storage)
+    scale, rotation, dc = (storage.empty((3, count), np.int32) for _ in range(3))
+    opacity = storage.empty((count,), np.int32)
+    ordered = OrderedPlanes(planes, order, storage)
     for part, values in ordered.parts(count, "quats", "log_scales", "opacity_logits", "sh_dc"):
         rows, (quats, log_scales, logits, colours) = order[part], values
         if rename:
@@ -90,7 +90,7 @@ def to_grid(
         dc,
         degrees,
         tuple(
-            _band_codes(ordered, degree, np.flatnonzero(degrees >= degree), steps, room, order)
+            _band_codes(ordered, degree, np.flatnonzero(degrees >= degree), steps, storage, order)
             for degree in range(1, top + 1)
         ),
         np.zeros(count, np.uint8) if layer is None else _bytes("layer", layer, count, 255)[order],
@@ -98,10 +98,12 @@ def to_grid(
     return grid, order
 
 
-def _along_curve(means: np.ndarray, step: float, layer: np.ndarray | None, room: Room) -> tuple[np.ndarray, np.ndarray]:
+def _along_curve(
+    means: np.ndarray, step: float, layer: np.ndarray | None, storage: Storage
+) -> tuple[np.ndarray, np.ndarray]:
     """Position codes [3, n] i32 in their order, and that order ([n] i64): by layer, then along the Morton curve."""
     count = means.shape[1]
-    codes = room.empty((3, count), np.int32)
+    codes = storage.empty((3, count), np.int32)
     low, high = np.full((3, 1), CODE_LIMIT), np.full((3, 1), -CODE_LIMIT)
     for part, (values,) in read_ahead(count, means):
         some = _codes("means", values, step, np.arange(part.start, part.stop))
@@ -115,23 +117,23 @@ def _along_curve(means: np.ndarray, step: float, layer: np.ndarray | None, room:
             f"means: the scene is {int((high - low).max())} position steps of {step:g} wide, expected less than "
             f"2^{POSITION_BITS}: take a larger step or remove far outliers"
         )
-    keys = room.empty((count,), np.uint64)
+    keys = storage.empty((count,), np.uint64)
     for part, (some,) in read_ahead(count, codes):
         put_rows(keys, part, morton(some - low))
     layers = None if layer is None else _bytes("layer", layer, count, 255)
-    order = stable_order(keys, room) if layers is None else np.lexsort((keys, layers)).astype(np.int64)
-    return room.take(codes, order), order
+    order = stable_order(keys, storage) if layers is None else np.lexsort((keys, layers)).astype(np.int64)
+    return storage.take(codes, order), order
 
 
-def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray, room: Room = MEMORY) -> GridScene:
+def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray, storage: Storage = IN_MEMORY) -> GridScene:
     """The same rows with other colours ([3, n] and [3 * K, n] f32, in the grid's row order) put on the same steps."""
-    dc = room.empty((3, grid.count), np.int32)
+    dc = storage.empty((3, grid.count), np.int32)
     for part in blocks(grid.count):
         rows, some = np.arange(part.start, part.stop), read_rows(sh_dc, part)[:, None]
         put_rows(dc, part, _colour_codes("sh_dc", some, grid.steps.colour(grid.steps.dc), rows)[:, 0])
     degrees = range(1, grid.sh_degree + 1)
-    colours = OrderedPlanes({"sh_rest": sh_rest}, None, room)
-    bands = tuple(_band_codes(colours, d, np.flatnonzero(grid.sh_degrees >= d), grid.steps, room) for d in degrees)
+    colours = OrderedPlanes({"sh_rest": sh_rest}, None, storage)
+    bands = tuple(_band_codes(colours, d, np.flatnonzero(grid.sh_degrees >= d), grid.steps, storage) for d in degrees)
     return replace(grid, dc=dc, sh=bands)
 
 
@@ -168,10 +170,15 @@ def _colour_codes(name: str, rgb: np.ndarray, steps: np.ndarray, order: np.ndarr
 
 
 def _band_codes(
-    planes: OrderedPlanes, degree: int, rows: np.ndarray, steps: Steps, room: Room, order: np.ndarray | None = None
+    planes: OrderedPlanes,
+    degree: int,
+    rows: np.ndarray,
+    steps: StepSizes,
+    storage: Storage,
+    order: np.ndarray | None = None,
 ) -> np.ndarray:
     """[3 * (2l + 1), n] codes of the coefficients of one SH degree; `order` gives input rows for the message."""
-    codes = room.empty((3, 2 * degree + 1, len(rows)), np.int32)
+    codes = storage.empty((3, 2 * degree + 1, len(rows)), np.int32)
     for part in blocks(len(rows)):
         chosen = rows[part]
         named = chosen if order is None else order[chosen]

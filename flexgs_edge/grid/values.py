@@ -9,13 +9,15 @@ import numpy as np
 
 from flexgs_edge.grid.grid_scene import GridScene, _places
 from flexgs_edge.memory.rows import put_rows, read_ahead, read_rows
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 
 
-def values_of(grid: GridScene, room: Room = MEMORY) -> dict[str, np.ndarray]:
-    """`from_grid` of all rows and fields, in arrays of `room`."""
-    planes = {name: room.empty((field.width(grid.sh_degree), grid.count), np.float32) for name, field in FIELD.items()}
+def values_of(grid: GridScene, storage: Storage = IN_MEMORY) -> dict[str, np.ndarray]:
+    """`from_grid` of all rows and fields, in arrays of `storage`."""
+    planes = {
+        name: storage.empty((field.width(grid.sh_degree), grid.count), np.float32) for name, field in FIELD.items()
+    }
     names = [name for name in FIELD if name != "sh_rest"]
     first = np.zeros(grid.sh_degree, np.int64)
     for part, found in read_ahead(grid.count, grid.position, grid.scale, grid.rotation, grid.opacity, grid.dc):

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from flexgs_edge.memory.rows import COPY_ROWS, blocks, put_rows, read_ahead, read_listed, read_rows
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 
 
 class OrderedPlanes:
@@ -17,10 +17,10 @@ class OrderedPlanes:
     all over every plane would be read for each part.
     """
 
-    def __init__(self, planes: Mapping[str, np.ndarray], order: np.ndarray | None, room: Room) -> None:
+    def __init__(self, planes: Mapping[str, np.ndarray], order: np.ndarray | None, storage: Storage) -> None:
         self._planes, self._order = dict(planes), order
-        if order is not None and room.spills:
-            self._planes = {name: room.take(values, order) for name, values in planes.items() if name != "means"}
+        if order is not None and storage.spills:
+            self._planes = {name: storage.take(values, order) for name, values in planes.items() if name != "means"}
             self._order = None
 
     def parts(self, count: int, *fields: str) -> Iterator[tuple[slice, list[np.ndarray]]]:
@@ -40,16 +40,16 @@ class OrderedPlanes:
         return read_listed(rgb, rows if self._order is None else self._order[rows])
 
 
-def stable_order(keys: np.ndarray, room: Room = MEMORY, rows: int = 1 << 22) -> np.ndarray:
+def stable_order(keys: np.ndarray, storage: Storage = IN_MEMORY, rows: int = 1 << 22) -> np.ndarray:
     """[n] i64, what `np.argsort(keys, kind="stable")` gives, with no more than about `rows` keys sorted at a time in memory.
 
     Keys are split by value into parts of about equal size (as a sample says), which are sorted one after the other; equal keys
     are never split.
     """
     count = len(keys)
-    if not room.spills or count <= rows:
+    if not storage.spills or count <= rows:
         return np.argsort(keys, kind="stable")
-    order = room.empty((count,), np.int64)
+    order = storage.empty((count,), np.int64)
     sample = np.sort(keys[:: max(count // 65536, 1)])
     parts = -(-2 * count // rows)
     edges = np.unique(sample[[len(sample) * part // parts for part in range(1, parts)]])

@@ -45,7 +45,7 @@ class _Owner(Protocol):
 class MappedFile(mmap.mmap):
     """A mapped file that counts itself."""
 
-    room: _Owner
+    storage: _Owner
     address: int
     file: BinaryIO
 
@@ -55,7 +55,7 @@ class MappedFile(mmap.mmap):
         return DirectFile.of(self.file)
 
     def __del__(self) -> None:
-        self.room.used -= len(self)
+        self.storage.used -= len(self)
         direct = self.__dict__.get("direct")
         if direct is not None:
             direct.close()
@@ -168,7 +168,7 @@ def put_rows(values: np.ndarray, rows: slice, part: np.ndarray) -> None:
             try:
                 size = os.pwrite(held.file.fileno(), left, at)
             except OSError as error:  # blocks are reserved; a disk that copies on writing may still be full
-                raise held.room.full(len(left), error) from error
+                raise held.storage.full(len(left), error) from error
             left, at = left[size:], at + size
 
 

@@ -28,7 +28,7 @@ _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _IN_MEMORY = {"tmpfs", "ramfs", "devtmpfs"}
 
 
-class Room:
+class Storage:
     """Arrays in memory."""
 
     spills = False
@@ -78,10 +78,10 @@ class Room:
         return error
 
 
-MEMORY = Room()
+IN_MEMORY = Storage()
 
 
-class Scratch(Room):
+class ScratchStorage(Storage):
     """Arrays in files of a folder, mapped.
 
     The files have no names: whatever ends the process, a kill included, the disk space is free again. Their blocks are reserved
@@ -124,16 +124,16 @@ class Scratch(Room):
 
     @property
     def peak_anonymous(self) -> int | None:
-        """See `Room.peak_anonymous`."""
+        """See `Storage.peak_anonymous`."""
         return None if self._watch is None else self._watch.peak
 
     def close(self) -> None:
-        """See `Room.close`."""
+        """See `Storage.close`."""
         if self._watch is not None:
             self._watch.close()
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        """See `Room.empty`; raises `BudgetError` when the disk is full."""
+        """See `Storage.empty`; raises `BudgetError` when the disk is full."""
         size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
         if size < _SMALL:
             return np.empty(shape, dtype)
@@ -144,7 +144,7 @@ class Scratch(Room):
         except OSError as error:
             file.close()
             raise self.full(size, error) from error
-        held.room, held.file = self, file
+        held.storage, held.file = self, file
         self.count(size)
         if hasattr(mmap, "MADV_RANDOM"):
             # Of one row of values the kernel may read ahead. Of planes, a part of the rows is a piece of each: a disk that reads
@@ -155,7 +155,7 @@ class Scratch(Room):
         return values
 
     def count(self, size: int) -> None:
-        """See `Room.count`."""
+        """See `Storage.count`."""
         self.used += size
         self.peak = max(self.peak, self.used)
 

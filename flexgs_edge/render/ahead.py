@@ -17,7 +17,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.kernels.backend import Backend
-from flexgs_edge.memory.storage import Room
+from flexgs_edge.memory.storage import Storage
 from flexgs_edge.render.camera_record import camera_record
 from flexgs_edge.render.compact import ShownView, Splats, fill_compact
 from flexgs_edge.render.device_scene import DeviceScene
@@ -31,14 +31,14 @@ AHEAD_ROW_BYTES = shapes_bytes(chunk_shapes(1)) + 4
 class WaitingView:
     """A view that has not had its turn, in a scratch file; close when done."""
 
-    def __init__(self, backend: Backend, room: Room, camera: Camera, record: np.ndarray) -> None:
+    def __init__(self, backend: Backend, storage: Storage, camera: Camera, record: np.ndarray) -> None:
         self.of = camera
         self.record, self.camera = record, backend.array(record.shape, np.float32)
         backend.write(self.camera, record)
         self.count = 0
-        self._backend, self._room = backend, room
+        self._backend, self._storage = backend, storage
         self._parts: list[int] = []
-        self._file: BinaryIO = room.file()
+        self._file: BinaryIO = storage.file()
         self._disk = ThreadPoolExecutor(1, "ahead")
         self._written: Future[None] | None = None
 
@@ -49,7 +49,7 @@ class WaitingView:
             self._written = self._disk.submit(self._move, os.pwritev, splats, self.count * AHEAD_ROW_BYTES)
             self._parts.append(len(splats[0]))
             self.count += len(splats[0])
-            self._room.count(AHEAD_ROW_BYTES * len(splats[0]))
+            self._storage.count(AHEAD_ROW_BYTES * len(splats[0]))
         return True
 
     def fill(self, buffers: ViewBuffers) -> np.ndarray:
@@ -71,7 +71,7 @@ class WaitingView:
             try:
                 done = call(self._file.fileno(), left, at)
             except OSError as error:
-                raise self._room.full(sum(map(len, left)), error) from error
+                raise self._storage.full(sum(map(len, left)), error) from error
             if not done:
                 raise EOFError(f"a scratch file ends at byte {at}")
             at += done
@@ -89,7 +89,7 @@ class WaitingView:
         """Remove the file."""
         self._disk.shutdown()
         self._file.close()
-        self._room.count(-AHEAD_ROW_BYTES * self.count)
+        self._storage.count(-AHEAD_ROW_BYTES * self.count)
         self.camera.release()
 
 
@@ -116,7 +116,7 @@ class ViewsAhead:
             self.drop()
 
     def fill(
-        self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers, room: Room, near: float, inria_extent: int
+        self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers, storage: Storage, near: float, inria_extent: int
     ) -> tuple[int, int, np.ndarray | None]:
         """Put the splats that a view shows into its buffers.
 
@@ -132,8 +132,8 @@ class ViewsAhead:
         in_turn = self._scene == (scene, scene.changes)
         waiting = next((view for view in self._waiting if view.of is camera), None) if in_turn else None
         if waiting is None:
-            may_wait = in_turn and room.spills and scene.source is not None and hasattr(os, "pwritev")
-            coming = [self._wait(later, scene, room, near) for later in self._coming] if may_wait else []
+            may_wait = in_turn and storage.spills and scene.source is not None and hasattr(os, "pwritev")
+            coming = [self._wait(later, scene, storage, near) for later in self._coming] if may_wait else []
             shown = ShownView(self._backend, buffers, record)
             seen = project((shown, *coming))
             if shown.count <= buffers.rows:
@@ -141,7 +141,7 @@ class ViewsAhead:
             if not may_wait:
                 return shown.count, seen, None
             # How many there are tells a pass that has room for all of them.
-            waiting, *coming = (self._wait(later, scene, room, near) for later in (camera, *self._coming))
+            waiting, *coming = (self._wait(later, scene, storage, near) for later in (camera, *self._coming))
             project((waiting, *coming))
         if waiting.count > buffers.rows:
             return max(view.count for view in self._waiting), scene.count, None
@@ -151,12 +151,12 @@ class ViewsAhead:
         finally:
             waiting.close()
 
-    def _wait(self, camera: Camera, scene: DeviceScene, room: Room, near: float) -> WaitingView:
+    def _wait(self, camera: Camera, scene: DeviceScene, storage: Storage, near: float) -> WaitingView:
         """A view that waits from now on, in place of what waited of it."""
         for view in [view for view in self._waiting if view.of is camera]:
             self._waiting.remove(view)
             view.close()
-        self._waiting.append(WaitingView(self._backend, room, camera, camera_record(camera, scene.origin, near)))
+        self._waiting.append(WaitingView(self._backend, storage, camera, camera_record(camera, scene.origin, near)))
         return self._waiting[-1]
 
     def drop(self) -> None:

@@ -193,7 +193,7 @@ def view_shapes(size: ViewSize, count: int) -> Shapes:
         "ids_b": ((count,), np.uint32),
         "digits": ((SORT_DIGITS * size.sort_blocks + 1,), np.uint32),
         "block_pairs": ((size.sort_blocks,), np.uint64),
-        "room": ((2, size.tile_blocks), np.uint32),
+        "pair_room": ((2, size.tile_blocks), np.uint32),
         "ends": ((size.tiles * size.tile_blocks + 1,), np.uint32),
         "state": ((size.tiles, 4, TILE * TILE), np.float32),
         "image": ((3, size.tiles_y * TILE, size.tiles_x * TILE), np.float32),

@@ -13,7 +13,7 @@ from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.packed.quantize import QuantizedScene
 from flexgs_edge.render import fit as fit_module
 from flexgs_edge.render.ahead import ViewsAhead
@@ -78,7 +78,7 @@ class Renderer:
 
     Attributes
     ----------
-    room : Room
+    storage : Storage
         Where sums over views go when memory cannot hold them beside a view.
     largest : Camera or None
         The largest view that is to come, where that is known: whether views have room for all rows is decided for it.
@@ -105,7 +105,7 @@ class Renderer:
         self.inria_extent = int(extent == "inria")
         self.antialiased = antialiased
         self.fit = fit or fit_module.DEFAULT
-        self.room: Room = MEMORY
+        self.storage: Storage = IN_MEMORY
         self.largest: Camera | None = None
         self.cluster: Cluster | None = None
         self.splats_shown = 0
@@ -337,7 +337,7 @@ class Renderer:
         part lets expect.
         """
         while True:
-            count, seen, rows = self._ahead.fill(scene, camera, buffers, self.room, self.near, self.inria_extent)
+            count, seen, rows = self._ahead.fill(scene, camera, buffers, self.storage, self.near, self.inria_extent)
             if rows is not None:
                 self._share = max(self._share, count / max(scene.count, 1))
                 return buffers, rows
@@ -377,7 +377,7 @@ class Renderer:
 
     def _may_be_compact(self, scene: DeviceScene, camera: Camera, shown: int) -> bool:
         """Whether there is a place for sums over views that hold `shown` rows; all stay where the first view put them."""
-        if scene.statistics or self.room.spills:
+        if scene.statistics or self.storage.spills:
             return not scene.statistics
         return saves_bytes(scene, view_size(self.backend, camera), shown)
 
@@ -386,7 +386,7 @@ class Renderer:
         if self.largest is not None and self.largest.width * self.largest.height > camera.width * camera.height:
             camera = self.largest
         size = view_size(self.backend, camera)
-        return self.fit.whole_views and fits_whole(scene, size, self.budget.free, self.room.spills)
+        return self.fit.whole_views and fits_whole(scene, size, self.budget.free, self.storage.spills)
 
     def _sort(self, count: int, buffers: ViewBuffers) -> tuple[int, int]:
         """Depth order of the shown splats into `buffers.sorted[0]`; how many there are, and a bound on their pairs."""
@@ -421,14 +421,14 @@ class Renderer:
     def _list_tiles(self, buffers: ViewBuffers, camera: Camera, start: int, count: int) -> None:
         backend, blocks = self.backend, self.backend.tile_blocks
         ids = buffers.sorted[0][1]
-        backend.launch("tile_room", (blocks,), start, count, ids, buffers.bounds, buffers.room)
+        backend.launch("tile_room", (blocks,), start, count, ids, buffers.bounds, buffers.pair_room)
         backend.launch(
             "tile_count", (blocks,), start, count, camera.width, camera.height, self.inria_extent, ids, buffers.records,
-            buffers.room, buffers.drafts, buffers.ends,
+            buffers.pair_room, buffers.drafts, buffers.ends,
         )  # fmt: skip
         backend.launch("exclusive_scan", (1,), buffers.tiles, blocks, buffers.ends)
         backend.launch(
-            "tile_scatter", (blocks,), buffers.tiles, buffers.room, buffers.drafts, buffers.ends, buffers.pairs
+            "tile_scatter", (blocks,), buffers.tiles, buffers.pair_room, buffers.drafts, buffers.ends, buffers.pairs
         )
 
     def release(self) -> None:

@@ -86,7 +86,7 @@ class ViewBuffers:
         self.camera, self.records, self.keys, self.bounds = (made[n] for n in ("camera", "records", "keys", "bounds"))
         self.sorted = [(made["keys_a"], made["ids_a"]), (made["keys_b"], made["ids_b"])]
         self.digits, self.block_pairs = made["digits"], made["block_pairs"]
-        self.room, self.ends = made["room"], made["ends"]
+        self.pair_room, self.ends = made["pair_room"], made["ends"]
         self.state, self.image = made["state"], made["image"]
         self.chunk = tuple(made[name] for name in chunk_shapes(0)) if rows is not None else ()
 

@@ -70,13 +70,13 @@ def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
 
     Otherwise it is the source as it is, which views in memory read once. Views give their memory to the decoder.
     """
-    room, budget = renderer.room, renderer.budget
-    if not room.spills:
+    storage, budget = renderer.storage, renderer.budget
+    if not storage.spills:
         return source
     renderer.release()
     budget.require("decoding the file", min(source.count, CHUNK_ROWS) * DECODE_BYTES)
     with ahead(source, budget):
-        planes = read_all(source, room)
+        planes = read_all(source, storage)
     return MemorySource(planes, source.sh_degree, source.origin, source.name)
 
 

@@ -11,8 +11,8 @@ from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import AUTO_CAMERAS
-from flexgs_edge.run.view_set import Views
-from flexgs_edge.views.references import TargetViews
+from flexgs_edge.run.view_set import ViewSet
+from flexgs_edge.views.references import References
 
 FIT_VIEWS = 8
 """Training poses that the finished file is compared on, evenly spread."""
@@ -45,7 +45,7 @@ class TrainingPoses:
         count = min(FIT_VIEWS, len(cameras))
         self._renderer = renderer
         self._cameras = [cameras[i * len(cameras) // count].every(FIT_STEP) for i in range(count)]
-        self._targets = TargetViews.of(renderer, original, self._cameras, progress=progress)
+        self._targets = References.of(renderer, original, self._cameras, progress=progress)
 
     def fidelity(self, scene: DeviceScene) -> float | None:
         """Fidelity of `scene`, mean over the poses; `None` when all are identical."""
@@ -62,7 +62,7 @@ class TrainingPoses:
 
 
 def doubts(
-    views: Views, scored: Scored | None, count: int, trained: float | None, held_out: float | None
+    views: ViewSet, scored: Scored | None, count: int, trained: float | None, held_out: float | None
 ) -> tuple[str, ...]:
     """Warnings of a run.
 

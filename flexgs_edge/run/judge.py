@@ -16,7 +16,7 @@ from flexgs_edge.quality.ssim import ssim_bytes, ssims
 from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.view_set import Views
+from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.source import SceneSource
 
 SHARE = 4
@@ -38,7 +38,7 @@ class Judge:
         Draws both.
     source : SceneSource
         The original; drawn again whenever a reference was not kept.
-    views : Views
+    views : ViewSet
         All views.
     indices : sequence of int
         The views that judge.
@@ -57,7 +57,7 @@ class Judge:
         self,
         renderer: Renderer,
         source: SceneSource,
-        views: Views,
+        views: ViewSet,
         indices: Sequence[int],
         budget: MemoryBudget,
         with_photos: bool = True,
@@ -83,9 +83,9 @@ class Judge:
         wanted = sum(camera.width * camera.height + _coarse_pixels(camera) for camera in self.cameras) * 12 * images
         self._work = LIBRARY_BYTES + WORK_BYTES * max(pixels)
         budget.take("comparing views", self._work)
-        self._room = min(wanted, budget.free // SHARE)
-        budget.take("reference images", self._room)
-        self._left = self._room
+        self._reserved = min(wanted, budget.free // SHARE)
+        budget.take("reference images", self._reserved)
+        self._left = self._reserved
         budget.reclaimers.append(self._give_back)
 
     def prepare(self, scene: DeviceScene, progress: Progress = SILENT) -> None:
@@ -104,8 +104,8 @@ class Judge:
     def close(self) -> None:
         """Give the memory of the kept images back."""
         self._kept, self._away = {}, {}
-        self._budget.give(self._room + self._work)
-        self._room = self._work = self._left = 0
+        self._budget.give(self._reserved + self._work)
+        self._reserved = self._work = self._left = 0
         if self._give_back in self._budget.reclaimers:
             self._budget.reclaimers.remove(self._give_back)
 
@@ -117,7 +117,7 @@ class Judge:
             key, image = self._kept.popitem()
             freed += image.nbytes
             self._put_away(key, image)
-        self._room -= freed
+        self._reserved -= freed
         self._budget.give(freed)
 
     @property
@@ -183,12 +183,12 @@ class Judge:
 
     def _ssims(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
         height, width = pairs[0][0].shape[:2]
-        room = min(ssim_bytes(width, height), self._work)
-        self._budget.give(room)  # taken again by the arrays themselves
+        work = min(ssim_bytes(width, height), self._work)
+        self._budget.give(work)  # taken again by the arrays themselves
         try:
             return ssims(self.renderer.backend, pairs)
         finally:
-            self._budget.take("comparing views", room)
+            self._budget.take("comparing views", work)
 
     def images(self, scene: DeviceScene, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Render of `scene`, render of the original and photo of the view `indices[i]`: [H, W, 3] f32 in [0, 1]."""
@@ -204,10 +204,10 @@ class Judge:
 
     def _put_away(self, key: tuple[str, int], image: np.ndarray) -> None:
         """Keep an image in a scratch file, where this run has some."""
-        room = self.renderer.room
-        if room.spills:
+        storage = self.renderer.storage
+        if storage.spills:
             height, width, _ = image.shape
-            planes = room.copy(image.transpose(2, 0, 1).reshape(3, -1))
+            planes = storage.copy(image.transpose(2, 0, 1).reshape(3, -1))
             self._away[key] = planes.reshape(3, height, width).transpose(1, 2, 0)
 
     def _held(self, key: tuple[str, int]) -> np.ndarray | None:

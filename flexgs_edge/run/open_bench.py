@@ -8,7 +8,7 @@ from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.open_backend import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.process import current_rss, peak_rss
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.run_info import RunInfo
 from flexgs_edge.run.clock import Stopwatch
@@ -78,7 +78,9 @@ def counted_backend(device: str | None, budget: MemoryBudget, clock: Stopwatch) 
     return backend
 
 
-def run_info(budget: MemoryBudget, clock: Stopwatch, backend: Backend | None = None, room: Room = MEMORY) -> RunInfo:
+def run_info(
+    budget: MemoryBudget, clock: Stopwatch, backend: Backend | None = None, storage: Storage = IN_MEMORY
+) -> RunInfo:
     """Seconds, memory and device of a run."""
     return RunInfo(
         seconds=clock.total,
@@ -88,6 +90,6 @@ def run_info(budget: MemoryBudget, clock: Stopwatch, backend: Backend | None = N
         memory_limit=budget.limit,
         peak_memory=peak_rss(),
         device=backend.describe() if backend else None,
-        peak_anonymous=room.peak_anonymous,
-        scratch=room.peak if room.spills else None,
+        peak_anonymous=storage.peak_anonymous,
+        scratch=storage.peak if storage.spills else None,
     )

@@ -14,7 +14,7 @@ from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.report.material import Rig, Shot
 from flexgs_edge.report.tones import error_map, ramp
 from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.view_set import Views
+from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.source import SceneSource
 
 MOST_SHOTS = 5
@@ -112,7 +112,7 @@ def encode_error(image: np.ndarray, original: np.ndarray, size: tuple[int, int])
     return encode(ramp()[np.rint(errors * 255.0).astype(np.uint8)] / np.float32(255.0), size, ERROR_QUALITY)
 
 
-def rig_of(views: Views, source: SceneSource) -> Rig:
+def rig_of(views: ViewSet, source: SceneSource) -> Rig:
     """Where the cameras stand, and some of the scene's Gaussians (evenly spaced rows: the same ones every time)."""
     cameras = views.cameras
     rows = np.unique(np.linspace(0, source.count - 1, min(source.count, MOST_POINTS)).astype(np.int64))

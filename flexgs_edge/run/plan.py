@@ -9,7 +9,7 @@ from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.target import Judge, Target
 from flexgs_edge.run.inputs import Scene
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.run.view_set import WITHOUT_VIEWS, Views
+from flexgs_edge.run.view_set import WITHOUT_VIEWS, ViewSet
 
 EVERYTHING = Choice(0, 0)
 
@@ -30,7 +30,7 @@ class Plan:
     computes_scores: bool
 
     @classmethod
-    def make(cls, options: CompressOptions, scene: Scene, views: Views | None) -> Plan:
+    def make(cls, options: CompressOptions, scene: Scene, views: ViewSet | None) -> Plan:
         fixed = options.fixed
         needs_scores = fixed != EVERYTHING and options.method == "paper"
         computes = needs_scores and options.score in ("gs", "meson")
@@ -80,7 +80,7 @@ class Plan:
         return "size" if self.target.limit_bytes is not None else self.target.judge
 
     @staticmethod
-    def kind_of(indices: list[int], views: Views | None) -> str:
+    def kind_of(indices: list[int], views: ViewSet | None) -> str:
         """`held-out`, `training` or `none`."""
         if not indices or views is None:
             return "none"

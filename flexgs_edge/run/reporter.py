@@ -26,7 +26,7 @@ from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.inputs import Scene
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.pictures import draw_shots, rig_of, shots_bytes
-from flexgs_edge.run.view_set import Views
+from flexgs_edge.run.view_set import ViewSet
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -79,7 +79,7 @@ class Reporter:
             for name in (PAGE, RECORD):
                 check_writable(folder / name, self.force)
 
-    def reserve(self, budget: MemoryBudget, views: Views, indices: list[int]) -> None:
+    def reserve(self, budget: MemoryBudget, views: ViewSet, indices: list[int]) -> None:
         """Take the pictures' memory before any work, so that a limit that is too small is named at once."""
         budget.take("pictures of the report", shots_bytes(views.of(indices)))
 
@@ -102,7 +102,7 @@ class Reporter:
             write(place)
             self.read_contents(place)
 
-    def see_cameras(self, views: Views, scene: Scene) -> None:
+    def see_cameras(self, views: ViewSet, scene: Scene) -> None:
         """Take down where the cameras stand."""
         self._rig = rig_of(views, scene.source)
 

@@ -11,14 +11,14 @@ from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.run.inputs import Scene
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.plan import Plan
-from flexgs_edge.run.view_set import Views
+from flexgs_edge.run.view_set import ViewSet
 
 
 def make_settings(
     options: CompressOptions,
     plan: Plan,
     scene: Scene,
-    views: Views | None,
+    views: ViewSet | None,
     search: SearchResult | None,
     bits: BitSpec | None,
 ) -> dict[str, Any]:

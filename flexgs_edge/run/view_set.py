@@ -22,7 +22,7 @@ WITHOUT_VIEWS = f"--cameras {NO_CAMERAS} leaves no views: leave it out for autom
 
 
 @dataclass(frozen=True)
-class Views:
+class ViewSet:
     """Views in order of name, and how they are split.
 
     Parameters
@@ -56,7 +56,7 @@ class Views:
 
 def find_views(
     options: ViewOptions, companions: Companions, source: SceneSource, with_photos: bool = True
-) -> Views | None:
+) -> ViewSet | None:
     """The views that the options or the files beside the scene give, else an automatic rig; `None` for `--cameras none`.
 
     `options` must have its background filled in (photos with an alpha channel are put on it).
@@ -85,15 +85,15 @@ def find_views(
         photos = Photos.open(images, cameras, options.background or (0.0, 0.0, 0.0), options.resolution)
         cameras, notes = photos.cameras, notes + photos.notes
     train, held_out = split_views(len(cameras), options.holdout)
-    return Views(cameras, photos, train, held_out, os.fspath(place), images, notes)
+    return ViewSet(cameras, photos, train, held_out, os.fspath(place), images, notes)
 
 
-def _automatic_views(options: ViewOptions, source: SceneSource) -> Views:
+def _automatic_views(options: ViewOptions, source: SceneSource) -> ViewSet:
     LOG.info("no cameras are used: making views from the scene itself")
     cameras, how = automatic_rig(source)
     cameras, note = limit_width(cameras, options.resolution)
     train, held_out = split_views(len(cameras), options.holdout)
-    return Views(cameras, None, train, held_out, AUTO_CAMERAS, None, (how,) if note is None else (how, note))
+    return ViewSet(cameras, None, train, held_out, AUTO_CAMERAS, None, (how,) if note is None else (how, note))
 
 
 def _images(options: ViewOptions, companions: Companions) -> Path | None:
@@ -108,7 +108,7 @@ def _images(options: ViewOptions, companions: Companions) -> Path | None:
     return companions.images
 
 
-def views_info(views: Views) -> ViewsInfo:
+def views_info(views: ViewSet) -> ViewsInfo:
     """The record of the views; width and height are the largest."""
     return ViewsInfo(
         cameras=views.cameras_from,

@@ -6,7 +6,7 @@ import numpy as np
 
 from flexgs_edge.memory.ordered import stable_order
 from flexgs_edge.memory.rows import blocks, put_rows, read_rows
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 
 
 def morton(cells: np.ndarray) -> np.ndarray:
@@ -20,18 +20,18 @@ def morton(cells: np.ndarray) -> np.ndarray:
     return index
 
 
-def near_rows(means: np.ndarray, room: Room = MEMORY) -> np.ndarray:
+def near_rows(means: np.ndarray, storage: Storage = IN_MEMORY) -> np.ndarray:
     """[n] i64: rows of `means` ([3, n]) along a Morton curve, so that neighbours on it are near each other."""
     # By rank along each axis: a few far rows do not squeeze the rest into one cell.
     count = means.shape[1]
-    cells, index = room.empty(means.shape, np.int16), room.empty((count,), np.uint64)
+    cells, index = storage.empty(means.shape, np.int16), storage.empty((count,), np.uint64)
     for line, ranks in zip(means, cells, strict=True):
-        order = stable_order(line, room)
+        order = stable_order(line, storage)
         for part in blocks(count):
             ranks[order[part]] = np.arange(part.start, part.stop) * 1024 // count
     for part in blocks(count):
         put_rows(index, part, morton(read_rows(cells, part)))
-    return stable_order(index, room)
+    return stable_order(index, storage)
 
 
 def _spread(bits: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.memory.rows import BLOCK_ROWS, copy_all_rows, put_rows
-from flexgs_edge.memory.storage import Room
+from flexgs_edge.memory.storage import Storage
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
 
 Planes = dict[str, np.ndarray]
@@ -180,10 +180,10 @@ def as_range(rows: np.ndarray) -> slice | None:
     return None
 
 
-def read_all(source: SceneSource, room: Room) -> Planes:
-    """All values of a scene, {field: [width, N] f32}, in arrays of `room`."""
-    planes = {field: room.empty((source.width(field), source.count), np.float32) for field in FIELD}
-    if not room.spills:
+def read_all(source: SceneSource, storage: Storage) -> Planes:
+    """All values of a scene, {field: [width, N] f32}, in arrays of `storage`."""
+    planes = {field: storage.empty((source.width(field), source.count), np.float32) for field in FIELD}
+    if not storage.spills:
         return source.read(slice(0, source.count), list(FIELD), planes)
     for rows in source.chunks(BLOCK_ROWS):
         for field, values in source.read(rows, list(FIELD)).items():

@@ -28,7 +28,7 @@ from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.open_bench import Workspace
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.plan import EVERYTHING, Plan
-from flexgs_edge.run.view_set import Views, find_views
+from flexgs_edge.run.view_set import ViewSet, find_views
 from flexgs_edge.studies.result_tables import Cell
 
 LOG = logging.getLogger("flexgs_edge")
@@ -81,7 +81,7 @@ class Bench:
         self,
         name: str,
         scene: Scene,
-        views: Views,
+        views: ViewSet,
         plan: Plan,
         options: CompressOptions,
         workspace: Workspace,

@@ -25,7 +25,7 @@ class Drawn:
 
     parts: list[Part]
     picture: np.ndarray | None
-    """[3, H, W] f16, as `TargetViews` keeps it: half the bytes to be sent."""
+    """[3, H, W] f16, as `References` keeps it: half the bytes to be sent."""
 
 
 def view_sums(renderer: Renderer, scene: DeviceScene, kind: str, camera: Camera, target: np.ndarray | None) -> Any:

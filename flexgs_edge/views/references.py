@@ -21,7 +21,7 @@ def to_half(values: np.ndarray) -> np.ndarray:
     return np.clip(values, -HALF_LARGEST, HALF_LARGEST).astype(np.float16)
 
 
-class TargetViews:
+class References:
     """Renders of one scene from some cameras, as `Renderer.residual_sums` wants them.
 
     Half precision (11 bits) is finer than the 8 bits that any viewer shows. The file is read with plain reads: a mapped file
@@ -46,7 +46,7 @@ class TargetViews:
         cameras: Sequence[Camera],
         scratch: str | Path | None = None,
         progress: Progress = SILENT,
-    ) -> TargetViews:
+    ) -> References:
         """All views of `scene` from `cameras`."""
         views = cls(scratch)
         try:
@@ -79,7 +79,7 @@ class TargetViews:
         """Remove the scratch file."""
         self._file.close()
 
-    def __enter__(self) -> TargetViews:
+    def __enter__(self) -> References:
         return self
 
     def __exit__(self, *exc: object) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.kernels.backend import Backend
-from flexgs_edge.memory.storage import Room
+from flexgs_edge.memory.storage import Storage
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
@@ -44,10 +44,10 @@ class _Dense:
 class _Spool:
     """What the rows of a scene got in some views, in a scratch file: view by view, rows ascending."""
 
-    def __init__(self, room: Room, starts: np.ndarray) -> None:
-        self._room, self._starts = room, starts
+    def __init__(self, storage: Storage, starts: np.ndarray) -> None:
+        self._storage, self._starts = storage, starts
         self._record: np.dtype[Any] | None = None
-        self._file: BinaryIO = room.file()
+        self._file: BinaryIO = storage.file()
         self._disk = ThreadPoolExecutor(1, "sums")
         """Writes and reads it, one block at a time, while the next is gathered or the one before is added."""
         self._end = self._counted = 0
@@ -70,8 +70,8 @@ class _Spool:
             written.result()
             self._disk.submit(self._file.flush).result()
         except OSError as error:
-            raise self._room.full(self._end - start, error) from error
-        self._room.count(self._end - self._counted)
+            raise self._storage.full(self._end - start, error) from error
+        self._storage.count(self._end - self._counted)
         self._counted = self._end
         self._views.append((camera, start, before))
 
@@ -109,4 +109,4 @@ class _Spool:
         """Remove the file."""
         self._disk.shutdown()
         self._file.close()
-        self._room.count(-self._counted)
+        self._storage.count(-self._counted)

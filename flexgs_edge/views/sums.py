@@ -72,7 +72,7 @@ class ViewSums:
         Yields
         ------
         callable
-            Gives the view for `TargetViews.add`; valid until the next step.
+            Gives the view for `References.add`; valid until the next step.
         """
         renderer, scene, cluster = self._renderer, self._scene, self._renderer.ready_cluster
         if cluster is None or scene.source is None:
@@ -104,7 +104,7 @@ class ViewSums:
     def _add_drawn(self, parts: Sequence[Part], camera: Camera) -> None:
         """Add a view that was drawn elsewhere."""
         renderer, scene = self._renderer, self._scene
-        if renderer.room.spills:
+        if renderer.storage.spills:
             self._add_parts(parts, camera)
             return
         if not parts:  # a compact view of nothing
@@ -128,7 +128,7 @@ class ViewSums:
 
     def _add_parts(self, parts: Iterable[Part], camera: Camera) -> None:
         if self._spool is None:
-            self._spool = _Spool(self._renderer.room, self._scene.starts)
+            self._spool = _Spool(self._renderer.storage, self._scene.starts)
         self._spool.add(parts, camera)
 
     def parts(self) -> Iterator[tuple[slice, list[Any]]]:

@@ -17,10 +17,10 @@ from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
-from flexgs_edge.commands.reduced import DROPPED, ONE_LESS, lesser_scenes
+from flexgs_edge.commands.reduced import DROPPED, ONE_LESS, reduced_scenes
 from flexgs_edge.commands.worth import worth, worth_text
 from flexgs_edge.errors import InputError
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.packed.quantize import quantize_scene
 from flexgs_edge.scene.fields import FIELD
@@ -29,7 +29,7 @@ from synthetic import random_scene
 from tiny_project import write_cameras
 
 COUNT, DEGREE = 120, 2
-STEPS = Steps(2**-6, 2**-3, 2**-6, 2**-2, 2**-4, (2**-4, 2**-4))
+STEPS = StepSizes(2**-6, 2**-3, 2**-6, 2**-2, 2**-4, (2**-4, 2**-4))
 """Powers of two: of a value and twice the step, both ways there and back are exact."""
 VIEWS: dict[str, Any] = {"device": "numpy", "resolution": 24}
 
@@ -110,7 +110,7 @@ def test_version_1_saves_what_its_arrays_take(folder: Path, found: dict[str, dic
     assert item(record, "opacity", ONE_LESS)["bytes_saved"] == COUNT * 4 // 8 - (COUNT * 3 + 7) // 8
     assert item(record, "rest", DROPPED)["bytes_saved"] == rest["bytes"]
     assert item(record, "rest from 2", DROPPED)["bytes_saved"] == rest["bytes"] * 15 // 24, "15 of 24 coefficients"
-    lessers = {(one.channel, one.change): one for one in lesser_scenes(open_fgs(folder / "1.fgs"))}
+    lessers = {(one.channel, one.change): one for one in reduced_scenes(open_fgs(folder / "1.fgs"))}
     old, new = read(open_fgs(folder / "1.fgs")), read(lessers["rest from 2", DROPPED].make()[1])
     np.testing.assert_array_equal(new["sh_rest"].reshape(3, 3, COUNT), old["sh_rest"].reshape(3, 8, COUNT)[:, :3])
     flat = read(lessers["dc", DROPPED].make()[1])["sh_dc"]

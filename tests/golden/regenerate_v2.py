@@ -15,7 +15,7 @@ import numpy as np
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.scene.fields import FIELDS
 
@@ -33,7 +33,7 @@ def golden_grid() -> GridScene:
     planes["opacity_logits"][0, 5] = 1e5  # an escape
     planes["means"][:, 7] = planes["means"][:, 8]  # a repeat
     degrees, layer = np.arange(400) // 7 % 3, np.arange(400) % 2
-    return to_grid(planes, degrees, Steps(0.125, 0.25, 0.0625, 0.5, 0.125, (0.25, 0.5)), (0.1, -2.0, 1e6), layer)[0]
+    return to_grid(planes, degrees, StepSizes(0.125, 0.25, 0.0625, 0.5, 0.125, (0.25, 0.5)), (0.1, -2.0, 1e6), layer)[0]
 
 
 def main() -> None:

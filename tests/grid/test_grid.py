@@ -11,7 +11,7 @@ import pytest
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.on_grid import grid_comment, lowered, on_grid, steps_of
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.scene.curve import morton
@@ -161,13 +161,13 @@ def test_rows_that_do_not_fit(degrees: np.ndarray, layer: np.ndarray | None, mes
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, 1e-30, 1e30])
 def test_steps_out_of_range(value: float) -> None:
     with pytest.raises(InputError, match="step of scale: expected"):
-        Steps(0.1, value, 0.1, 0.1, 0.1)
+        StepSizes(0.1, value, 0.1, 0.1, 0.1)
 
 
 def test_steps_through_json() -> None:
-    steps = Steps(0.1, 0.2, 0.3, 0.4, 0.5, (0.6, 0.7))
+    steps = StepSizes(0.1, 0.2, 0.3, 0.4, 0.5, (0.6, 0.7))
     assert steps.position == float(np.float32(0.1))
-    assert Steps.from_json(json.loads(json.dumps(steps.to_json()))) == steps
+    assert StepSizes.from_json(json.loads(json.dumps(steps.to_json()))) == steps
     assert isinstance(make_grid(3), GridScene)
 
 

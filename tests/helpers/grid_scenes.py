@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.scene.fields import FIELDS
 
-STEPS = Steps(0.05, 0.25, 0.05, 0.4, 0.1, (0.2, 0.25, 0.3, 0.3))
+STEPS = StepSizes(0.05, 0.25, 0.05, 0.4, 0.1, (0.2, 0.25, 0.3, 0.3))
 
 
 def make_planes(count: int, sh_degree: int = 2, seed: int = 0) -> dict[str, np.ndarray]:
@@ -21,7 +21,7 @@ def make_planes(count: int, sh_degree: int = 2, seed: int = 0) -> dict[str, np.n
     return planes
 
 
-def make_grid(count: int, sh_degree: int = 2, seed: int = 0, layers: int = 1, steps: Steps = STEPS) -> GridScene:
+def make_grid(count: int, sh_degree: int = 2, seed: int = 0, layers: int = 1, steps: StepSizes = STEPS) -> GridScene:
     """Rows of every degree up to `sh_degree`, in `layers` layers."""
     rng = np.random.default_rng(seed + 1)
     degrees = rng.integers(0, sh_degree + 1, count)

@@ -10,7 +10,7 @@ from test_kernels_twins import padded_target
 
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.methods.best.refit.descent import ORDER, Descent
@@ -24,7 +24,7 @@ from synthetic import look_from, make_camera, random_scene
 Planes = dict[str, np.ndarray]
 BACKGROUND = (0.1, 0.5, 0.9)
 RATES = {"means": 1e-2, **FIELD_RATES}
-STEPS = Steps(0.01, 0.1, 0.03, 0.2, 0.05, (0.04, 0.05, 0.06, 0.07))
+STEPS = StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04, 0.05, 0.06, 0.07))
 CHANGE = 1e-5
 """Of a value, for finite differences in float64: their own error is about its square."""
 
@@ -132,7 +132,7 @@ def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: 
 def test_views_are_drawn_from_what_a_file_gives_back() -> None:
     """Values on the grid on the device are those of `from_grid`, but where float32 divides to the other side of a half."""
     planes = planes_of(300, 5, 3)
-    fine = Steps(1e-5, 1e-6, 1e-6, 1e-6, 1e-6, (1e-6,) * 3)
+    fine = StepSizes(1e-5, 1e-6, 1e-6, 1e-6, 1e-6, (1e-6,) * 3)
     degrees = np.full(300, 3, np.uint8)
     planes = from_grid(to_grid(planes, degrees, fine, np.zeros(3))[0])  # quaternions in the grid's own form
     steps = replace(STEPS, sh=STEPS.sh[:3])

@@ -20,7 +20,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.check import SH_LARGEST, check_scene
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.references import TargetViews
+from flexgs_edge.views.references import References
 from kernel_fixtures import ALL_FORMS, FORMS, PairedBackend, count, draw, large_budget, open_form, same_bits
 from reference_renderer import Reference
 from synthetic import look_from, make_camera, random_scene
@@ -88,7 +88,7 @@ def sums_of(backend: Backend, name: str, source: MemorySource) -> np.ndarray:
     """[6, N] i64: weights, residuals of three channels against the halved image, costs of removal, squared weights."""
     extreme = EXTREMES[name]
     renderer = Renderer(backend, large_budget(), background=(0.2, 0.5, 1.0), antialiased=extreme.antialiased)
-    with renderer.load(source) as scene, TargetViews() as targets:
+    with renderer.load(source) as scene, References() as targets:
         targets.add(0, renderer.render_planes(scene, extreme.camera) / 2)
         sums = renderer.read_sums(
             renderer.residual_and_removal_sums(scene, extreme.camera, targets[0]), 6, source.count
@@ -137,7 +137,7 @@ def test_a_row_at_the_camera_leaves_no_trace(form: str) -> None:
     arrays["means"][:, 3] = 0
     source, cameras = MemorySource(arrays, 2), [make_camera(33, 20)] * 2
     renderer = Renderer(PairedBackend(open_form(form), 3), large_budget())
-    with renderer.load(source) as scene, TargetViews.of(renderer, scene, cameras) as targets:
+    with renderer.load(source) as scene, References.of(renderer, scene, cameras) as targets:
         costs = measure_costs(renderer, scene, cameras)
         planes = {**arrays, "sh_dc": arrays["sh_dc"] / 2}
         mended = refit_colours(renderer, planes, np.full(16, 2), np.zeros(3), cameras, targets, rounds=2)
@@ -194,7 +194,7 @@ def test_any_rows(
     camera = make_camera(*size, rotation=rotation, translation=translation)
     paired = PairedBackend(open_form(form), 3)
     renderer = Renderer(paired, large_budget(), antialiased=antialiased)
-    with renderer.load(source) as scene, TargetViews() as targets:
+    with renderer.load(source) as scene, References() as targets:
         image = renderer.render_planes(scene, camera)
         assert np.isfinite(image).all() and image.min() >= 0
         targets.add(0, image[:, ::-1] / 3)

@@ -23,7 +23,7 @@ from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.codec.v2.decode import decode_chunk
 from flexgs_edge.codec.v2.device.decode_kernel import ChunkKernel
 from flexgs_edge.codec.v2.grid_source import GridSource
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.methods.best.costs import measure_costs
@@ -111,7 +111,7 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
     yield planes["sh_dc"]
     yield planes["sh_rest"]
     with Descent(drawer, planes, np.full(source.count, 4), source.origin, camera) as descent:
-        descent.put_on(Steps(0.01, 0.1, 0.03, 0.2, 0.05, (0.04,) * 4))
+        descent.put_on(StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04,) * 4))
         descent.step(camera, targets[0], {"means": 1e-2, **FIELD_RATES})
         yield from descent.planes().values()
 

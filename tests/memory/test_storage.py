@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from flexgs_edge.errors import BudgetError, InputError
-from flexgs_edge.memory import rows as mapped
-from flexgs_edge.memory import storage
+from flexgs_edge.memory import rows as memory_rows
+from flexgs_edge.memory import storage as storage_module
 from flexgs_edge.memory.ordered import stable_order
 from flexgs_edge.memory.rows import copy_rows, put_rows, read_rows
-from flexgs_edge.memory.storage import MEMORY, Room, Scratch, file_system_of
+from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage, file_system_of
 from flexgs_edge.methods.best.checkpoint import Checkpoint
 from flexgs_edge.methods.best.rounds import lowest
 
@@ -26,26 +26,26 @@ COUNT = 40_000
 
 
 @pytest.fixture(params=["memory", "files"])
-def room(request: pytest.FixtureRequest, tmp_path: Path) -> Room:
-    return MEMORY if request.param == "memory" else Scratch(tmp_path)
+def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Storage:
+    return IN_MEMORY if request.param == "memory" else ScratchStorage(tmp_path)
 
 
-def test_take_and_copy(room: Room) -> None:
+def test_take_and_copy(storage: Storage) -> None:
     rng = np.random.default_rng(1)
     rows = np.sort(rng.choice(COUNT, 30_000, replace=False))
     for values in (rng.normal(size=COUNT), rng.normal(size=(3, 4, COUNT)), rng.normal(size=(2, COUNT))):
-        np.testing.assert_array_equal(room.take(values, rows), values[..., rows])
-        copied = room.copy(values[..., ::2])
+        np.testing.assert_array_equal(storage.take(values, rows), values[..., rows])
+        copied = storage.copy(values[..., ::2])
         np.testing.assert_array_equal(copied, values[..., ::2])
         assert copied.flags.c_contiguous and copied.flags.writeable
-    assert room.take(np.zeros((0, COUNT)), rows).shape == (0, len(rows))
-    assert room.empty((3, 0), np.float32).shape == (3, 0)
+    assert storage.take(np.zeros((0, COUNT)), rows).shape == (0, len(rows))
+    assert storage.empty((3, 0), np.float32).shape == (3, 0)
 
 
 @pytest.mark.parametrize("shape", [(COUNT,), (3, COUNT), (2, 4, COUNT)])
-def test_copied_rows_are_those_of_the_array(room: Room, shape: tuple[int, ...]) -> None:
+def test_copied_rows_are_those_of_the_array(storage: Storage, shape: tuple[int, ...]) -> None:
     """Of a whole array and of some of its planes, into planes that are not next to each other, and into every second element."""
-    held = room.copy(np.random.default_rng(2).normal(size=shape).astype(np.float32))
+    held = storage.copy(np.random.default_rng(2).normal(size=shape).astype(np.float32))
     held[..., 7] = 5  # not on the disk yet
     for values in (held, held[1:]) if held.ndim > 1 else (held,):
         for start, stop in ((0, COUNT), (5, 4097), (COUNT - 1, COUNT), (9, 9)):
@@ -59,12 +59,12 @@ def test_copied_rows_are_those_of_the_array(room: Room, shape: tuple[int, ...]) 
 @pytest.mark.parametrize("cached", [True, False])
 @pytest.mark.parametrize("shape", [(COUNT,), (3, COUNT), (2, 4, COUNT)])
 def test_rows_that_are_put_are_read(
-    room: Room, shape: tuple[int, ...], cached: bool, monkeypatch: pytest.MonkeyPatch
+    storage: Storage, shape: tuple[int, ...], cached: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whether they are in the kernel's cache or not, by the accessors and through the pages."""
-    monkeypatch.setattr(mapped, "is_cached", lambda address, size: cached)
+    monkeypatch.setattr(memory_rows, "is_cached", lambda address, size: cached)
     expected = np.random.default_rng(3).normal(size=shape).astype(np.float32)
-    held = room.copy(expected)
+    held = storage.copy(expected)
     for start, stop in ((0, COUNT), (5, 4097), (COUNT - 1, COUNT), (9, 9)):
         rows = slice(start, stop)
         np.testing.assert_array_equal(read_rows(held, rows), expected[..., rows])
@@ -81,77 +81,77 @@ def test_rows_that_are_put_are_read(
         np.testing.assert_array_equal(held, expected)
 
 
-def test_rows_in_any_order_are_taken(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_in_any_order_are_taken(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
     """From a plane that is read as a whole, where memory holds it; else rows far apart are looked up through the pages."""
-    values = room.copy(np.random.default_rng(4).normal(size=(3, COUNT)))
+    values = storage.copy(np.random.default_rng(4).normal(size=(3, COUNT)))
     fetched = []
-    monkeypatch.setattr(mapped, "fetch", lambda plane, rows: fetched.append(rows))
+    monkeypatch.setattr(memory_rows, "fetch", lambda plane, rows: fetched.append(rows))
     for whole in (storage.WHOLE_BYTES, 0):
-        monkeypatch.setattr(room, "whole_bytes", whole)
+        monkeypatch.setattr(storage, "whole_bytes", whole)
         for rows, apart in (
             (np.arange(0, COUNT, 2), False),
             (np.array([5, COUNT - 1, 7]), True),
             (np.arange(0), False),
         ):
             fetched.clear()
-            np.testing.assert_array_equal(room.take(values, rows), values[:, rows])
-            assert bool(fetched) is (apart and room.spills and not whole)
+            np.testing.assert_array_equal(storage.take(values, rows), values[:, rows])
+            assert bool(fetched) is (apart and storage.spills and not whole)
             np.testing.assert_array_equal(mapped.read_listed(values, rows), values[:, rows])
 
 
 def test_larger_planes_are_held_where_the_limit_is_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(storage, "WHOLE_BYTES", 0)
-    monkeypatch.setattr(mapped, "fetch", lambda *_: pytest.fail("looked up through the pages"))
-    room = Scratch(tmp_path, 16 * 8 * COUNT)
-    values, rows = room.copy(np.random.default_rng(5).normal(size=(2, COUNT))), np.array([5, COUNT - 1, 7])
-    np.testing.assert_array_equal(room.take(values, rows), values[:, rows])
+    monkeypatch.setattr(storage_module, "WHOLE_BYTES", 0)
+    monkeypatch.setattr(memory_rows, "fetch", lambda *_: pytest.fail("looked up through the pages"))
+    storage = ScratchStorage(tmp_path, 16 * 8 * COUNT)
+    values, rows = storage.copy(np.random.default_rng(5).normal(size=(2, COUNT))), np.array([5, COUNT - 1, 7])
+    np.testing.assert_array_equal(storage.take(values, rows), values[:, rows])
 
 
 def test_a_part_is_fetched_plane_by_plane(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    advise = mapped.MappedFile.madvise
+    advise = memory_rows.MappedFile.madvise
 
-    def note(self: mapped.MappedFile, *words: int) -> None:
+    def note(self: memory_rows.MappedFile, *words: int) -> None:
         asked.append(words)
         advise(self, *words)
 
-    values = Scratch(tmp_path).empty((3, 4, 10_000), np.float32)
+    values = ScratchStorage(tmp_path).empty((3, 4, 10_000), np.float32)
     numbers = values.reshape(-1)
     numbers[:] = np.arange(numbers.size)
-    monkeypatch.setattr(mapped.MappedFile, "madvise", note)
+    monkeypatch.setattr(memory_rows.MappedFile, "madvise", note)
     for view in (values, values[1:, ::2, 5:], values.reshape(12, -1)[3:5], numbers):
         asked.clear()
-        mapped.fetch(view, slice(2_100, 5_000))
+        memory_rows.fetch(view, slice(2_100, 5_000))
         pieces = [numbers[start // 4 : (start + length) // 4] for _, start, length in asked]
         got = set(np.concatenate(pieces).astype(int).tolist())
         part = view[..., 2_100:5_000]
         assert got >= set(part.reshape(-1).astype(int).tolist())
         assert len(got) <= part.size + len(pieces) * mmap.PAGESIZE // 4
     asked.clear()
-    mapped.fetch(np.zeros((3, 4)), slice(0, 4))
-    mapped.fetch(values[:, :0], slice(0, 4))
+    memory_rows.fetch(np.zeros((3, 4)), slice(0, 4))
+    memory_rows.fetch(values[:, :0], slice(0, 4))
     assert not asked
 
 
 def test_files_are_gone_with_their_arrays(tmp_path: Path) -> None:
-    room = Scratch(tmp_path)
-    first, second = room.empty((1 << 17,), np.uint8), room.empty((1 << 18,), np.float64)
+    storage = ScratchStorage(tmp_path)
+    first, second = storage.empty((1 << 17,), np.uint8), storage.empty((1 << 18,), np.float64)
     part = second[100:]
-    assert room.used == room.peak == 17 << 17 and not list(tmp_path.iterdir())
+    assert storage.used == storage.peak == 17 << 17 and not list(tmp_path.iterdir())
     first[:] = 7
     del first, second
     gc.collect()
-    assert room.used == 1 << 21, "a view keeps its file"
+    assert storage.used == 1 << 21, "a view keeps its file"
     del part
     gc.collect()
-    assert room.used == 0 and room.peak == 17 << 17
-    room.close()
+    assert storage.used == 0 and storage.peak == 17 << 17
+    storage.close()
 
 
 def test_small_arrays_stay_in_memory(tmp_path: Path) -> None:
-    room = Scratch(tmp_path)
-    room.empty((100,), np.float64)
-    assert room.peak == 0
+    storage = ScratchStorage(tmp_path)
+    storage.empty((100,), np.float64)
+    assert storage.peak == 0
 
 
 def test_a_kill_leaves_nothing(tmp_path: Path) -> None:
@@ -165,8 +165,8 @@ def test_a_kill_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    room = Scratch(tmp_path)
-    held = room.empty((1 << 20,), np.uint8)
+    storage = ScratchStorage(tmp_path)
+    held = storage.empty((1 << 20,), np.uint8)
 
     def full(descriptor: int, offset: int, size: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -175,30 +175,30 @@ def test_a_full_disk_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(
         BudgetError, match=r"disk is full: scratch files hold 1\.05 MB there, 2\.10 MB more .*--scratch"
     ):
-        room.empty((1 << 21,), np.uint8)
-    assert room.used == len(held) and not list(tmp_path.iterdir())
+        storage.empty((1 << 21,), np.uint8)
+    assert storage.used == len(held) and not list(tmp_path.iterdir())
 
 
 def test_other_failures_are_errors_of_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    room = Scratch(tmp_path)
+    storage = ScratchStorage(tmp_path)
 
     def broken(descriptor: int, offset: int, size: int) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(os, "posix_fallocate", broken)
     with pytest.raises(InputError, match="cannot make a scratch file of 2097152 bytes"):
-        room.empty((1 << 21,), np.uint8)
+        storage.empty((1 << 21,), np.uint8)
 
 
 def test_no_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no scratch file can be made there"):
-        Scratch(tmp_path / "nothing")
+        ScratchStorage(tmp_path / "nothing")
 
 
 def test_a_folder_in_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(storage, "file_system_of", lambda folder: "tmpfs")
+    monkeypatch.setattr(storage_module, "file_system_of", lambda folder: "tmpfs")
     with pytest.raises(InputError, match="lies in memory itself"):
-        Scratch(tmp_path)
+        ScratchStorage(tmp_path)
 
 
 def test_kinds_of_file_systems(tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_kinds_of_file_systems(tmp_path: Path) -> None:
 def test_orders_in_parts_are_stable(tmp_path: Path, values: int) -> None:
     keys = np.random.default_rng(values).integers(0, values, COUNT).astype(np.uint64)
     expected = np.argsort(keys, kind="stable")
-    np.testing.assert_array_equal(stable_order(keys, Scratch(tmp_path), rows=1000), expected)
+    np.testing.assert_array_equal(stable_order(keys, ScratchStorage(tmp_path), rows=1000), expected)
     np.testing.assert_array_equal(stable_order(keys), expected)
 
 
@@ -233,7 +233,7 @@ def test_the_lowest_are_those_that_a_stable_sort_puts_first(values: int) -> None
         np.testing.assert_array_equal(lowest(costs, count), expected)
 
 
-def test_checkpoints(room: Room, tmp_path: Path) -> None:
+def test_checkpoints(storage: Storage, tmp_path: Path) -> None:
     checkpoint = Checkpoint(tmp_path / "kept")
     arrays = {"a": np.arange(12.0).reshape(2, 2, 3), "b": np.arange(5), "c": np.zeros((0, 7), np.float32)}
     assert checkpoint.rounds == 0
@@ -242,7 +242,7 @@ def test_checkpoints(room: Room, tmp_path: Path) -> None:
     (checkpoint.folder / "round-1" / "done").unlink()
     again = Checkpoint(tmp_path / "kept")
     assert again.rounds == 1 and not again.has(1)
-    for name, values in again.load(0, room).items():
+    for name, values in again.load(0, storage).items():
         np.testing.assert_array_equal(values, arrays[name])
         assert values.dtype == arrays[name].dtype and values.shape == arrays[name].shape
     again.remove()

@@ -17,7 +17,7 @@ from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import Backend, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.memory.storage import Scratch
+from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.render import ahead, fit
 from flexgs_edge.render.chunks import SourcePlanes
 from flexgs_edge.render.device_scene import DeviceScene
@@ -42,7 +42,7 @@ def spilling(folder: Path, form: str = "numpy", budget: MemoryBudget | None = No
     budget = budget or large_budget()
     backend = TwinBackend(budget) if form == "numpy" else OpenCLBackend(default_device(), budget)
     renderer = Renderer(backend, budget)
-    renderer.room = Scratch(folder)
+    renderer.storage = ScratchStorage(folder)
     return renderer
 
 
@@ -149,9 +149,12 @@ def test_a_loop_that_is_left_leaves_nothing(compact: None, tmp_path: Path) -> No
             [view.count for view in renderer._ahead._waiting],
         )
         assert len(files) == 3 and not any(file.closed for file in files)
-        assert isinstance(renderer.room, Scratch) and renderer.room.used == sum(shown) * ahead.AHEAD_ROW_BYTES > 0
+        assert (
+            isinstance(renderer.storage, ScratchStorage)
+            and renderer.storage.used == sum(shown) * ahead.AHEAD_ROW_BYTES > 0
+        )
         del turns
-        assert all(file.closed for file in files) and renderer.room.used == 0
+        assert all(file.closed for file in files) and renderer.storage.used == 0
     renderer.release()
     assert renderer.budget.used == used
 

@@ -20,14 +20,14 @@ from flexgs_edge.cli.study.rate import RATIOS, command
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import min_ratio
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.io.exchange import read_foreign, write_foreign
 from flexgs_edge.io.formats import FORMATS
 from flexgs_edge.methods.best.allocation import BitModel, choose
 from flexgs_edge.methods.best.costs import RemovalCosts
-from flexgs_edge.methods.best.method import open_path
-from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.methods.best.method import open_rounds
+from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.paper.prune import ranks_from_order
 from flexgs_edge.progress import SILENT
 from flexgs_edge.report.plots import LineChart, Series, draw, picture
@@ -201,16 +201,16 @@ def test_a_ratio_out_of_reach_is_said(bench: Bench, project: Path) -> None:
 def test_ranks_decide_who_goes_and_costs_how_many(bench: Bench) -> None:
     order = np.random.default_rng(5).permutation(COUNT)
 
-    def walk(make: object) -> PrunePath:
+    def walk(make: object) -> PruneRounds:
         cameras = bench.views.of(bench.views.train)
         workspace = bench.workspace
-        with open_path(
+        with open_rounds(
             workspace.renderer, bench.scene.source, cameras, OPTIONS, workspace.budget, workspace.clock, make=make
         ) as path:  # type: ignore[arg-type]
             path.descend(0.8)
         return path
 
-    path = walk(PrunePath)
+    path = walk(PruneRounds)
     measured, ranks = path.snapshots, ranks_from_order(order)[path.rows]
     ranked = walk(lambda *w, **m: ablations.RankedPath(*w, order=order, **m)).snapshots
     seen = measured[0].costs.weight2 > 0
@@ -255,7 +255,7 @@ def test_choosing_among_all_degrees_is_the_methods_own_choice() -> None:
 def test_coders_sizes() -> None:
     count = 600
     planes = random_scene(count, 12, 1).read(slice(0, count), list(FIELD))
-    steps = Steps(position=0.01, scale=0.1, rotation=0.05, opacity=0.2, dc=0.05, sh=(0.1,))
+    steps = StepSizes(position=0.01, scale=0.1, rotation=0.05, opacity=0.2, dc=0.05, sh=(0.1,))
     degrees = (np.arange(count) % 2).astype(np.uint8)
     grid, _ = to_grid(planes, degrees, steps, np.zeros(3))
     sizes = coders.plane_sizes(grid)

@@ -21,7 +21,7 @@ from flexgs_edge.cli import app
 from flexgs_edge.cli.study.stability import command
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import MaxDrop, MaxSize
-from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.progress import SILENT
 from flexgs_edge.quality.psnr import mse
 from flexgs_edge.render.renderer import Renderer
@@ -191,7 +191,7 @@ def test_a_bit_is_worth_the_same_in_each_pixel_of_fewer(bench: Bench) -> None:
     """Poses of a fourth of the pixels get a fourth of the multiplier."""
     given: list[float] = []
 
-    def whole_at(bench: Bench, path: PrunePath, judge: Judge, multiplier: float) -> Whole:
+    def whole_at(bench: Bench, path: PruneRounds, judge: Judge, multiplier: float) -> Whole:
         given.append(multiplier)
         return ours.whole_at(bench, path, judge, multiplier)
 

@@ -16,7 +16,7 @@ from flexgs_edge._version import __version__
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import write_ply
-from flexgs_edge.memory.storage import MEMORY
+from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.methods.best.costs import PART_NAMES, cost_parts, cost_sums, measure_costs, put_costs
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.views import cluster, worker
@@ -105,7 +105,7 @@ def test_a_view_of_nothing_adds_nothing() -> None:
             sums.add_view(renderer.removal_sums(scene, cameras()[0]), cameras()[0])
             if drawn:
                 sums._add_drawn([], cameras()[-1])
-            costs = cost_parts(1, scene.count, MEMORY)
+            costs = cost_parts(1, scene.count, IN_MEMORY)
             for rows, (part,) in sums.parts():
                 put_costs(costs, rows, part)
             found.append([getattr(costs, name) for name in PART_NAMES])

@@ -24,7 +24,7 @@ from flexgs_edge.codec.v2.walk import ChunkCodes
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.files import atomic_write
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 
 VERSION = 2
 
@@ -40,7 +40,7 @@ def write_grid(
     chunk_rows: int = CHUNK_ROWS,
     device: Device | None = None,
     encoded: Encoded | None = None,
-    room: Room = MEMORY,
+    storage: Storage = IN_MEMORY,
 ) -> int:
     """Encode a grid scene into a file, which appears under its name only when it is complete.
 
@@ -60,7 +60,7 @@ def write_grid(
         Counts symbols, with the same result.
     encoded : Encoded, optional
         `encode_grid(grid, chunk_rows)`, where it is known already.
-    room : Room, optional
+    storage : Storage, optional
         Where symbols lie until they are written.
 
     Returns
@@ -68,7 +68,7 @@ def write_grid(
     int
         Bytes of the file, as `coded_size` predicts.
     """
-    encoded = encoded or encode_grid(grid, chunk_rows, device, room)
+    encoded = encoded or encode_grid(grid, chunk_rows, device, storage)
     model = encoded.model.to_bytes()
     header = _header(grid, encoded, len(model), settings, chunk_rows)
     with atomic_write(path, force) as file:
@@ -88,10 +88,10 @@ def coded_size(
     chunk_rows: int = CHUNK_ROWS,
     device: Device | None = None,
     encoded: Encoded | None = None,
-    room: Room = MEMORY,
+    storage: Storage = IN_MEMORY,
 ) -> int:
     """Exact bytes of the file that `write_grid` makes of these arguments."""
-    encoded = encoded or encode_grid(grid, chunk_rows, device, room)
+    encoded = encoded or encode_grid(grid, chunk_rows, device, storage)
     header = _header(grid, encoded, len(encoded.model.to_bytes()), settings, chunk_rows)
     return header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes
 
@@ -264,8 +264,8 @@ def verify_grid(path: str | os.PathLike[str], raise_errors: bool = True) -> list
     return found.check_chunks(container, table, container.read_table, chunks)
 
 
-def _wrong_length(length: int, room: int) -> str:
-    most = min(HEADER_MOST, room)
+def _wrong_length(length: int, left: int) -> str:
+    most = min(HEADER_MOST, left)
     return "" if length <= most else f"wanted at most {most}"
 
 

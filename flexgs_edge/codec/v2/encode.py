@@ -22,7 +22,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import POSITION_BITS
 from flexgs_edge.memory.rows import blocks, put_rows, read_rows
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.curve import morton
 
 SAMPLE_CHUNKS = 2
@@ -31,7 +31,7 @@ SAMPLE_ROWS = 16384
 """About as many rows of each of them are fitted to: all rows cost four times the time for 0.01 bits a Gaussian."""
 
 
-def cells_of(grid: GridScene, room: Room = MEMORY) -> tuple[np.ndarray, np.ndarray, int]:
+def cells_of(grid: GridScene, storage: Storage = IN_MEMORY) -> tuple[np.ndarray, np.ndarray, int]:
     """[n] u64 Morton indices, the lowest cell [3] i64, and the depth of the cube that holds the scene."""
     if grid.count == 0:
         return np.zeros(0, np.uint64), np.zeros(3, np.int64), 0
@@ -39,7 +39,7 @@ def cells_of(grid: GridScene, room: Room = MEMORY) -> tuple[np.ndarray, np.ndarr
     depth = int((grid.position.max(axis=1) - low).max()).bit_length()
     if depth > POSITION_BITS:
         raise InputError(f"position: the scene is 2^{depth} cells wide, expected at most 2^{POSITION_BITS}")
-    index = room.empty((grid.count,), np.uint64)
+    index = storage.empty((grid.count,), np.uint64)
     for rows in blocks(grid.count):
         put_rows(index, rows, morton(read_rows(grid.position, rows) - low[:, None]))
     sorted_ = True
@@ -116,14 +116,14 @@ class Encoded:
 
 
 def encode_grid(
-    grid: GridScene, chunk_rows: int = CHUNK_ROWS, device: Device | None = None, room: Room = MEMORY
+    grid: GridScene, chunk_rows: int = CHUNK_ROWS, device: Device | None = None, storage: Storage = IN_MEMORY
 ) -> Encoded:
     """Fit a model to a scene and count its symbols; `Encoded.streams` gives the chunks.
 
     Holds two or three bytes a coded number beside the grid itself; with a device, which gives the same result, a kilobyte
-    a row of as many chunks as it works on at once. The bytes for each number lie in `room`.
+    a row of as many chunks as it works on at once. The bytes for each number lie in `storage`.
     """
-    cells, low, depth = cells_of(grid, room)
+    cells, low, depth = cells_of(grid, storage)
     layers = np.bincount(grid.layer, minlength=1).tolist()
     chunks = plan_chunks(layers, chunk_rows)
     kinds = group_kinds(grid.sh_degree)
@@ -146,7 +146,7 @@ def encode_grid(
         else in_order(counted, chunks, thread_count(len(chunks)))
     )
     for port in ports:
-        batches.append(_put_away(port.batches, room))
+        batches.append(_put_away(port.batches, storage))
         count.add(port)
     merged = [merge_contexts(counts) for counts in count.counts]
     levels = [
@@ -163,12 +163,12 @@ def encode_grid(
     return Encoded(model, low, layers, chunks, batches, count.raw + np.array(list(costs)), device)
 
 
-def _put_away(batches: list[Batch], room: Room) -> list[Batch]:
-    """The batches of a chunk in one array of `room`."""
-    if not room.spills:
+def _put_away(batches: list[Batch], storage: Storage) -> list[Batch]:
+    """The batches of a chunk in one array of `storage`."""
+    if not storage.spills:
         return batches
     size = sum(len(c) + len(s) + sum(len(values) for _, values in raw) for _, c, s, raw in batches)
-    held, at = room.empty((size,), np.uint8), 0
+    held, at = storage.empty((size,), np.uint8), 0
 
     def put(values: np.ndarray) -> np.ndarray:
         nonlocal at

@@ -23,7 +23,7 @@ from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes, plan
 from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.step_sizes import POSITION_BITS, Steps
+from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
 
 HEADER_MOST = 1 << 20
 MODEL_MOST = 1 << 20
@@ -57,7 +57,7 @@ class GridHeader:
     origin : tuple of float
         World position that positions are relative to.
     steps : dict
-        `Steps.to_json`.
+        `StepSizes.to_json`.
     layers : tuple of int
         Rows of each layer.
     chunk_rows : int
@@ -135,9 +135,9 @@ class GridHeader:
         return replace(self, count=sum(kept), layers=kept, cut_from=source, channels=None).sealed()
 
     @property
-    def grid_steps(self) -> Steps:
+    def grid_steps(self) -> StepSizes:
         """The steps."""
-        return Steps.from_json(self.steps)
+        return StepSizes.from_json(self.steps)
 
     @property
     def chunk_count(self) -> int:
@@ -224,7 +224,7 @@ def _steps(value: object, sh_degree: int) -> dict[str, Any]:
     if not all(type(number) is float and math.isfinite(number) for number in numbers):
         raise HeaderError(f"steps: wanted finite numbers with a decimal point, got {_short(value)}")
     try:
-        steps = Steps.from_json(value).to_json()
+        steps = StepSizes.from_json(value).to_json()
     except (InputError, OverflowError) as error:
         raise HeaderError(f"steps: {error}") from None
     if steps != value:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.memory.rows import put_rows, read_ahead
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.costs import RemovalCosts
 
 SH_FACTOR = 2.0
@@ -92,7 +92,7 @@ def drop_bands(
     degrees: np.ndarray,
     sh_mean: np.ndarray,
     y0: float,
-    room: Room = MEMORY,
+    storage: Storage = IN_MEMORY,
 ) -> dict[str, np.ndarray]:
     """Rows of planes, without the SH above their degrees, whose mean colour is added to the constant.
 
@@ -112,12 +112,12 @@ def drop_bands(
     Returns
     -------
     dict
-        [width, m] f32 by field, in arrays of `room`.
+        [width, m] f32 by field, in arrays of `storage`.
     """
     top = len(sh_mean)
     if top == 0:
-        return {name: room.take(values, rows) for name, values in planes.items()}
-    kept = {name: room.empty((len(planes[name]), len(rows)), np.float32) for name in ("sh_dc", "sh_rest")}
+        return {name: storage.take(values, rows) for name, values in planes.items()}
+    kept = {name: storage.empty((len(planes[name]), len(rows)), np.float32) for name in ("sh_dc", "sh_rest")}
     # Taken and cleared at once: six million within 1 GiB wrote and read 0.5 GB more for each choice.
     for part, found in read_ahead(planes["means"].shape[1], sh_mean, planes["sh_dc"], planes["sh_rest"]):
         here = slice(*np.searchsorted(rows, (part.start, part.stop)).tolist())
@@ -130,4 +130,4 @@ def drop_bands(
         for level in range(1, top + 1):
             bands[:, level * level - 1 : (level + 1) ** 2 - 1] *= some >= level
         put_rows(kept["sh_rest"], here, bands.reshape(len(kept["sh_rest"]), len(some)))
-    return {name: kept[name] if name in kept else room.take(values, rows) for name, values in planes.items()}
+    return {name: kept[name] if name in kept else storage.take(values, rows) for name, values in planes.items()}

@@ -22,7 +22,7 @@ LARGEST_STRIDE = 1.2
 
 
 @dataclass(frozen=True)
-class RateStep:
+class Candidate:
     """One whole result that the search looked at.
 
     Parameters
@@ -58,17 +58,17 @@ class RateResult(Generic[Product]):
     """The answer of a search: what to write and the way to it."""
 
     product: Product
-    chosen: RateStep
+    chosen: Candidate
     reached: bool
-    steps: tuple[RateStep, ...]
+    steps: tuple[Candidate, ...]
 
 
-def misses(steps: Sequence[RateStep]) -> int:
+def misses(steps: Sequence[Candidate]) -> int:
     """How many of the last results missed the target."""
     return next((count for count, step in enumerate(reversed(steps)) if step.holds), len(steps))
 
 
-def bounds(steps: Sequence[RateStep], by_size: bool) -> tuple[float, float]:
+def bounds(steps: Sequence[Candidate], by_size: bool) -> tuple[float, float]:
     """Logs of the multipliers between which the answer lies, away from both ends; infinite where none is known.
 
     One end is the farthest result that holds, the other the nearest miss beyond it. Misses before it are void: refits go on
@@ -77,12 +77,12 @@ def bounds(steps: Sequence[RateStep], by_size: bool) -> tuple[float, float]:
     sign = -1.0 if by_size else 1.0
     low = max((sign * math.log(s.multiplier) for s in steps if s.holds), default=-math.inf)
     high = min((m for s in steps if not s.holds and (m := sign * math.log(s.multiplier)) > low), default=math.inf)
-    room = NEAREST * (high - low) if math.isfinite(high - low) else 0.0
-    ends = sign * (low + room), sign * (high - room)
+    away = NEAREST * (high - low) if math.isfinite(high - low) else 0.0
+    ends = sign * (low + away), sign * (high - away)
     return min(ends), max(ends)
 
 
-def next_multiplier(steps: Sequence[RateStep], target: Target) -> float:
+def next_multiplier(steps: Sequence[Candidate], target: Target) -> float:
     """Where the excess is expected to be just below zero, in the log of the multiplier."""
     slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
     return math.exp(next_point([(math.log(s.multiplier), s.excess) for s in steps], slope, LARGEST_STRIDE))

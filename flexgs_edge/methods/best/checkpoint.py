@@ -13,7 +13,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.files import DISK_FULL
 from flexgs_edge.memory.rows import blocks, read_rows
-from flexgs_edge.memory.storage import Room
+from flexgs_edge.memory.storage import Storage
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
 from flexgs_edge.methods.best.spill import LOG
 from flexgs_edge.render.renderer import Renderer
@@ -59,12 +59,12 @@ class Checkpoint:
             number += 1
         return number
 
-    def load(self, number: int, room: Room) -> dict[str, np.ndarray]:
-        """The arrays of a finished round, by name, in `room`."""
+    def load(self, number: int, storage: Storage) -> dict[str, np.ndarray]:
+        """The arrays of a finished round, by name, in `storage`."""
         arrays = {}
         for place in sorted(self._place(number).glob("*.npy")):
             held = np.load(place, mmap_mode="r", allow_pickle=False)
-            arrays[place.stem] = room.copy(held)
+            arrays[place.stem] = storage.copy(held)
         return arrays
 
     def save(self, number: int, arrays: Iterable[tuple[str, np.ndarray]]) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import CODE_LIMIT, SH_C0
-from flexgs_edge.grid.step_sizes import POSITION_BITS, Steps
+from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
 from flexgs_edge.memory.rows import COPY_ROWS, blocks, put_rows, read_ahead, read_rows
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.rotations import tilted, turned
@@ -64,7 +64,7 @@ def probe_slopes(
     per_row = {}
     for kind in GEOMETRY:
         field = CHANGES[kind]
-        moved = {**planes, field: renderer.room.empty(planes[field].shape, np.float32)}
+        moved = {**planes, field: renderer.storage.empty(planes[field].shape, np.float32)}
         for rows, found in read_ahead(count, *(planes[name] for name in CHANGES.values())):
             part = dict(zip(CHANGES.values(), found, strict=True))
             put_rows(moved[field], rows, _on_trial_grid(part, kind, np.float32(trial[kind])))
@@ -100,7 +100,9 @@ def _squared_error(image: np.ndarray, reference: np.ndarray) -> float:
     return float(np.vdot(difference.astype(np.float64), difference))
 
 
-def choose_steps(slopes: Slopes, weight2: np.ndarray, degrees: np.ndarray, sh_degree: int, multiplier: float) -> Steps:
+def choose_steps(
+    slopes: Slopes, weight2: np.ndarray, degrees: np.ndarray, sh_degree: int, multiplier: float
+) -> StepSizes:
     """Steps of every kind for a multiplier.
 
     Parameters
@@ -118,10 +120,10 @@ def choose_steps(slopes: Slopes, weight2: np.ndarray, degrees: np.ndarray, sh_de
 
     bands = tuple(colour(weight2[degrees >= max(level, 1)]) for level in range(1, sh_degree + 1))
     geometry = {kind: slopes.step(kind, multiplier) for kind in GEOMETRY}
-    return Steps(**geometry, dc=colour(weight2), sh=bands, chroma=CHROMA)
+    return StepSizes(**geometry, dc=colour(weight2), sh=bands, chroma=CHROMA)
 
 
-def holdable(steps: Steps, planes: dict[str, np.ndarray]) -> Steps:
+def holdable(steps: StepSizes, planes: dict[str, np.ndarray]) -> StepSizes:
     """`steps`, made coarser where the grid could not hold the planes' values: far outliers, or a multiplier near zero."""
 
     def finest(name: str, codes: int = CODE_LIMIT - 2) -> float:
@@ -131,7 +133,7 @@ def holdable(steps: Steps, planes: dict[str, np.ndarray]) -> Steps:
     least = 2.0**-70
     colours = CODE_LIMIT // 4  # Co reaches twice the coefficients, and refits move them
     finest_sh = finest("sh_rest", colours)
-    return Steps(
+    return StepSizes(
         position=max(steps.position, width / (2**POSITION_BITS - 2), finest("means"), least),
         scale=max(steps.scale, finest("log_scales"), least),
         rotation=max(steps.rotation, 2 / CODE_LIMIT),
@@ -154,7 +156,7 @@ def _ranges(planes: np.ndarray) -> list[tuple[np.float32, np.float32]]:
     return ranges
 
 
-def reachable(steps: Steps, planes: dict[str, np.ndarray], seen: np.ndarray) -> np.ndarray:
+def reachable(steps: StepSizes, planes: dict[str, np.ndarray], seen: np.ndarray) -> np.ndarray:
     """[n] bool: rows that a grid of these steps can hold beside those that some pose sees.
 
     One Gaussian far away, in no view, would ask for position steps as large as the scene is small beside it: five of them, a
@@ -177,7 +179,7 @@ def reachable(steps: Steps, planes: dict[str, np.ndarray], seen: np.ndarray) -> 
             np.minimum(low, some.min(axis=1, initial=np.inf)),
             np.maximum(high, some.max(axis=1, initial=-np.inf)),
         )
-    room = max((2**POSITION_BITS - 2) * steps.position, float((high - low).max()))
+    storage = max((2**POSITION_BITS - 2) * steps.position, float((high - low).max()))
     limits = {
         "log_scales": (CODE_LIMIT - 2) * steps.scale,
         "opacity_logits": (CODE_LIMIT - 2) * steps.opacity,
@@ -185,7 +187,7 @@ def reachable(steps: Steps, planes: dict[str, np.ndarray], seen: np.ndarray) -> 
     }
     every = seen.copy()
     for rows, (part, *others) in read_ahead(count, means, *(planes[name] for name in limits)):
-        inside = np.abs(part.astype(np.float64) - (low + high)[:, None] / 2).max(axis=0) <= room / 2
+        inside = np.abs(part.astype(np.float64) - (low + high)[:, None] / 2).max(axis=0) <= storage / 2
         for values, most in zip(others, limits.values(), strict=True):
             inside &= np.abs(values).max(axis=0) <= most
         every[rows] |= inside

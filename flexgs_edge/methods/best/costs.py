@@ -16,7 +16,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import FIXED_ERROR, FIXED_WEIGHT
 from flexgs_edge.memory.rows import put_rows, read_ahead
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.device_scene import DeviceScene
@@ -49,10 +49,10 @@ class RemovalCosts:
     sh_mean: np.ndarray
 
     @classmethod
-    def of(cls, parts: Sequence[CostParts], room: Room = MEMORY) -> RemovalCosts:
+    def of(cls, parts: Sequence[CostParts], storage: Storage = IN_MEMORY) -> RemovalCosts:
         """Costs over all poses, from sums over some of them each."""
         levels, count = parts[0].moments.shape[0], len(parts[0].removal)
-        costs = cls.empty(levels, count, room)
+        costs = cls.empty(levels, count, storage)
         for rows, found in read_ahead(count, *(getattr(part, name) for name in PART_NAMES for part in parts)):
             removal, weight2, moments = (
                 np.asarray(sum(found[at : at + len(parts)])) for at in range(0, len(found), len(parts))
@@ -68,10 +68,10 @@ class RemovalCosts:
         return costs
 
     @classmethod
-    def empty(cls, levels: int, count: int, room: Room = MEMORY) -> RemovalCosts:
+    def empty(cls, levels: int, count: int, storage: Storage = IN_MEMORY) -> RemovalCosts:
         """Arrays for `count` rows of SH degree `levels`."""
-        one, two = (room.empty((count,), np.float64) for _ in range(2))
-        return cls(one, two, room.empty((levels, count), np.float64), room.empty((levels, 3, count), np.float32))
+        one, two = (storage.empty((count,), np.float64) for _ in range(2))
+        return cls(one, two, storage.empty((levels, count), np.float64), storage.empty((levels, 3, count), np.float32))
 
 
 @dataclass
@@ -90,9 +90,9 @@ class CostParts:
     weight2: np.ndarray
     moments: np.ndarray
 
-    def take(self, rows: np.ndarray, room: Room = MEMORY) -> CostParts:
+    def take(self, rows: np.ndarray, storage: Storage = IN_MEMORY) -> CostParts:
         """The sums of some rows."""
-        return CostParts(*(room.take(values, rows) for values in (self.removal, self.weight2, self.moments)))
+        return CostParts(*(storage.take(values, rows) for values in (self.removal, self.weight2, self.moments)))
 
 
 def moment_bytes(sh_degree: int) -> int:
@@ -130,10 +130,10 @@ def cost_sums(renderer: Renderer, degree: int, first: int = 0) -> Maker:
     return partial(_ChunkCosts, renderer, degree, first)
 
 
-def cost_parts(levels: int, count: int, room: Room) -> CostParts:
+def cost_parts(levels: int, count: int, storage: Storage) -> CostParts:
     """Parts of `count` rows of SH degree `levels`, to be filled by `put_costs`."""
-    one, two = (room.empty((count,), np.float64) for _ in range(2))
-    return CostParts(one, two, room.empty((levels, 4, count), np.float64))
+    one, two = (storage.empty((count,), np.float64) for _ in range(2))
+    return CostParts(one, two, storage.empty((levels, 4, count), np.float64))
 
 
 def put_costs(parts: CostParts, rows: slice, sums: Any) -> None:
@@ -165,10 +165,10 @@ def measure_costs(
     try:
         for _ in progress.track(costs.draw("removal_sums", cameras), "measuring costs", len(cameras)):
             pass
-        found = cost_parts(degree, scene.count, renderer.room)
+        found = cost_parts(degree, scene.count, renderer.storage)
         for rows, (sums,) in costs.parts():
             put_costs(found, rows, sums)
-        return RemovalCosts.of([found], renderer.room)
+        return RemovalCosts.of([found], renderer.storage)
     finally:
         costs.release()
 

@@ -34,7 +34,7 @@ class GridCoder:
 
     def _encode(self, grid: GridScene) -> Encoded:
         device = coding_device(self._renderer.backend, self._renderer.budget, grid.count, grid.sh_degree)
-        return encode_grid(grid, device=device, room=self._renderer.room)
+        return encode_grid(grid, device=device, storage=self._renderer.storage)
 
     def encoded(self, grid: GridScene) -> Encoded:
         """The grid as it will lie in a file."""
@@ -42,7 +42,7 @@ class GridCoder:
             self._last = None
             encoded = self._encode(grid)
             # Of a scene in scratch files even the bytes of the file may be too many.
-            self._last = grid, encoded if self._renderer.room.spills else encoded.finished()
+            self._last = grid, encoded if self._renderer.storage.spills else encoded.finished()
         return self._last[1]
 
     def bits(self, grid: GridScene) -> BitModel:

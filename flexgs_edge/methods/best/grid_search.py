@@ -13,17 +13,17 @@ from flexgs_edge.goals.line import AIM, next_point
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.on_grid import lowered
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import recolour, to_grid
 from flexgs_edge.grid.values import values_of
-from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOPE, RateStep, bounds, misses
+from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOPE, Candidate, bounds, misses
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
 from flexgs_edge.methods.best.effort import Effort
-from flexgs_edge.methods.best.kept import Kept, Mended
+from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import Schedule, distil
-from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.methods.best.rounds import PruneRounds
 
 FINE_COLOUR = 2.0**-8
 """Colour steps before the refit, as a share of the final ones: only geometry shall move."""
@@ -63,12 +63,12 @@ def rate_from(fidelity: float | None) -> float:
     return 1.0 if fidelity is None else max(min(1.0, 10 ** ((FULL_RATES - fidelity) / 20)), LEAST_RATE)
 
 
-class RateSearch(MultiplierSearch[GridScene]):
+class GridSearch(MultiplierSearch[GridScene]):
     """The search for the grid that is coded in container version 2.
 
     Parameters
     ----------
-    path : PrunePath
+    path : PruneRounds
     size_of : callable
         Exact bytes of a grid's file.
     measure : callable
@@ -79,12 +79,12 @@ class RateSearch(MultiplierSearch[GridScene]):
 
     def __init__(
         self,
-        path: PrunePath,
+        path: PruneRounds,
         size_of: Callable[[GridScene], int],
         measure: Measure,
         effort: Effort,
         refit: bool = True,
-        on_step: Callable[[RateStep], None] | None = None,
+        on_step: Callable[[Candidate], None] | None = None,
         steps: int = 0,
     ) -> None:
         super().__init__(path, measure, effort, on_step)
@@ -92,24 +92,24 @@ class RateSearch(MultiplierSearch[GridScene]):
         if steps:
             self.pruned_part, self.keeps_best = PRUNED_DISTILLED, True
         self._slopes: Slopes | None = None
-        self._mended: Mended | None = None
-        self._descents: list[tuple[float, Mended]] = []
+        self._mended: Refitted | None = None
+        self._descents: list[tuple[float, Refitted]] = []
         # Where SH are not refitted, a result has nothing from the one before.
         self._drift = DRIFT_DISTILLED if steps else DRIFT if effort.refit_rounds else 0.0
         self._expected = 0.0
 
-    def _unmended(self, multiplier: float) -> GridScene:
+    def _before_refit(self, multiplier: float) -> GridScene:
         kept, steps = self._choice(multiplier)
-        return to_grid(kept.planes, kept.degrees, steps, self.path.origin, room=self.path.room)[0]
+        return to_grid(kept.planes, kept.degrees, steps, self.path.origin, storage=self.path.storage)[0]
 
     def _probe(self, multiplier: float, target: Target) -> float:
         """The excess of a multiplier's result without a refit of its own."""
-        grid = self._unmended(multiplier)
+        grid = self._before_refit(multiplier)
         if target.limit_bytes is not None:
             return target.excess(self.size_of(grid), None)
-        return target.excess(0, self.measure(values_of(grid, self.path.room), estimate=True))
+        return target.excess(0, self.measure(values_of(grid, self.path.storage), estimate=True))
 
-    def _aim(self, multiplier: float, steps: Sequence[RateStep], target: Target) -> float:
+    def _aim(self, multiplier: float, steps: Sequence[Candidate], target: Target) -> float:
         """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
@@ -145,12 +145,12 @@ class RateSearch(MultiplierSearch[GridScene]):
             return DISTILLED
         return self.effort.mended * FURTHER ** (self.effort.refit_rounds - 1)
 
-    def _choice(self, multiplier: float) -> tuple[Kept, Steps]:
+    def _choice(self, multiplier: float) -> tuple[Kept, StepSizes]:
         """What a multiplier keeps, with the colours of the last refit, and the grid steps."""
         kept = self.kept(multiplier)
         mended = self._descended(multiplier) if self.steps else self._mended
         if mended is not None:
-            kept.planes = mended.apply(kept.rows, kept.degrees, kept.planes, self.path.room)
+            kept.planes = mended.apply(kept.rows, kept.degrees, kept.planes, self.path.storage)
         snapshot = self.path.snapshots[kept.snapshot]
         if self._slopes is None:
             # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
@@ -158,21 +158,21 @@ class RateSearch(MultiplierSearch[GridScene]):
                 self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras, self.effort.probed
             )
         steps = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
-        kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0), self.path.room)
+        kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0), self.path.storage)
         return kept, holdable(steps, kept.planes)
 
-    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
+    def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, GridScene]:
         started = time.perf_counter()
         kept, steps = self._choice(multiplier)
         grid = self._distilled(multiplier, kept, steps) if self.steps else self._finish(kept, steps)
-        grid = lowered(grid, self.path.room)
+        grid = lowered(grid, self.path.storage)
         size = self.size_of(grid)
-        measurement = self.measure(values_of(grid, self.path.room))
+        measurement = self.measure(values_of(grid, self.path.storage))
         excess = target.excess(size, measurement)
         seconds = time.perf_counter() - started
-        return RateStep(multiplier, len(kept.rows), grid.sh_count, size, measurement, excess, seconds), grid
+        return Candidate(multiplier, len(kept.rows), grid.sh_count, size, measurement, excess, seconds), grid
 
-    def _descended(self, multiplier: float) -> Mended | None:
+    def _descended(self, multiplier: float) -> Refitted | None:
         """Values of the last descent that kept what this multiplier keeps and more.
 
         Not of one that kept less: its values make up for what it lacked, and would be too much of it with that back (fox: .92 dB
@@ -181,7 +181,7 @@ class RateSearch(MultiplierSearch[GridScene]):
         before = [(at, mended) for at, mended in self._descents if at <= multiplier]
         return max(before, key=lambda pair: pair[0])[1] if before else None
 
-    def _distilled(self, multiplier: float, kept: Kept, steps: Steps) -> GridScene:
+    def _distilled(self, multiplier: float, kept: Kept, steps: StepSizes) -> GridScene:
         """All values moved towards the original's renders with the grid in view, on the grid, and the constant refitted."""
         path = self.path
         first = self._descended(multiplier) is None
@@ -199,7 +199,7 @@ class RateSearch(MultiplierSearch[GridScene]):
             progress=path.progress,
         )
         own = np.arange(len(kept.rows))
-        self._descents.append((multiplier, Mended.of(kept.rows, kept.degrees, own, moved, fields=tuple(moved))))
+        self._descents.append((multiplier, Refitted.of(kept.rows, kept.degrees, own, moved, fields=tuple(moved))))
         grid, order = to_grid(moved, kept.degrees, holdable(steps, moved), path.origin)
         if not self.refit:
             return grid
@@ -217,14 +217,14 @@ class RateSearch(MultiplierSearch[GridScene]):
         )
         return recolour(grid, moved["sh_dc"], moved["sh_rest"])
 
-    def _finish(self, kept: Kept, steps: Steps) -> GridScene:
+    def _finish(self, kept: Kept, steps: StepSizes) -> GridScene:
         """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
-        path, room, planes = self.path, self.path.room, kept.planes
+        path, storage, planes = self.path, self.path.storage, kept.planes
         fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
         fine = holdable(fine, planes)
-        grid, order = to_grid(planes, kept.degrees, fine, path.origin, room=room)
+        grid, order = to_grid(planes, kept.degrees, fine, path.origin, storage=storage)
         degrees = kept.degrees[order]
-        moved = values_of(grid, room)
+        moved = values_of(grid, storage)
         if self.refit:
             shared = (path.origin, path.cameras, path.targets)
             if self.effort.refit_rounds:
@@ -237,9 +237,9 @@ class RateSearch(MultiplierSearch[GridScene]):
                     subsets=self.effort.subsets_of(len(path.cameras)),
                     progress=path.progress,
                 )
-                self._mended = Mended.of(kept.rows, kept.degrees, order, moved, room)
+                self._mended = Refitted.of(kept.rows, kept.degrees, order, moved, storage)
             grid = replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree]))
-            coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], room), room)
+            coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], storage), storage)
             moved = refit_colours(
                 path.renderer,
                 coarse,
@@ -251,4 +251,4 @@ class RateSearch(MultiplierSearch[GridScene]):
                 progress=path.progress,
             )
         final = replace(grid.steps, dc=steps.dc, sh=steps.sh[: grid.sh_degree])
-        return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"], room)
+        return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"], storage)

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.memory.rows import blocks, put_rows, read_rows
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 
 COLOURS = ("sh_dc", "sh_rest")
 
 
 @dataclass
-class Mended:
+class Refitted:
     """Values after a refit (colours) or a descent (all), by row of the scene (ascending): where the next one starts."""
 
     rows: np.ndarray
@@ -28,21 +28,21 @@ class Mended:
         degrees: np.ndarray,
         order: np.ndarray,
         planes: dict[str, np.ndarray],
-        room: Room = MEMORY,
+        storage: Storage = IN_MEMORY,
         fields: Iterable[str] = COLOURS,
-    ) -> Mended:
+    ) -> Refitted:
         """Of the changed fields of `planes`, whose columns belong to `rows[order]`; rows ascending."""
-        back = room.empty((len(order),), np.int64)
+        back = storage.empty((len(order),), np.int64)
         back[order] = np.arange(len(order))
-        return cls(rows, degrees, {name: room.take(planes[name], back) for name in fields})
+        return cls(rows, degrees, {name: storage.take(planes[name], back) for name in fields})
 
     def apply(
-        self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray], room: Room = MEMORY
+        self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray], storage: Storage = IN_MEMORY
     ) -> dict[str, np.ndarray]:
         """`planes` with these values: geometry wherever a row was kept, colours where it was with the same SH degree."""
         if not len(self.rows) or not len(rows):
             return planes
-        changed = {name: room.empty(planes[name].shape, planes[name].dtype) for name in self.planes}
+        changed = {name: storage.empty(planes[name].shape, planes[name].dtype) for name in self.planes}
         for part in blocks(len(rows)):
             some = rows[part]
             at = np.minimum(np.searchsorted(self.rows, some), len(self.rows) - 1)
@@ -86,12 +86,12 @@ class Kept:
     degrees: np.ndarray
     weight2: np.ndarray
 
-    def take(self, keep: np.ndarray, room: Room = MEMORY) -> Kept:
+    def take(self, keep: np.ndarray, storage: Storage = IN_MEMORY) -> Kept:
         """Some of the rows: [n] bool."""
         if keep.all():
             return self
         rows = np.flatnonzero(keep)
-        planes = {name: room.take(values, rows) for name, values in self.planes.items()}
+        planes = {name: storage.take(values, rows) for name, values in self.planes.items()}
         return Kept(
-            self.snapshot, room.take(self.rows, rows), planes, self.degrees[rows], room.take(self.weight2, rows)
+            self.snapshot, storage.take(self.rows, rows), planes, self.degrees[rows], storage.take(self.weight2, rows)
         )

@@ -49,11 +49,11 @@ def assign_layers(
     spent = np.array([bits.of_degree(degree) for degree in range(grid.sh_degree + 1)])[grid.sh_degrees]
     layer = np.zeros(grid.count, np.uint8)
     left = np.arange(grid.count)
-    planes, room = values_of(grid, renderer.room), renderer.room
+    planes, storage = values_of(grid, renderer.storage), renderer.storage
     for level in range(layers - 1, 0, -1):
         end = HALF * spent[left].sum()
         while len(left) and spent[left].sum() > end:
-            kept = take_rows(planes, left, room)
+            kept = take_rows(planes, left, storage)
             with renderer.load(MemorySource(kept, origin=grid.origin), sum_bytes(2)) as scene:
                 costs = measure_costs(renderer, scene, cameras, sh_costs=False, progress=progress)
             worth = np.where(costs.weight2 > 0, costs.removal / spent[left], -1.0)
@@ -64,4 +64,4 @@ def assign_layers(
             layer[left[cut]] = level
             left = np.delete(left, cut)
     order = np.argsort(layer, kind="stable")
-    return replace(grid.take(order, room), layer=layer[order])
+    return replace(grid.take(order, storage), layer=layer[order])

@@ -18,16 +18,16 @@ from flexgs_edge.goals.steps import Scored, SearchResult, Step
 from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.methods.best.candidates import Product, RateResult, RateStep
+from flexgs_edge.methods.best.candidates import Candidate, Product, RateResult
 from flexgs_edge.methods.best.checkpoint import Checkpoint
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
 from flexgs_edge.methods.best.grid_coder import GridCoder
-from flexgs_edge.methods.best.grid_search import RateSearch
+from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.keep import LAYERS_COST
 from flexgs_edge.methods.best.layers import assign_layers
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
 from flexgs_edge.methods.best.poses import ScoredPoses
-from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, least_spilled, needed_bytes
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.renderer import Renderer
@@ -36,15 +36,15 @@ from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
-from flexgs_edge.views.references import TargetViews
+from flexgs_edge.views.references import References
 
 LOG = logging.getLogger("flexgs_edge")
-Report = Callable[[RateStep], None]
-SearchMaker = Callable[[PrunePath, Measure, Report], MultiplierSearch[Product]]
+Report = Callable[[Candidate], None]
+SearchMaker = Callable[[PruneRounds, Measure, Report], MultiplierSearch[Product]]
 
 
 def grid_search(
-    options: CompressOptions, coder: GridCoder, search: type[RateSearch] = RateSearch
+    options: CompressOptions, coder: GridCoder, search: type[GridSearch] = GridSearch
 ) -> SearchMaker[GridScene]:
     """Searches for the grid of a `.fgs`."""
 
@@ -54,7 +54,7 @@ def grid_search(
 
     plan = EFFORTS[options.effort]
 
-    def make(path: PrunePath, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
+    def make(path: PruneRounds, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
         steps = distil_steps(options, len(path.cameras))
         return search(path, size_of, measure, plan, options.refit, report, steps)
 
@@ -82,7 +82,7 @@ def search_best(
     make : callable
         `grid_search` or `file_search`.
     source : SceneSource
-        A checked scene; held in `renderer.room` as a whole.
+        A checked scene; held in `renderer.storage` as a whole.
     poses : ScoredPoses
         From `scored_poses`.
     judge : Judge
@@ -95,14 +95,14 @@ def search_best(
     BudgetError
         When the scene does not fit.
     """
-    path_of = open_path(renderer, source, poses.cameras, options, budget, clock, progress, checkpoint=checkpoint)
+    path_of = open_rounds(renderer, source, poses.cameras, options, budget, clock, progress, checkpoint=checkpoint)
     with path_of as path, clock.stage("search"):
-        product, search = search_path(make, path, renderer, source, judge, target, options, on_step)
+        product, search = search_rounds(make, path, renderer, source, judge, target, options, on_step)
         return product, replace(search, scored=Scored(len(poses.cameras), poses.made, path.unseen))
 
 
 @contextmanager
-def open_path(
+def open_rounds(
     renderer: Renderer,
     source: SceneSource,
     scored: Sequence[Camera],
@@ -110,9 +110,9 @@ def open_path(
     budget: MemoryBudget,
     clock: Stopwatch,
     progress: Progress = SILENT,
-    make: Callable[..., PrunePath] = PrunePath,
+    make: Callable[..., PruneRounds] = PruneRounds,
     checkpoint: Checkpoint | None = None,
-) -> Iterator[PrunePath]:
+) -> Iterator[PruneRounds]:
     """The path that searches walk, at its start; several targets may share it, the weakest compression first.
 
     Parameters
@@ -120,24 +120,24 @@ def open_path(
     scored : sequence of Camera
         From `scored_poses`.
     make : callable, optional
-        Builds the path from the arguments of `PrunePath`.
+        Builds the path from the arguments of `PruneRounds`.
     checkpoint : Checkpoint, optional
         Where the path keeps its rounds.
     """
-    room, steps = renderer.room, distil_steps(options, len(scored))
-    if room.spills:
+    storage, steps = renderer.storage, distil_steps(options, len(scored))
+    if storage.spills:
         size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest_of(scored))
     else:
         size, least = needed_bytes(renderer, source, scored, options)
     budget.require("a search by measured costs", size + least)
     budget.take("the scene and its path", size)
     try:
-        planes = read_all(source, room)
-        with TargetViews(room.folder) as targets:
+        planes = read_all(source, storage)
+        with References(storage.folder) as targets:
             with clock.stage("search"):
                 rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
                 # Neighbours in space become neighbours in memory: a view of fox takes a seventh less.
-                rows = room.take(rows, near_rows(room.take(planes["means"], rows), room))
+                rows = storage.take(rows, near_rows(storage.take(planes["means"], rows), storage))
                 path = make(
                     renderer,
                     planes,
@@ -157,9 +157,9 @@ def open_path(
         budget.give(size)
 
 
-def search_path(
+def search_rounds(
     make: SearchMaker[Product],
-    path: PrunePath,
+    path: PruneRounds,
     renderer: Renderer,
     source: SceneSource,
     judge: Judge,
@@ -174,7 +174,7 @@ def search_path(
             quality = judge.estimate(kept_scene) if estimate else judge.compare(kept_scene, with_ssim=judge.reports)
             return measurement_of(quality)
 
-    def report(step: RateStep) -> None:
+    def report(step: Candidate) -> None:
         if on_step:
             on_step(as_step(step, source.count))
 
@@ -214,7 +214,7 @@ def alive(logits: np.ndarray) -> np.ndarray:
     return logits >= np.float32(-np.log(1 / ALPHA_MIN - 1) - 1e-3)
 
 
-def as_step(step: RateStep, count: int) -> Step:
+def as_step(step: Candidate, count: int) -> Step:
     """The step as every search records it: rates are shares of the scene's rows."""
     prune = round(1000 * (1 - step.count / count))
     return Step(

@@ -15,11 +15,11 @@ from flexgs_edge.errors import TargetError
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.methods.best.allocation import BitModel, choose, drop_bands
-from flexgs_edge.methods.best.candidates import Product, RateResult, RateStep, next_multiplier
+from flexgs_edge.methods.best.candidates import Candidate, Product, RateResult, next_multiplier
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.kept import Kept
-from flexgs_edge.methods.best.rounds import PrunePath, Snapshot
+from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -45,7 +45,7 @@ class MultiplierSearch(ABC, Generic[Product]):
 
     Parameters
     ----------
-    path : PrunePath
+    path : PruneRounds
     measure : callable
         Quality of planes without quantization, where the search starts.
     effort : Effort
@@ -60,19 +60,19 @@ class MultiplierSearch(ABC, Generic[Product]):
 
     def __init__(
         self,
-        path: PrunePath,
+        path: PruneRounds,
         measure: Measure,
         effort: Effort,
-        on_step: Callable[[RateStep], None] | None = None,
+        on_step: Callable[[Candidate], None] | None = None,
     ) -> None:
         self.path, self.measure, self.effort, self.on_step = path, measure, effort, on_step
         self.bits = BitModel()
 
     @abstractmethod
-    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, Product]:
+    def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, Product]:
         """The whole result at a multiplier, measured."""
 
-    def _aim(self, multiplier: float, steps: Sequence[RateStep], target: Target) -> float:
+    def _aim(self, multiplier: float, steps: Sequence[Candidate], target: Target) -> float:
         """A better guess than `multiplier` of where the next whole result should be, for less than the time of one."""
         return multiplier
 
@@ -86,8 +86,8 @@ class MultiplierSearch(ABC, Generic[Product]):
 
     def run(self, target: Target, best_effort: bool = False) -> RateResult[Product]:
         """Search; raises `TargetError` with the closest point when nothing holds and `best_effort` is not set."""
-        steps: list[RateStep] = []
-        best: tuple[RateStep, Product] | None = None
+        steps: list[Candidate] = []
+        best: tuple[Candidate, Product] | None = None
         multiplier = self._aim(self._start(target), steps, target)
         for count in range(self.effort.steps + EXTRA_STEPS):
             try:
@@ -160,7 +160,7 @@ class MultiplierSearch(ABC, Generic[Product]):
         """What a multiplier keeps."""
         index, keep, degrees = self._snapshot(multiplier)
         snapshot = self.path.snapshots[index]
-        rows, room = np.flatnonzero(keep), self.path.room
-        planes = drop_bands(snapshot.planes, rows, degrees[rows], snapshot.costs.sh_mean, SH_C0, room)
-        weight2 = room.take(snapshot.costs.weight2, rows)
-        return Kept(index, room.take(snapshot.rows, rows), planes, degrees[rows], weight2)
+        rows, storage = np.flatnonzero(keep), self.path.storage
+        planes = drop_bands(snapshot.planes, rows, degrees[rows], snapshot.costs.sh_mean, SH_C0, storage)
+        weight2 = storage.take(snapshot.costs.weight2, rows)
+        return Kept(index, storage.take(snapshot.rows, rows), planes, degrees[rows], weight2)

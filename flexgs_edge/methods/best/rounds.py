@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.memory.storage import MEMORY, Room
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.checkpoint import Checkpoint
 from flexgs_edge.methods.best.costs import (
     PART_NAMES,
@@ -27,7 +27,7 @@ from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.references import TargetViews
+from flexgs_edge.views.references import References
 from flexgs_edge.views.sums import ViewSums
 
 PARTS = 2
@@ -43,7 +43,7 @@ class Snapshot:
     Attributes
     ----------
     rows : np.ndarray
-        [n] i64, places in the rows that the path began with (`PrunePath.rows`), ascending.
+        [n] i64, places in the rows that the path began with (`PruneRounds.rows`), ascending.
     planes : dict
         Stored planes of these rows.
     costs : RemovalCosts
@@ -77,7 +77,7 @@ def lowest(values: np.ndarray, count: int) -> np.ndarray:
     return chosen
 
 
-class PrunePath:
+class PruneRounds:
     """Walks down from the whole scene; `snapshots[-1]` is the smallest set so far, and `unseen` rows were in no scored pose.
 
     Parameters
@@ -91,7 +91,7 @@ class PrunePath:
         [3] f64.
     cameras : sequence of Camera
         Scored poses.
-    targets : TargetViews
+    targets : References
         Empty; the original from these poses is put into it if colours are to be mended.
     refit : bool
         Mend colours on the way.
@@ -111,7 +111,7 @@ class PrunePath:
         rows: np.ndarray,
         origin: np.ndarray,
         cameras: Sequence[Camera],
-        targets: TargetViews,
+        targets: References,
         refit: bool = True,
         unseen: float = 1.0,
         progress: Progress = SILENT,
@@ -121,7 +121,7 @@ class PrunePath:
         self.checkpoint = checkpoint
         self.renderer, self.origin, self.refit = renderer, origin, refit
         self.cameras, self.targets, self.progress = cameras, targets, progress
-        self.room, self.rows, self.between = renderer.room, rows, between
+        self.storage, self.rows, self.between = renderer.storage, rows, between
         count = max(min(PARTS, len(cameras) // LEAST_VIEWS), 1)
         self._views = [range(first, len(cameras), count) for first in range(count)]
         self._parts: list[CostParts] = []
@@ -134,20 +134,20 @@ class PrunePath:
 
     def _begin(self, planes: dict[str, np.ndarray], unseen: float) -> None:
         """Measure costs on the whole scene."""
-        room, start = self.room, take_rows(planes, self.rows, self.room)
+        storage, start = self.storage, take_rows(planes, self.rows, self.storage)
         source = MemorySource(start, origin=self.origin)
-        room_of_sums = sum_bytes(2) + moment_bytes(source.sh_degree)
-        with self.renderer.load(source, room_of_sums, view_sums=2) as scene:
+        sum_bytes_a_row = sum_bytes(2) + moment_bytes(source.sh_degree)
+        with self.renderer.load(source, sum_bytes_a_row, view_sums=2) as scene:
             self._parts = [self._measure(scene, some, keep=True) for some in self._views]
             for view, camera in enumerate(self.renderer.in_turn(scene, self.between), start=len(self.cameras)):
                 self.targets.add(view, self.renderer.render_planes(scene, camera))
-        costs = RemovalCosts.of(self._parts, room)
-        rows = room.copy(np.arange(len(self.rows)))
+        costs = RemovalCosts.of(self._parts, storage)
+        rows = storage.copy(np.arange(len(self.rows)))
         keep = np.flatnonzero(~_hidden(start, costs.weight2, unseen))
         if len(keep) < len(rows):
-            rows, start = room.take(rows, keep), take_rows(start, keep, room)
-            self._parts = [part.take(keep, room) for part in self._parts]
-            costs = RemovalCosts.of(self._parts, room)
+            rows, start = storage.take(rows, keep), take_rows(start, keep, storage)
+            self._parts = [part.take(keep, storage) for part in self._parts]
+            costs = RemovalCosts.of(self._parts, storage)
         self._add(Snapshot(rows, start, costs), keep_views=True)
 
     def scene_rows(self, places: np.ndarray) -> np.ndarray:
@@ -164,17 +164,17 @@ class PrunePath:
             return self.snapshots[-1]
         last = self.snapshots[-1]
         keep = np.flatnonzero(last.cheapest(last.count - round(last.count * share)))
-        planes = take_rows(last.planes, keep, self.room)
+        planes = take_rows(last.planes, keep, self.storage)
         source = MemorySource(planes, origin=self.origin)
-        with self.renderer.load(source, sums_room(source.sh_degree), targets=self.refit) as scene:
+        with self.renderer.load(source, sum_row_bytes(source.sh_degree), targets=self.refit) as scene:
             turn = (len(self.snapshots) - 1) % len(self._parts)
             views = self._views[turn]
             measured = self._measure_and_mend(scene, planes, views) if self.refit else self._measure(scene, views)
         self._parts = [
-            measured if part == turn else sums.take(keep, self.room) for part, sums in enumerate(self._parts)
+            measured if part == turn else sums.take(keep, self.storage) for part, sums in enumerate(self._parts)
         ]
-        costs = RemovalCosts.of(self._parts, self.room)
-        return self._add(Snapshot(self.room.take(last.rows, keep), planes, costs))
+        costs = RemovalCosts.of(self._parts, self.storage)
+        return self._add(Snapshot(self.storage.take(last.rows, keep), planes, costs))
 
     def _add(self, snapshot: Snapshot, keep_views: bool = False) -> Snapshot:
         """Append a snapshot, and keep it for a later run where that is asked for."""
@@ -195,12 +195,12 @@ class PrunePath:
         number = len(self.snapshots)
         if self.checkpoint is None or not self.checkpoint.has(number):
             return False
-        arrays = self.checkpoint.load(number, self.room)
+        arrays = self.checkpoint.load(number, self.storage)
         planes = {name: arrays[f"plane-{name}"] for name in FIELD}
         self._parts = [
             CostParts(*(arrays[f"part-{part}-{name}"] for name in PART_NAMES)) for part in range(len(self._views))
         ]
-        self.snapshots.append(Snapshot(arrays["rows"], planes, RemovalCosts.of(self._parts, self.room)))
+        self.snapshots.append(Snapshot(arrays["rows"], planes, RemovalCosts.of(self._parts, self.storage)))
         if number == 0 and self.refit:
             for view in range(len(self.cameras) + len(self.between)):
                 self.targets.add(view, arrays[f"view-{view}"])
@@ -214,7 +214,7 @@ class PrunePath:
             for view, picture in zip(self.progress.track(views, "measuring costs", len(views)), drawn, strict=True):
                 if keep:
                     self.targets.add(view, picture())
-            found = cost_parts(scene.sh_degree, scene.count, self.room)
+            found = cost_parts(scene.sh_degree, scene.count, self.storage)
             for rows, (sums,) in costs.parts():
                 put_costs(found, rows, sums)
             return found
@@ -231,7 +231,7 @@ class PrunePath:
             drawn = both.draw("residual_and_removal_sums", cameras, lambda place: self.targets[views[place]])
             for _ in self.progress.track(drawn, "measuring costs", len(views)):
                 pass
-            found = cost_parts(scene.sh_degree, scene.count, self.room)
+            found = cost_parts(scene.sh_degree, scene.count, self.storage)
             for rows, (costs, normal) in both.parts():
                 put_costs(found, rows, costs)
                 step_colours(planes, degrees, rows, normal.values())
@@ -240,7 +240,7 @@ class PrunePath:
             both.release()
 
 
-def sums_room(sh_degree: int) -> int:
+def sum_row_bytes(sh_degree: int) -> int:
     """Bytes a row that measuring costs and mending colours in one pass takes on the backend."""
     return sum_bytes(6) + moment_bytes(sh_degree) + normal_bytes(sh_degree)
 
@@ -257,6 +257,6 @@ def _hidden(planes: dict[str, np.ndarray], weight2: np.ndarray, share: float) ->
     return gone
 
 
-def take_rows(planes: dict[str, np.ndarray], rows: np.ndarray, room: Room = MEMORY) -> dict[str, np.ndarray]:
+def take_rows(planes: dict[str, np.ndarray], rows: np.ndarray, storage: Storage = IN_MEMORY) -> dict[str, np.ndarray]:
     """The planes' columns `rows`, C-contiguous."""
-    return {name: room.take(values, rows) for name, values in planes.items()}
+    return {name: storage.take(values, rows) for name, values in planes.items()}

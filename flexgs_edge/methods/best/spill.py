@@ -10,10 +10,10 @@ from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.process import return_freed_memory
 from flexgs_edge.memory.rows import READING_BYTES
-from flexgs_edge.memory.storage import MEMORY, Room, Scratch
+from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
 from flexgs_edge.methods.best.refit.descent import descent_bytes
-from flexgs_edge.methods.best.rounds import PARTS, sums_room
+from flexgs_edge.methods.best.rounds import PARTS, sum_row_bytes
 from flexgs_edge.render.ahead import AHEAD_ROW_BYTES
 from flexgs_edge.render.fit import (
     MOST_SUMS,
@@ -58,14 +58,14 @@ def prepare_memory(source: SceneSource, options: CompressOptions, budget: Memory
         return_freed_memory()
 
 
-def choose_room(
+def choose_storage(
     renderer: Renderer,
     source: SceneSource,
     scored: Sequence[Camera],
     options: CompressOptions,
     budget: MemoryBudget,
     folder: Path,
-) -> Room:
+) -> Storage:
     """Memory, where the scene and the path of its search fit, else scratch files; says which, and how much they may take.
 
     Parameters
@@ -83,14 +83,14 @@ def choose_room(
     whole = rows * row_bytes(source.sh_degree, keep)
     size, least = needed_bytes(renderer, source, scored, options)
     if size + least <= budget.free:
-        return MEMORY
+        return IN_MEMORY
     if distil_steps(options, len(scored)):
         budget.require("distilling (--effort max, --distil), which stays in memory as a whole,", size + least)
     budget.require(
         "a search by measured costs with all else in scratch files",
         READING_BYTES + SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest),
     )
-    room = Scratch(folder, budget.limit)
+    storage = ScratchStorage(folder, budget.limit)
     budget.take("reading scratch files", READING_BYTES)  # as long as the process lives
     renderer.largest = largest
     spooled = SPOOL_ROW_BYTES * rows * len(scored) + renderer.fit.ahead * AHEAD_ROW_BYTES * rows
@@ -98,17 +98,20 @@ def choose_room(
         "%d Gaussians and the path of their search need %s in memory, %s are free: they go to scratch files in %s "
         "(at most about %s; --scratch names another folder), %d rows at a time; %d bytes of each Gaussian and views of the "
         "Gaussians that they show stay in memory; %d passes over %d poses",
-        rows, format_size(size + least), format_size(budget.free), room.folder, format_size(whole + spooled),
+        rows, format_size(size + least), format_size(budget.free), storage.folder, format_size(whole + spooled),
         renderer.fit.compact_rows, SPILLED_ROW_BYTES, 2 + EFFORTS[options.effort].refit_rounds, len(scored),
     )  # fmt: skip
-    return room
+    return storage
 
 
 def needed_bytes(
     renderer: Renderer, source: SceneSource, scored: Sequence[Camera], options: CompressOptions
 ) -> tuple[int, int]:
     """Bytes that a search in memory holds, and that drawing needs beside them at the least."""
-    size, sums = source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep), sums_room(source.sh_degree)
+    size, sums = (
+        source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep),
+        sum_row_bytes(source.sh_degree),
+    )
     if distil_steps(options, len(scored)):
         # A descent holds what is kept, with all that it remembers, at once: as much as the whole scene at the most.
         sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))

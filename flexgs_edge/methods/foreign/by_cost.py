@@ -11,13 +11,13 @@ from flexgs_edge.goals.target import Target
 from flexgs_edge.io.exchange import near_order
 from flexgs_edge.io.formats import Format
 from flexgs_edge.methods.best.allocation import BitModel, choose_one_degree
-from flexgs_edge.methods.best.candidates import RateStep
+from flexgs_edge.methods.best.candidates import Candidate
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.effort import EFFORTS, Effort
 from flexgs_edge.methods.best.method import SearchMaker
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.rounds import PrunePath, take_rows
+from flexgs_edge.methods.best.rounds import PruneRounds, take_rows
 from flexgs_edge.methods.foreign.file_maker import FileMaker, WrittenFile
 from flexgs_edge.methods.foreign.lower_sh import lower_degree
 from flexgs_edge.run.options import CompressOptions
@@ -38,12 +38,12 @@ class FileSearch(MultiplierSearch[WrittenFile]):
 
     def __init__(
         self,
-        path: PrunePath,
+        path: PruneRounds,
         files: FileMaker,
         measure: Measure,
         effort: Effort,
         refit: bool = True,
-        on_step: Callable[[RateStep], None] | None = None,
+        on_step: Callable[[Candidate], None] | None = None,
     ) -> None:
         super().__init__(path, measure, effort, on_step)
         self.files, self.refit = files, refit
@@ -59,7 +59,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         """Remove a file that is not the best any more."""
         product.path.unlink()
 
-    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, WrittenFile]:
+    def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, WrittenFile]:
         started = time.perf_counter()
         kept = self.kept(multiplier)
         planes, degrees = kept.planes, kept.degrees
@@ -69,7 +69,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         assert file.measurement is not None
         excess = target.excess(file.size, file.measurement)
         seconds = time.perf_counter() - started
-        return RateStep(multiplier, file.count, file.sh_count, file.size, file.measurement, excess, seconds), file
+        return Candidate(multiplier, file.count, file.sh_count, file.size, file.measurement, excess, seconds), file
 
     def _finish(self, planes: dict[str, np.ndarray], degrees: np.ndarray) -> WrittenFile:
         """All colours refitted to the decoded geometry, then the constant to the decoded SH; geometry goes in as it was."""

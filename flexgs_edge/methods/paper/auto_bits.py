@@ -11,7 +11,7 @@ from flexgs_edge.progress import Progress
 from flexgs_edge.quality.psnr import error_for_drop
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.plan import EVERYTHING
-from flexgs_edge.run.view_set import Views
+from flexgs_edge.run.view_set import ViewSet
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -20,7 +20,7 @@ SENSITIVITY_VIEWS = 8
 
 
 def bits_by_sensitivity(
-    evaluator: SceneEvaluator, views: Views | None, base_psnr: float, progress: Progress
+    evaluator: SceneEvaluator, views: ViewSet | None, base_psnr: float, progress: Progress
 ) -> tuple[BitSpec, list[Sensitivity]]:
     """The bits, and what was measured, with nothing pruned."""
     renderer, source = evaluator.renderer, evaluator.source

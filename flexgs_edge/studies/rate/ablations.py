@@ -11,12 +11,12 @@ import numpy as np
 
 from flexgs_edge.methods.best.allocation import REMOVAL_FACTOR, SH_FACTOR, BitModel
 from flexgs_edge.methods.best.costs import RemovalCosts
-from flexgs_edge.methods.best.grid_search import RateSearch
-from flexgs_edge.methods.best.rounds import PrunePath, Snapshot
+from flexgs_edge.methods.best.grid_search import GridSearch
+from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
 from flexgs_edge.methods.paper.prune import ranks_from_order
 
 
-class RankedPath(PrunePath):
+class RankedPath(PruneRounds):
     """Rows go in the order of a score; how many go, and all else, is as measured.
 
     The measured costs are handed out again by rank: the row of the lowest score gets the lowest of them. So a multiplier
@@ -34,7 +34,7 @@ class RankedPath(PrunePath):
         self._hand_out(self.snapshots[0])
 
     def descend(self, share: float) -> Snapshot:
-        """See `PrunePath.descend`."""
+        """See `PruneRounds.descend`."""
         self._hand_out(super().descend(share))
         return self.snapshots[-1]
 
@@ -47,11 +47,11 @@ class RankedPath(PrunePath):
         snapshot.costs = replace(costs, removal=removal)
 
 
-class OnePassPath(PrunePath):
+class OnePassPath(PruneRounds):
     """Costs as the first pass over the whole scene measured them; colours are mended on the way all the same."""
 
     def descend(self, share: float) -> Snapshot:
-        """See `PrunePath.descend`."""
+        """See `PruneRounds.descend`."""
         last = self.snapshots[-1]
         snapshot = super().descend(share)
         kept = np.searchsorted(last.rows, snapshot.rows)
@@ -60,7 +60,7 @@ class OnePassPath(PrunePath):
         return snapshot
 
 
-class SomeDegrees(RateSearch):
+class SomeDegrees(GridSearch):
     """Gaussians that stay keep SH up to one of a few degrees; a subclass says which."""
 
     with_none: ClassVar[bool]
@@ -114,17 +114,17 @@ class Variant:
     words : str
         What stands in the part's place.
     search : type
-        Of `RateSearch`.
+        Of `GridSearch`.
     path : callable
-        Builds the path from the arguments of `PrunePath`.
+        Builds the path from the arguments of `PruneRounds`.
     refit : bool
         As for `compress`.
     """
 
     name: str
     words: str
-    search: type[RateSearch] = RateSearch
-    path: Callable[..., PrunePath] = PrunePath
+    search: type[GridSearch] = GridSearch
+    path: Callable[..., PruneRounds] = PruneRounds
     refit: bool = True
 
 

@@ -18,7 +18,7 @@ from flexgs_edge.io.converter import check_converter
 from flexgs_edge.io.exchange import near_order
 from flexgs_edge.io.formats import FORMATS, Format
 from flexgs_edge.methods.best.grid_coder import GridCoder
-from flexgs_edge.methods.best.method import grid_search, open_path, search_path
+from flexgs_edge.methods.best.method import grid_search, open_rounds, search_rounds
 from flexgs_edge.methods.best.poses import scored_poses
 from flexgs_edge.methods.foreign.file_maker import open_files
 from flexgs_edge.quality.view_quality import Quality
@@ -177,7 +177,7 @@ def best_points(
     poses = scored_poses(bench.views.of(bench.views.train), largest, workspace.renderer, source)
     found = NOTHING
     started = time.perf_counter()
-    with open_path(
+    with open_rounds(
         workspace.renderer,
         source,
         poses.cameras,
@@ -192,7 +192,7 @@ def best_points(
             target = _target(bench, ratio)
             make = grid_search(options, coder, variant.search)
             with workspace.clock.stage("search"):
-                grid, search = search_path(make, path, workspace.renderer, source, bench.judge, target, options)
+                grid, search = search_rounds(make, path, workspace.renderer, source, bench.judge, target, options)
             seconds = time.perf_counter() - started
             if search.reached:
                 plan = replace(bench.plan, target=target)

@@ -129,9 +129,9 @@ def score_rows(bench: Bench, fewest: int = FEWEST, orders: Sequence[str] = COMPA
 def _scores(bench: Bench, score: str, sets: Sequence[tuple[str, int, list[Camera]]]) -> list[tuple[np.ndarray, float]]:
     """Scores ([N] f64) and seconds of each set of poses."""
     source, renderer = bench.scene.source, bench.workspace.renderer
-    room = sum_bytes(2) + moment_bytes(source.sh_degree)
+    storage = sum_bytes(2) + moment_bytes(source.sh_degree)
     found = []
-    with renderer.load(source, room) as scene:
+    with renderer.load(source, storage) as scene:
         make: dict[str, Callable[[list[Camera]], np.ndarray]] = {
             "gs": lambda poses: score_scene(renderer, scene, source, poses, "gs", bench.progress),
             # With the costs of SH, as a search by measured costs asks for them: they come from the same pass.

@@ -9,7 +9,7 @@ import numpy as np
 
 from flexgs_edge.codec.v2.container import coded_size
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.io.exchange import near_order
@@ -84,7 +84,7 @@ def rounding(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
     )
 
 
-def _scaled(steps: Steps, factor: float) -> Steps:
+def _scaled(steps: StepSizes, factor: float) -> StepSizes:
     kinds = ("position", "scale", "rotation", "opacity", "dc")
     larger = {kind: factor * getattr(steps, kind) for kind in kinds}
     return replace(steps, **larger, sh=tuple(factor * step for step in steps.sh))

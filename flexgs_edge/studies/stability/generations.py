@@ -14,7 +14,7 @@ from flexgs_edge.goals.target import MaxSize
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.methods.best.grid_coder import SETTINGS_MOST, GridCoder
 from flexgs_edge.methods.best.keep import kept_as_it_is
-from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.paper.evaluator import SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.methods.paper.scores import score_scene
@@ -72,7 +72,7 @@ class Copies:
         self.ply.unlink(missing_ok=True)
 
 
-def generations(bench: Bench, path: PrunePath, ours: Whole, amounts: Amounts, folder: Path) -> Experiment:
+def generations(bench: Bench, path: PruneRounds, ours: Whole, amounts: Amounts, folder: Path) -> Experiment:
     """Every generation of three methods, against the first original; and two targets in a row."""
     copies = Copies(folder)
     rows: list[dict[str, Cell]] = []

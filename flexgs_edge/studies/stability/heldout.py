@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from flexgs_edge.goals.target import MaxDrop, WorstToo
-from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.plots import BarChart
@@ -42,7 +42,7 @@ HEADS = {
 }
 
 
-def held_out(bench: Bench, path: PrunePath, contenders: Contenders, amounts: Amounts) -> Experiment:
+def held_out(bench: Bench, path: PruneRounds, contenders: Contenders, amounts: Amounts) -> Experiment:
     """Every contender, best when only the even held-out views decide, and with its worst view held, view by view."""
     cameras = bench.judge.cameras
     whole: dict[str, Whole] = {}
@@ -94,7 +94,7 @@ def held_out(bench: Bench, path: PrunePath, contenders: Contenders, amounts: Amo
     )
 
 
-def _decided_on_even(bench: Bench, path: PrunePath) -> Whole:
+def _decided_on_even(bench: Bench, path: PruneRounds) -> Whole:
     workspace, source = bench.workspace, bench.scene.source
     judge = Judge(
         workspace.renderer,

@@ -22,7 +22,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.plots import BarChart
 from flexgs_edge.run.inputs import load_scene
 from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.view_set import Views
+from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
 from flexgs_edge.studies.experiment import Experiment
@@ -96,7 +96,7 @@ class Place:
         train, judges = few_views(bench, amounts)
         cameras = [move.camera(camera) for camera in (*train, *judges)]
         places = list(range(len(cameras)))
-        self.views = Views(cameras, None, places[: len(train)], places[len(train) :], "moved", None)
+        self.views = ViewSet(cameras, None, places[: len(train)], places[len(train) :], "moved", None)
         options, workspace = bench.options, bench.workspace
         assert options.near is not None and options.background is not None and options.extent is not None
         self.renderer = Renderer(

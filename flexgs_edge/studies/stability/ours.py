@@ -14,10 +14,10 @@ from flexgs_edge.goals.target import MaxDrop, Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.methods.best.grid_coder import GridCoder
-from flexgs_edge.methods.best.grid_search import RateSearch
-from flexgs_edge.methods.best.method import grid_search, open_path
+from flexgs_edge.methods.best.grid_search import GridSearch
+from flexgs_edge.methods.best.method import grid_search, open_rounds
 from flexgs_edge.methods.best.poses import scored_poses
-from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import MemorySource, SceneSource
@@ -56,7 +56,7 @@ class Whole:
         return MemorySource(from_grid(self.grid), origin=self.grid.origin)
 
 
-class FixedSearch(RateSearch):
+class FixedSearch(GridSearch):
     """The search that can also be told the multiplier: where it stops is partly chance, what it does there is not."""
 
     def at(self, multiplier: float) -> GridScene:
@@ -71,11 +71,11 @@ def walked(
     cameras: Sequence[Camera],
     renderer: Renderer | None = None,
     margin: bool = False,
-) -> Iterator[PrunePath]:
+) -> Iterator[PruneRounds]:
     """The path of prune and rescore over some poses (`margin`: and made ones), for as many searches as wanted."""
     workspace, options = bench.workspace, replace(bench.options, views_margin=margin)
     renderer = renderer or workspace.renderer
-    with open_path(
+    with open_rounds(
         renderer,
         source,
         scored_poses(cameras, options, renderer, source).cameras,
@@ -87,12 +87,12 @@ def walked(
         yield path
 
 
-def scored_pixels(path: PrunePath) -> int:
+def scored_pixels(path: PruneRounds) -> int:
     """Pixels that a path looks at in all its poses."""
     return sum(camera.width * camera.height for camera in path.cameras)
 
 
-def search(bench: Bench, path: PrunePath, target: Target, judge: Judge | None = None) -> Whole:
+def search(bench: Bench, path: PruneRounds, target: Target, judge: Judge | None = None) -> Whole:
     """The search for a target along a path; the closest result where it cannot be met."""
     judge = judge or bench.judge
     made = _search(bench, path, judge, path.renderer)
@@ -102,7 +102,7 @@ def search(bench: Bench, path: PrunePath, target: Target, judge: Judge | None = 
     return _whole(made, found.product, multiplier, found.reached)
 
 
-def whole_at(bench: Bench, path: PrunePath, judge: Judge, multiplier: float) -> Whole:
+def whole_at(bench: Bench, path: PruneRounds, judge: Judge, multiplier: float) -> Whole:
     """The whole result at a multiplier, without a search."""
     made = _search(bench, path, judge, path.renderer)
     with bench.workspace.clock.stage("search"):
@@ -110,7 +110,7 @@ def whole_at(bench: Bench, path: PrunePath, judge: Judge, multiplier: float) -> 
     return _whole(made, grid, multiplier, True)
 
 
-def _search(bench: Bench, path: PrunePath, judge: Judge, renderer: Renderer) -> FixedSearch:
+def _search(bench: Bench, path: PruneRounds, judge: Judge, renderer: Renderer) -> FixedSearch:
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=path.origin)) as scene:
             return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))

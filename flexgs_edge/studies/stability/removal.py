@@ -12,7 +12,7 @@ from flexgs_edge.goals.target import MaxSize
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.effort import EFFORTS
 from flexgs_edge.methods.best.grid_coder import SETTINGS_MOST
-from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.paper.evaluator import SceneEvaluator
 from flexgs_edge.methods.paper.prune import order_from_scores
 from flexgs_edge.methods.paper.scores import score_scene
@@ -47,7 +47,7 @@ SH_ONLY, BEST = "SH only", "best's path"
 HEADS = {"scores": "scored", "same": "loss on the same half (dB)", "other": "loss on the other half (dB)"}
 
 
-def pruning(bench: Bench, path: PrunePath, amounts: Amounts) -> Experiment:
+def pruning(bench: Bench, path: PruneRounds, amounts: Amounts) -> Experiment:
     """Shares of the Gaussians removed by each score, and shares that lose their SH; 16 bits stand for untouched values."""
     costs = path.snapshots[0]
     removal = np.full(bench.scene.source.count, -np.inf)
@@ -89,7 +89,7 @@ def pruning(bench: Bench, path: PrunePath, amounts: Amounts) -> Experiment:
     )
 
 
-def _path_rows(bench: Bench, path: PrunePath, most: int) -> list[dict[str, Cell]]:
+def _path_rows(bench: Bench, path: PruneRounds, most: int) -> list[dict[str, Cell]]:
     """The snapshots of the path, until so many thousandths are gone."""
     keep = EFFORTS[bench.options.effort].keep
     count = bench.scene.source.count

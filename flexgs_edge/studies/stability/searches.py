@@ -14,9 +14,9 @@ from flexgs_edge.goals.line import LINE_STEPS, START, search_line
 from flexgs_edge.goals.steps import MAX_PRUNE, Step, better
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.methods.best.candidates import RateStep
+from flexgs_edge.methods.best.candidates import Candidate
 from flexgs_edge.methods.best.effort import EFFORTS
-from flexgs_edge.methods.best.grid_search import RateSearch
+from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.paper.search import adapt
 from flexgs_edge.report.plots import BarChart
 from flexgs_edge.studies.experiment import Experiment
@@ -122,7 +122,7 @@ def _measurement(drop: float) -> Measurement:
     return Measurement(drop, 42 - 10 * math.log10(max(drop, 1e-9)), drop)
 
 
-class _Pretended(RateSearch):
+class _Pretended(GridSearch):
     """The search over a multiplier, of a world in place of a path."""
 
     def __init__(self, world: World, effort: str) -> None:
@@ -136,9 +136,9 @@ class _Pretended(RateSearch):
     def _probe(self, multiplier: float, target: Target) -> float:
         return target.excess(self.world.size_at(multiplier), self.world.measure_at(multiplier))
 
-    def _whole(self, multiplier: float, target: Target) -> tuple[RateStep, GridScene]:
+    def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, GridScene]:
         size, found = self.world.size_at(multiplier), self.world.measure_at(multiplier)
-        step = RateStep(multiplier, COUNT, 0, size, found, target.excess(size, found), 0.0)
+        step = Candidate(multiplier, COUNT, 0, size, found, target.excess(size, found), 0.0)
         return step, cast(GridScene, None)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flexgs_edge.files import atomic_folder, check_folder
-from flexgs_edge.methods.best.rounds import PrunePath
+from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.plots import require_matplotlib
 from flexgs_edge.run.options import CompressOptions
@@ -125,7 +125,7 @@ def _experiments(bench: Bench, amounts: Amounts, folder: Path) -> list[Experimen
             return _along_the_path(bench, path, guarded, amounts, Path(place))
 
 
-def _along_the_path(bench: Bench, path: PrunePath, guarded: Whole, amounts: Amounts, place: Path) -> list[Experiment]:
+def _along_the_path(bench: Bench, path: PruneRounds, guarded: Whole, amounts: Amounts, place: Path) -> list[Experiment]:
     made: list[Experiment] = []
 
     @contextmanager

@@ -24,7 +24,7 @@ from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.constants import CODE_LIMIT
 from flexgs_edge.errors import FormatError
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.opencl import OpenCLBackend
@@ -36,7 +36,7 @@ from flexgs_edge.scene.source import MemorySource
 from grid_scenes import STEPS, assert_same_grid, make_grid
 from kernel_fixtures import default_device, large_budget, open_form
 
-FINE = Steps(0.05, 2.0**-14, 2.0**-9, 2.0**-12, 2.0**-10, (2.0**-9, 0.25, 2.0**-8, 0.3))
+FINE = StepSizes(0.05, 2.0**-14, 2.0**-9, 2.0**-12, 2.0**-10, (2.0**-9, 0.25, 2.0**-8, 0.3))
 """Steps at which alphabets have raw low bits."""
 
 

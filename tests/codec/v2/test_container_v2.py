@@ -21,7 +21,7 @@ from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.errors import InputError, TargetError
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.check import check_scene
@@ -130,7 +130,7 @@ def test_a_scene_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_the_largest_codes_are_valid_values(tmp_path: Path, rotation: float, colour: float, fault: str | None) -> None:
     """A grid is taken unchecked only where every code gives a value that the check would pass."""
     path = tmp_path / "a.fgs"
-    steps = Steps(*[2.0**80] * 4, colour, (colour,) * 4, 2.0**4)
+    steps = StepSizes(*[2.0**80] * 4, colour, (colour,) * 4, 2.0**4)
     grid = make_grid(20, 1)
     for plane in (grid.position, grid.scale, grid.rotation, grid.opacity, grid.dc, *grid.sh):
         plane[:] = 2**24

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexgs_edge.constants import SH_C0
-from flexgs_edge.memory import rows as mapped
+from flexgs_edge.memory import rows as memory_rows
 from flexgs_edge.methods.best.allocation import (
     REMOVAL_FACTOR,
     SH_FACTOR,
@@ -153,7 +153,7 @@ def test_bands_of_some_rows_in_any_blocks(monkeypatch: pytest.MonkeyPatch) -> No
     alone = {name: values[:, rows] for name, values in planes.items()}
     expected = drop_bands(alone, np.arange(25), degrees, mean[..., rows], SH_C0)
     for size in (1, 7, 40):
-        monkeypatch.setattr(mapped.blocks, "__defaults__", (size,))
+        monkeypatch.setattr(memory_rows.blocks, "__defaults__", (size,))
         for name, values in drop_bands(planes, rows, degrees, mean, SH_C0).items():
             np.testing.assert_array_equal(values, expected[name])
 

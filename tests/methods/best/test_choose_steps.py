@@ -10,7 +10,7 @@ import pytest
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import SH_C0
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.methods.best.choose_steps import (
     GEOMETRY,
     VALUES,
@@ -31,11 +31,11 @@ WEIGHT2 = np.array([4.0, 1.0, 0.5, 2.5])
 DEGREES = np.array([0, 1, 2, 2])
 
 
-def steps_at(multiplier: float, weight2: np.ndarray = WEIGHT2, slopes: Slopes = SLOPES) -> Steps:
+def steps_at(multiplier: float, weight2: np.ndarray = WEIGHT2, slopes: Slopes = SLOPES) -> StepSizes:
     return choose_steps(slopes, weight2, DEGREES, 2, multiplier)
 
 
-def numbers(steps: Steps) -> np.ndarray:
+def numbers(steps: StepSizes) -> np.ndarray:
     return np.array([*(getattr(steps, kind) for kind in GEOMETRY), steps.dc, *steps.sh])
 
 

@@ -14,7 +14,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.made import poses_between
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import BudgetError, InputError
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels.backend import TwinBackend
@@ -25,7 +25,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.references import TargetViews
+from flexgs_edge.views.references import References
 from kernel_fixtures import large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
 from tiny_project import make_project
@@ -33,7 +33,7 @@ from tiny_project import make_project
 Planes = dict[str, np.ndarray]
 KEPT = 150
 SEEN = 6
-STEPS = Steps(0.03, 0.25, 0.06, 0.5, 0.15, (0.12, 0.12))
+STEPS = StepSizes(0.03, 0.25, 0.06, 0.5, 0.15, (0.12, 0.12))
 RATES = {"means": 5e-3, **FIELD_RATES}
 
 
@@ -55,7 +55,7 @@ class Bench:
         self.renderer = Renderer(open_form(form), large_budget())
         self.cameras = [view(seed) for seed in range(SEEN)]
         with self.renderer.load(MemorySource(whole)) as scene:
-            self.targets = TargetViews.of(self.renderer, scene, self.cameras)
+            self.targets = References.of(self.renderer, scene, self.cameras)
             self.original = [self.renderer.render(scene, camera) for camera in self.cameras]
 
     def _without_higher(self, rest: np.ndarray) -> np.ndarray:
@@ -71,7 +71,7 @@ class Bench:
         errors = [np.mean(np.square(a - b)) for a, b in zip(images, self.original, strict=True)]
         return float(-10 * np.log10(np.mean(errors)))
 
-    def distil(self, steps: int, grid: Steps | None = None, **words: Any) -> Planes:
+    def distil(self, steps: int, grid: StepSizes | None = None, **words: Any) -> Planes:
         shared = (self.degrees, np.zeros(3), self.cameras, self.targets)
         return distil(self.renderer, self.kept, *shared, Schedule(steps, **words), grid, rates=RATES)
 

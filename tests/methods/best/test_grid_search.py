@@ -13,16 +13,16 @@ import pytest
 from flexgs_edge.errors import TargetError
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, MinFidelity, Target
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid as grid
-from flexgs_edge.memory.storage import MEMORY
+from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.methods.best import multiplier as search_module
-from flexgs_edge.methods.best.candidates import RateResult, RateStep
+from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses
-from flexgs_edge.methods.best.grid_search import DISTILLED, RateSearch, rate_from
-from flexgs_edge.methods.best.kept import Mended
+from flexgs_edge.methods.best.grid_search import DISTILLED, GridSearch, rate_from
+from flexgs_edge.methods.best.kept import Refitted
 from flexgs_edge.methods.best.multiplier import EXTRA_STEPS
 from flexgs_edge.methods.best.rounds import Snapshot, take_rows
 from flexgs_edge.scene.fields import FIELD
@@ -41,7 +41,7 @@ class FakePath:
 
     renderer = origin = targets = None
     cameras: tuple[object, ...] = ()
-    room = MEMORY
+    storage = IN_MEMORY
 
     def __init__(self, count: int = 600, degree: int = 1, unseen: int = 0, scale: float = 1.0) -> None:
         rng = np.random.default_rng(81)
@@ -95,7 +95,7 @@ def powers(loss: float = 0.6, size: float = -0.45) -> World:
 
 @pytest.fixture(autouse=True)
 def _known_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
-    def to_grid(planes: Any, degrees: Any, steps: Steps, origin: Any, **words: Any) -> Any:
+    def to_grid(planes: Any, degrees: Any, steps: StepSizes, origin: Any, **words: Any) -> Any:
         World.multiplier = (steps.opacity / UNIT) ** 2
         return grid.to_grid(planes, degrees, steps, origin, **words)
 
@@ -110,11 +110,11 @@ def search(
     words = {"effort": EFFORT, "refit": False, **words}
     World.multiplier = None
     world.path = path or FakePath()
-    found = RateSearch(world.path, world.size_of, world.measure, **words)  # type: ignore[arg-type]
+    found = GridSearch(world.path, world.size_of, world.measure, **words)  # type: ignore[arg-type]
     return found.run(target, best_effort)
 
 
-def best_of(steps: tuple[RateStep, ...]) -> RateStep:
+def best_of(steps: tuple[Candidate, ...]) -> Candidate:
     """The smallest step that holds."""
     return min((step for step in steps if step.holds), key=lambda step: step.size)
 
@@ -196,7 +196,7 @@ def test_a_size_that_nothing_fits_into() -> None:
 
 def test_the_file_is_the_chosen_step_s() -> None:
     world = powers()
-    seen: list[RateStep] = []
+    seen: list[Candidate] = []
     found = search(world, MaxDrop(1.0), on_step=seen.append)
     assert tuple(seen) == found.steps
     assert any(found.product is grid for grid in world.grids)
@@ -305,15 +305,15 @@ def test_an_interrupted_search_with_descents_keeps_the_best(
 ) -> None:
     done: list[int] = []
 
-    def whole(self: RateSearch, multiplier: float, target: Target) -> Any:
+    def whole(self: GridSearch, multiplier: float, target: Target) -> Any:
         if len(done) == after:
             raise KeyboardInterrupt
         done.append(1)
-        grid = self._unmended(multiplier)
+        grid = self._before_refit(multiplier)
         measurement = Measurement(0.5, 42.0, 0.5)
-        return RateStep(multiplier, 1, 0, 4000, measurement, target.excess(4000, measurement), 0.0), grid
+        return Candidate(multiplier, 1, 0, 4000, measurement, target.excess(4000, measurement), 0.0), grid
 
-    monkeypatch.setattr(RateSearch, "_whole", whole)
+    monkeypatch.setattr(GridSearch, "_whole", whole)
     if steps and after:
         assert search(powers(), MaxDrop(1.0), steps=steps).chosen.size == 4000
     else:
@@ -324,7 +324,7 @@ def test_an_interrupted_search_with_descents_keeps_the_best(
 def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> None:
     rng = np.random.default_rng(5)
     mended = {"sh_dc": rng.normal(size=(3, 3)).astype(np.float32), "sh_rest": np.ones((9, 3), np.float32)}
-    last = Mended.of(np.array([2, 5, 7]), np.array([0, 1, 1]), np.array([2, 0, 1]), mended)
+    last = Refitted.of(np.array([2, 5, 7]), np.array([0, 1, 1]), np.array([2, 0, 1]), mended)
     planes = {"sh_dc": np.zeros((3, 4), np.float32), "sh_rest": np.zeros((24, 4), np.float32), "means": np.ones((3, 4))}
     found = last.apply(np.array([1, 2, 5, 7]), np.array([1, 1, 1, 1]), planes)
     np.testing.assert_array_equal(
@@ -358,7 +358,7 @@ def test_large_scenes_are_scored_from_more_poses() -> None:
 
 def test_geometry_goes_on_whatever_the_degree() -> None:
     moved = {"sh_dc": np.ones((3, 2), np.float32), "means": np.array([[1, 2]] * 3, np.float32)}
-    last = Mended.of(np.array([2, 7]), np.array([0, 1]), np.array([1, 0]), moved, fields=tuple(moved))
+    last = Refitted.of(np.array([2, 7]), np.array([0, 1]), np.array([1, 0]), moved, fields=tuple(moved))
     planes = {"sh_dc": np.zeros((3, 3), np.float32), "means": np.zeros((3, 3), np.float32)}
     found = last.apply(np.array([1, 2, 7]), np.array([1, 1, 1]), planes)
     np.testing.assert_array_equal(found["means"], [[0, 2, 1]] * 3)

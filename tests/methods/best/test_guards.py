@@ -31,7 +31,7 @@ from flexgs_edge.run.doubts import FIT_GAP, FIT_STEP, FIT_VIEWS, NEEDED_VIEWS, T
 from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.run.view_set import Views
+from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.views.depths import middle_of, visible_depths
 from kernel_fixtures import count, draw, large_budget, open_form
 from synthetic import make_camera, make_splats, random_scene
@@ -254,7 +254,7 @@ def test_a_compression_with_margin(project: Path, tmp_path: Path) -> None:
 def test_doubts(
     scored: Scored | None, trained: float | None, held_out: float | None, cameras: str, words: list[str]
 ) -> None:
-    found = doubts(Views([], None, [], [], cameras, None), scored, 1000, trained, held_out)
+    found = doubts(ViewSet([], None, [], [], cameras, None), scored, 1000, trained, held_out)
     assert len(found) == len(words)
     for text, wanted in zip(found, words):
         assert re.search(wanted, text), text

@@ -22,10 +22,10 @@ from flexgs_edge.constants import CULLED
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.kernels.backend import TwinBackend
-from flexgs_edge.memory.storage import Scratch
+from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.rounds import sums_room
+from flexgs_edge.methods.best.rounds import sum_row_bytes
 from flexgs_edge.render.camera_record import camera_record
 from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.chunks import SourcePlanes
@@ -35,7 +35,7 @@ from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.references import TargetViews
+from flexgs_edge.views.references import References
 from kernel_fixtures import FORMS, large_budget, open_form
 from synthetic import joined, look_from, make_camera, random_scene
 from tiny_project import make_project, write_cameras
@@ -54,20 +54,20 @@ def cameras() -> list[Camera]:
     return [*views, make_camera(40, 30, rotation=rotation, translation=(0.0, 0.0, -50.0), name="nothing")]
 
 
-def found_by(form: str, room: Scratch | None) -> dict[str, np.ndarray]:
+def found_by(form: str, storage: ScratchStorage | None) -> dict[str, np.ndarray]:
     """Pictures, statistics, costs and refitted colours of the scene."""
     drawer = Renderer(open_form(form), large_budget())
-    if room is not None:
-        drawer.room = room
+    if storage is not None:
+        drawer.storage = storage
     statistics = Statistics.zeros(SCENE.count)
     found: dict[str, np.ndarray] = {}
     with drawer.load(SCENE) as scene:
         for camera in cameras():
             found[camera.name] = drawer.render(scene, camera)
             drawer.add_statistics(scene, camera, statistics)
-        assert (scene.shown is not None) == (room is not None)
+        assert (scene.shown is not None) == (storage is not None)
     found |= {"hits": statistics.hits, "weights": statistics.weights}
-    with drawer.load(SCENE, 100) as scene, TargetViews() as targets:
+    with drawer.load(SCENE, 100) as scene, References() as targets:
         costs = measure_costs(drawer, scene, cameras())
         found |= {name: getattr(costs, name) for name in ("removal", "weight2", "sh", "sh_mean")}
         planes = SCENE.read(slice(0, SCENE.count), list(FIELD))
@@ -84,15 +84,15 @@ def found_by(form: str, room: Scratch | None) -> dict[str, np.ndarray]:
 def test_compact_views_give_the_same_bits(
     form: str, compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spilled = found_by(form, Scratch(tmp_path))
+    spilled = found_by(form, ScratchStorage(tmp_path))
     # Some chunks stay in memory.
     asked = itertools.count()
     monkeypatch.setattr(DeviceScene, "_may_stay", lambda *_: next(asked) % 3 == 0)
-    for name, values in found_by(form, Scratch(tmp_path)).items():
+    for name, values in found_by(form, ScratchStorage(tmp_path)).items():
         np.testing.assert_array_equal(values, spilled[name], err_msg=name)
     # One chunk, so that it is the last one that shows more than there is room for.
     use_fit(monkeypatch, compact_rows=4096)
-    for name, values in found_by(form, Scratch(tmp_path)).items():
+    for name, values in found_by(form, ScratchStorage(tmp_path)).items():
         np.testing.assert_array_equal(values, spilled[name], err_msg=name)
     monkeypatch.undo()
     plain = found_by(form, None)
@@ -110,8 +110,8 @@ def test_sums_of_a_chunk_take_the_place_of_a_view(
     views, drawn = cameras()[:2], list[int]()
     budget = large_budget()
     drawer = Renderer(TwinBackend(budget), budget)
-    drawer.room, held = Scratch(tmp_path), budget.used
-    with TargetViews() as targets:
+    drawer.storage, held = ScratchStorage(tmp_path), budget.used
+    with References() as targets:
         with drawer.load(SCENE) as scene:
             for view, camera in enumerate(views):
                 targets.add(view, drawer.render_planes(scene, camera))
@@ -119,7 +119,7 @@ def test_sums_of_a_chunk_take_the_place_of_a_view(
         for limit in range(250_000, 750_000, 20_011):
             budget.limit = held + limit
             try:
-                with drawer.load(SCENE, sums_room(SCENE.sh_degree), view_sums=2) as scene:
+                with drawer.load(SCENE, sum_row_bytes(SCENE.sh_degree), view_sums=2) as scene:
                     measure_costs(drawer, scene, views)
                 refit_colours(drawer, planes, degrees, SCENE.origin, views, targets, 1)
                 drawn.append(limit)
@@ -186,10 +186,10 @@ def test_views_read_the_chunks_that_they_see(
     source, views = wide_scene(), cameras()
     read: list[slice] = []
 
-    def drawn(room: Scratch | None) -> list[np.ndarray]:
+    def drawn(storage: ScratchStorage | None) -> list[np.ndarray]:
         drawer = Renderer(open_form(form), large_budget(), extent=extent, antialiased=antialiased)
-        if room is not None:
-            drawer.room = room
+        if storage is not None:
+            drawer.storage = storage
         found = []
         with drawer.load(source) as scene:
             for camera in views:
@@ -208,7 +208,7 @@ def test_views_read_the_chunks_that_they_see(
 
     plain_read, counts = MemorySource.read, []
     monkeypatch.setattr(MemorySource, "read", note)
-    spilled = drawn(Scratch(tmp_path))
+    spilled = drawn(ScratchStorage(tmp_path))
     chunks = -(-source.count // 64)
     # The first view of the scene looks at every chunk, and the one that sees nothing at none.
     assert counts[0] >= chunks and counts[-1] == 0
@@ -260,12 +260,12 @@ def expected(project: Path) -> bytes:
 
 
 @pytest.fixture
-def spilled(compact: None, monkeypatch: pytest.MonkeyPatch) -> list[Scratch]:
+def spilled(compact: None, monkeypatch: pytest.MonkeyPatch) -> list[ScratchStorage]:
     """Every scene goes to scratch files, however small."""
-    rooms: list[Scratch] = []
+    rooms: list[ScratchStorage] = []
 
-    def choose(renderer: Any, source: Any, cameras: Any, options: Any, budget: Any, folder: Path) -> Scratch:
-        rooms.append(Scratch(folder))
+    def choose(renderer: Any, source: Any, cameras: Any, options: Any, budget: Any, folder: Path) -> ScratchStorage:
+        rooms.append(ScratchStorage(folder))
         return rooms[-1]
 
     monkeypatch.setattr(compress_module, "choose_room", choose)
@@ -274,7 +274,7 @@ def spilled(compact: None, monkeypatch: pytest.MonkeyPatch) -> list[Scratch]:
 
 
 def test_the_bytes_are_those_of_a_run_in_memory(
-    project: Path, expected: bytes, spilled: list[Scratch], tmp_path: Path
+    project: Path, expected: bytes, spilled: list[ScratchStorage], tmp_path: Path
 ) -> None:
     result = compress(project / "point_cloud.ply", tmp_path / "a.fgs", layers=2, **TINY)
     assert (tmp_path / "a.fgs").read_bytes() == expected
@@ -287,7 +287,7 @@ class Stop(BaseException):
 
 
 def test_a_run_goes_on_from_its_last_round(
-    project: Path, expected: bytes, spilled: list[Scratch], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    project: Path, expected: bytes, spilled: list[ScratchStorage], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = {**TINY, "layers": 2, "resume": True, "scratch": str(tmp_path / "kept")}
     (tmp_path / "kept").mkdir()
@@ -328,7 +328,7 @@ def test_a_run_goes_on_from_its_last_round(
 
 
 def test_a_full_disk_leaves_nothing_behind(
-    project: Path, spilled: list[Scratch], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    project: Path, spilled: list[ScratchStorage], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reserve = os.posix_fallocate
     calls = []

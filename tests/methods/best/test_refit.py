@@ -17,13 +17,13 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.references import TargetViews
+from flexgs_edge.views.references import References
 from kernel_fixtures import large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
 
 COUNT = 120
 Planes = dict[str, np.ndarray]
-OPENED: list[TargetViews] = []
+OPENED: list[References] = []
 
 
 @pytest.fixture(autouse=True)
@@ -65,7 +65,7 @@ class Bench:
         self.renderer, self.cameras = Renderer(open_form(form), large_budget()), poses(views)
         self.original = self.images(planes)
         with self.renderer.load(MemorySource(planes)) as scene:
-            self.targets = TargetViews.of(self.renderer, scene, self.cameras)
+            self.targets = References.of(self.renderer, scene, self.cameras)
         OPENED.append(self.targets)
 
     def images(self, planes: Planes) -> list[np.ndarray]:
@@ -229,7 +229,7 @@ def test_targets_are_the_renders_in_half_precision(tmp_path: Path) -> None:
     renderer, cameras = Renderer(open_form("w16"), large_budget(), background=(0.2, 0.4, 0.6)), poses(2)
     cameras += [make_camera(17, 33), make_camera(64, 16)]
     with renderer.load(MemorySource(planes)) as scene:
-        with TargetViews.of(renderer, scene, cameras, tmp_path) as targets:
+        with References.of(renderer, scene, cameras, tmp_path) as targets:
             for view in (3, 0, 2, 1, 0):
                 camera, target = cameras[view], targets[view]
                 assert target.dtype == np.float16 and target.shape[0] == 3
@@ -261,9 +261,9 @@ def test_the_scratch_file_goes_when_something_fails(tmp_path: Path, monkeypatch:
         monkeypatch.setattr("flexgs_edge.views.references.tempfile.TemporaryFile", remembered)
         monkeypatch.setattr(renderer, "render_planes", fail_at_last)
         with pytest.raises(KeyboardInterrupt):
-            TargetViews.of(renderer, scene, cameras, tmp_path)
+            References.of(renderer, scene, cameras, tmp_path)
         monkeypatch.setattr(renderer, "render_planes", plain)
-        with pytest.raises(ZeroDivisionError), TargetViews.of(renderer, scene, cameras, tmp_path):
+        with pytest.raises(ZeroDivisionError), References.of(renderer, scene, cameras, tmp_path):
             raise ZeroDivisionError
     assert len(files) == 2 and all(file.closed for file in files)
     assert list(tmp_path.iterdir()) == []

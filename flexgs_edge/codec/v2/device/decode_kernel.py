@@ -18,7 +18,7 @@ from flexgs_edge.codec.v2.rans import StreamError, first_states, lane_count
 from flexgs_edge.codec.v2.walk import ChunkCodes, base_kinds
 from flexgs_edge.constants import CODE_LIMIT, RANS_LANES
 from flexgs_edge.constants import RANS_PRECISION as PRECISION
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.scene.fields import sh_rest_count
 
 _ROWS, _LANES, _WORDS, _STATUS, _FOUND, _FOUND_HIGH, _WANTED, _AT = range(len(INFO))
@@ -30,7 +30,7 @@ class RowSteps:
     """What makes values of codes: position code of the first cell, and the steps."""
 
     low: tuple[int, int, int]
-    steps: Steps
+    steps: StepSizes
 
     def packed(self) -> np.ndarray:
         """[6 + 2 D] f32: position, scale, rotation, opacity, then luma and chroma of every degree from 0."""

@@ -17,7 +17,7 @@ from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.references import TargetViews
+from flexgs_edge.views.references import References
 from flexgs_edge.views.sums import Maker, ViewSums
 
 RELAX_DC = 1.0
@@ -34,7 +34,7 @@ def refit_colours(
     degrees: np.ndarray,
     origin: np.ndarray,
     cameras: Sequence[Camera],
-    targets: TargetViews,
+    targets: References,
     rounds: int,
     bands: bool = True,
     subsets: int = 1,
@@ -53,7 +53,7 @@ def refit_colours(
         [n] SH degree kept for each row: coefficients above it stay zero.
     origin : np.ndarray
         [3] f64, as in `SceneSource`.
-    targets : TargetViews
+    targets : References
         The original from `cameras`.
     rounds : int
         Times that every pose is looked at.
@@ -67,13 +67,13 @@ def refit_colours(
     dict
         The planes, with new `sh_dc` and `sh_rest`.
     """
-    room = renderer.room
-    planes = {**planes, "sh_dc": room.copy(planes["sh_dc"]), "sh_rest": room.copy(planes["sh_rest"])}
+    storage = renderer.storage
+    planes = {**planes, "sh_dc": storage.copy(planes["sh_dc"]), "sh_rest": storage.copy(planes["sh_rest"])}
     subsets = max(min(subsets, len(cameras)), 1)
     parts = [range(first, len(cameras), subsets) for _ in range(rounds) for first in range(subsets)]
     source = MemorySource(planes, origin=origin)
-    room_of_sums = sum_bytes(4) + normal_bytes(source.sh_degree)
-    with renderer.load(source, room_of_sums, targets=True, view_sums=4) as scene:
+    sum_bytes_a_row = sum_bytes(4) + normal_bytes(source.sh_degree)
+    with renderer.load(source, sum_bytes_a_row, targets=True, view_sums=4) as scene:
         for part in progress.track(parts, "refitting colours", len(parts)):
             normal = ViewSums(renderer, scene, [normal_sums(renderer)])
             try:

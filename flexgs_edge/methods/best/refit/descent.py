@@ -10,7 +10,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import LANES
 from flexgs_edge.errors import BudgetError
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import sum_bytes
@@ -100,7 +100,7 @@ class Descent:
         self._arrays.append(self.backend.array(shape, np.float32))
         return self._arrays[-1]
 
-    def put_on(self, steps: Steps | None) -> None:
+    def put_on(self, steps: StepSizes | None) -> None:
         """Draw from values on this grid from now on (None: from the values themselves)."""
         self.backend.write(self._steps, step_record(steps))
         for part in self._parts:
@@ -243,7 +243,7 @@ def _fields(planes: dict[str, np.ndarray], own: dict[str, int]) -> Iterator[tupl
         at += width
 
 
-def step_record(steps: Steps | None) -> np.ndarray:
+def step_record(steps: StepSizes | None) -> np.ndarray:
     """What `snap` takes for steps (None: zeros)."""
     record = np.zeros(GRID_VALUES, np.float32)
     if steps is not None:

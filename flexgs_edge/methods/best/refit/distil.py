@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.grid.step_sizes import Steps
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.rotations import canonical_axes
-from flexgs_edge.views.references import TargetViews
+from flexgs_edge.views.references import References
 
 MEANS_RATE = 1.6e-4
 """Largest change of a position in a step, as a share of the cameras' extent (the reference program's first rate)."""
@@ -82,9 +82,9 @@ def distil(
     degrees: np.ndarray,
     origin: np.ndarray,
     cameras: Sequence[Camera],
-    targets: TargetViews,
+    targets: References,
     schedule: Schedule,
-    steps: Steps | None = None,
+    steps: StepSizes | None = None,
     progress: Progress = SILENT,
     rates: dict[str, float] | None = None,
 ) -> dict[str, np.ndarray]:
@@ -98,9 +98,9 @@ def distil(
         [n] SH degree kept for each row: coefficients above it stay zero.
     origin : np.ndarray
         [3] f64, as in `SceneSource`.
-    targets : TargetViews
+    targets : References
         The original from `cameras`.
-    steps : Steps, optional
+    steps : StepSizes, optional
         The grid that the values will be put on: the last steps repair its rounding.
 
     Returns
