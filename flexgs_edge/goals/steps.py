@@ -120,7 +120,7 @@ def better(step: Point, other: Point, target: Target) -> bool:
     if not step.holds:
         return step.excess < other.excess
     if target.limit_bytes is not None and step.measurement is not None and other.measurement is not None:
-        return step.measurement.loss(target.judge) < other.measurement.loss(target.judge)
+        return step.measurement.loss(target.figure) < other.measurement.loss(target.figure)
     return step.size < other.size
 
 

@@ -13,7 +13,7 @@ from typing import Literal, Protocol
 from flexgs_edge.errors import InputError
 from flexgs_edge.units import format_size
 
-Judge = Literal["drop", "modelled drop", "fidelity"]
+Figure = Literal["drop", "modelled drop", "fidelity"]
 """Which figure decides: the drop against photos, the modelled drop, or the PSNR against the original's renders."""
 
 IDENTICAL_DB = 200.0
@@ -41,25 +41,25 @@ class Measurement:
     modelled_drop: float
     worst: Measurement | None = None
 
-    def figure(self, judge: Judge) -> float | None:
-        """The figure that `judge` names, dB (`None`: identical, or no photos)."""
-        return {"drop": self.drop, "modelled drop": self.modelled_drop, "fidelity": self.fidelity}[judge]
+    def figure(self, figure: Figure) -> float | None:
+        """What `figure` names, dB (`None`: identical, or no photos)."""
+        return {"drop": self.drop, "modelled drop": self.modelled_drop, "fidelity": self.fidelity}[figure]
 
-    def loss(self, judge: Judge) -> float:
+    def loss(self, figure: Figure) -> float:
         """The same figure as a number that grows as quality falls."""
-        if judge == "fidelity":
+        if figure == "fidelity":
             return -IDENTICAL_DB if self.fidelity is None else -self.fidelity
-        figure = self.figure(judge)
-        if figure is None:
+        value = self.figure(figure)
+        if value is None:
             raise InputError("the drop against photos was asked to decide, but there are no photos")
-        return figure
+        return value
 
 
 class Target(Protocol):
     """What `adapt` needs to know of a target."""
 
     @property
-    def judge(self) -> Judge: ...
+    def figure(self) -> Figure: ...
 
     @property
     def limit_bytes(self) -> int | None:
@@ -77,10 +77,10 @@ class Target(Protocol):
 
 @dataclass(frozen=True)
 class MaxDrop:
-    """Lose at most `limit` dB, by photos (`judge="drop"`) or modelled (`judge="modelled drop"`)."""
+    """Lose at most `limit` dB, by photos (`figure="drop"`) or modelled (`figure="modelled drop"`)."""
 
     limit: float
-    judge: Judge = "drop"
+    figure: Figure = "drop"
     limit_bytes: int | None = None
 
     def __post_init__(self) -> None:
@@ -89,14 +89,14 @@ class MaxDrop:
 
     def excess(self, size: int, measurement: Measurement | None) -> float:
         assert measurement is not None
-        return _log_loss(measurement.loss(self.judge), self.limit)
+        return _log_loss(measurement.loss(self.figure), self.limit)
 
     def describe(self) -> str:
-        return f"{self.judge} <= {self.limit:g} dB"
+        return f"{self.figure} <= {self.limit:g} dB"
 
     def report(self, size: int, measurement: Measurement | None) -> str:
         assert measurement is not None
-        return f"{self.judge} {measurement.loss(self.judge):.3f} dB at {format_size(size)}"
+        return f"{self.figure} {measurement.loss(self.figure):.3f} dB at {format_size(size)}"
 
 
 def _log_loss(loss: float, limit: float) -> float:
@@ -112,7 +112,7 @@ class MinFidelity:
     """Keep a PSNR of at least `limit` dB against the original's renders."""
 
     limit: float
-    judge: Judge = "fidelity"
+    figure: Figure = "fidelity"
     limit_bytes: int | None = None
 
     def __post_init__(self) -> None:
@@ -140,7 +140,7 @@ class WorstToo:
 
     target: MaxDrop | MinFidelity
     limit_worst: float
-    drop: Judge
+    drop: Figure
     """What the worst view loses is told by this figure: `drop` or `modelled drop`."""
     limit_bytes: int | None = None
 
@@ -151,9 +151,9 @@ class WorstToo:
             )
 
     @property
-    def judge(self) -> Judge:
+    def figure(self) -> Figure:
         """The figure of the mean."""
-        return self.target.judge
+        return self.target.figure
 
     @property
     def limit(self) -> float:
@@ -177,10 +177,10 @@ class WorstToo:
 
 @dataclass(frozen=True)
 class MaxSize:
-    """Stay within `limit_bytes`; `judge` picks the best of the points that fit."""
+    """Stay within `limit_bytes`; `figure` picks the best of the points that fit."""
 
     limit_bytes: int
-    judge: Judge = "modelled drop"
+    figure: Figure = "modelled drop"
     words: str = ""
 
     def __post_init__(self) -> None:
@@ -194,11 +194,11 @@ class MaxSize:
         return self.words or f"size <= {format_size(self.limit_bytes)}"
 
     def report(self, size: int, measurement: Measurement | None) -> str:
-        figure = None if measurement is None else measurement.figure(self.judge)
-        return f"{size} bytes ({format_size(size)})" + ("" if figure is None else f", {self.judge} {figure:.3f} dB")
+        value = None if measurement is None else measurement.figure(self.figure)
+        return f"{size} bytes ({format_size(size)})" + ("" if value is None else f", {self.figure} {value:.3f} dB")
 
 
-def min_ratio(ratio: float, ply_bytes: int, judge: Judge = "modelled drop") -> MaxSize:
+def min_ratio(ratio: float, ply_bytes: int, figure: Figure = "modelled drop") -> MaxSize:
     """The size target behind `--min-ratio`: PLY bytes / ratio, rounded down.
 
     >>> min_ratio(10.0, 2480).limit_bytes
@@ -207,4 +207,4 @@ def min_ratio(ratio: float, ply_bytes: int, judge: Judge = "modelled drop") -> M
     if not (math.isfinite(ratio) and ratio >= 1.0):
         raise InputError(f"--min-ratio {ratio:g}: expected a ratio of 1 or more")
     limit = int(ply_bytes / ratio)
-    return MaxSize(max(limit, 1), judge, f"ratio >= {ratio:g} (size <= {format_size(limit)})")
+    return MaxSize(max(limit, 1), figure, f"ratio >= {ratio:g} (size <= {format_size(limit)})")

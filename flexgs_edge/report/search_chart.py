@@ -32,7 +32,7 @@ td.bar span { display: block; height: .7rem; min-width: 1px; background: var(--m
 
 def step_chart(steps: Sequence[Step], chosen: Step, target: Target) -> str:
     """Size against the figure that judges, a mark a step; empty with fewer than two steps that were measured."""
-    judge = target.judge
+    judge = target.figure
     # The chosen step may be equal to others in all its figures: it is found by identity.
     points = [(s.size, figure, s) for s in steps if (figure := _figure(s.measurement, target)) is not None]
     if len(points) < 2:
@@ -87,7 +87,7 @@ _KEY = "&ensp; ".join(
 
 def _figure(measurement: Measurement | None, target: Target) -> float | None:
     """`None` for identical renders too: they have no place on a scale in dB."""
-    return None if measurement is None else measurement.figure(target.judge)
+    return None if measurement is None else measurement.figure(target.figure)
 
 
 def _target_line(target: Target, limit: float | None, x: object, y: object) -> str:

@@ -11,7 +11,7 @@ from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, MAX_VIEW_W
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.steps import REFINE_STEPS
-from flexgs_edge.goals.target import Judge, MaxDrop, MaxSize, MinFidelity, Target, WorstToo, min_ratio
+from flexgs_edge.goals.target import Figure, MaxDrop, MaxSize, MinFidelity, Target, WorstToo, min_ratio
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 
 NO_PHOTOS = "none"
@@ -280,17 +280,17 @@ class CompressOptions(ViewOptions):
             raise InputError(f"--prune-rate {self.prune_rate:g}: expected less than 1: nothing would be left to draw")
         return choice
 
-    def target(self, judge: Judge, ply_bytes: int) -> Target | None:
-        """The target; `judge` is the figure that decides on drops, `None` comes back for fixed rates."""
+    def target(self, figure: Figure, ply_bytes: int) -> Target | None:
+        """The target; `figure` is what decides on drops, `None` comes back for fixed rates."""
         if self.fixed is not None:
             return None
         if self.max_size is not None:
-            return MaxSize(self.max_size, judge)
+            return MaxSize(self.max_size, figure)
         if self.min_ratio is not None:
-            return min_ratio(self.min_ratio, ply_bytes, judge)
-        drop = MaxDrop(DEFAULT_MAX_DROP if self.max_drop is None else self.max_drop, judge)
+            return min_ratio(self.min_ratio, ply_bytes, figure)
+        drop = MaxDrop(DEFAULT_MAX_DROP if self.max_drop is None else self.max_drop, figure)
         mean = drop if self.min_fidelity is None else MinFidelity(self.min_fidelity)
-        return mean if self.max_worst_drop is None else WorstToo(mean, self.max_worst_drop, judge)
+        return mean if self.max_worst_drop is None else WorstToo(mean, self.max_worst_drop, figure)
 
     def bit_spec(self) -> tuple[BitSpec | None, int | None]:
         """Bits (`None`: to be searched) and groups that `--bits` and `--groups` ask for."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.target import Judge, Target
+from flexgs_edge.goals.target import Figure, Target
 from flexgs_edge.run.inputs import Scene
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.view_set import WITHOUT_VIEWS, ViewSet
@@ -24,7 +24,7 @@ class Plan:
 
     decide: list[int]
     report: list[int]
-    judge: Judge
+    figure: Figure
     target: Target | None
     needs_scores: bool
     computes_scores: bool
@@ -62,12 +62,12 @@ class Plan:
                 "give more views, or --holdout 0 --select train"
             )
         on_train = options.select == "train"
-        judge: Judge = "drop" if views.photos is not None and not on_train else "modelled drop"
+        figure: Figure = "drop" if views.photos is not None and not on_train else "modelled drop"
         return cls(
             decide=views.train if on_train else views.held_out,
             report=views.held_out or views.train,
-            judge=judge,
-            target=options.target(judge, scene.ply_bytes),
+            figure=figure,
+            target=options.target(figure, scene.ply_bytes),
             needs_scores=needs_scores,
             computes_scores=computes,
         )
@@ -77,7 +77,7 @@ class Plan:
         """The figure that decides: `drop`, `modelled drop`, `fidelity` or `size`; `None` for fixed rates."""
         if self.target is None:
             return None
-        return "size" if self.target.limit_bytes is not None else self.target.judge
+        return "size" if self.target.limit_bytes is not None else self.target.figure
 
     @staticmethod
     def kind_of(indices: list[int], views: ViewSet | None) -> str:

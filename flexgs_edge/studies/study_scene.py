@@ -56,7 +56,7 @@ class Point:
     measurement: Measurement
 
 
-class Bench:
+class StudyScene:
     """A scene, its judge and everything measured so far.
 
     Parameters
@@ -105,13 +105,13 @@ class Bench:
     @property
     def figure(self) -> str:
         """The column that decides: `drop` with photos, else `modelled_drop`."""
-        return self.plan.judge.replace(" ", "_")
+        return self.plan.figure.replace(" ", "_")
 
     @property
     def decided_by(self) -> str:
         """The deciding figure and its views, in words."""
         views = f"{len(self.plan.decide)} {self.plan.kind_of(self.plan.decide, self.views)} views"
-        if self.plan.judge == "drop":
+        if self.plan.figure == "drop":
             return f"drop in PSNR against the photos, mean over {views}"
         return (
             f"modelled drop (no photos: error against the original's renders, from a base of {self.options.base_psnr:g} dB), "
@@ -194,23 +194,23 @@ FIGURES = {
 class _Remembering:
     """The evaluator that a search gets: what the bench has measured is not measured again."""
 
-    def __init__(self, bench: Bench) -> None:
-        self.bench = bench
+    def __init__(self, studied: StudyScene) -> None:
+        self.studied = studied
 
     def size(self, choice: Choice) -> int:
-        return self.bench.size(Setting(choice))
+        return self.studied.size(Setting(choice))
 
     def measure(self, choice: Choice) -> Measurement:
-        return self.bench.point(Setting(choice)).measurement
+        return self.studied.point(Setting(choice)).measurement
 
     def estimate(self, choice: Choice) -> Measurement:
-        return self.bench.evaluator(Setting()).estimate(choice)
+        return self.studied.evaluator(Setting()).estimate(choice)
 
 
 @contextmanager
-def open_bench(
+def open_study_scene(
     path: str | Path, name: str, options: CompressOptions, progress: Progress, scores: Sequence[str] = ("gs",)
-) -> Iterator[Bench]:
+) -> Iterator[StudyScene]:
     """Open a scene, draw the original's renders and score every Gaussian, as `compress --method paper` does.
 
     Raises
@@ -234,7 +234,7 @@ def open_bench(
         renderer = workspace.renderer
         budget.take("ranks", RANK_BYTES * scene.source.count * len(scores))
         judge = Judge(
-            renderer, scene.source, views, plan.decide, budget, plan.judge == "drop", base_psnr=options.base_psnr
+            renderer, scene.source, views, plan.decide, budget, plan.figure == "drop", base_psnr=options.base_psnr
         )
         stack.callback(judge.close)
         with clock.stage("load"):
@@ -250,7 +250,7 @@ def open_bench(
                     found = score_scene(renderer, original, scene.source, cameras, score, progress)
                     orders[score] = order_from_scores(found)
         renderer.release()
-        yield Bench(name, scene, views, plan, options, workspace, judge, orders, has_sh, progress)
+        yield StudyScene(name, scene, views, plan, options, workspace, judge, orders, has_sh, progress)
 
 
 def scene_names(paths: Sequence[str | Path]) -> list[str]:

@@ -16,7 +16,7 @@ from flexgs_edge.run.view_set import views_info
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.page import Section
 from flexgs_edge.studies.result_tables import json_bytes
-from flexgs_edge.studies.study_scene import Bench
+from flexgs_edge.studies.study_scene import StudyScene
 
 
 @dataclass(frozen=True)
@@ -31,15 +31,15 @@ class SceneStudy:
     run: RunInfo
 
     @classmethod
-    def of(cls, bench: Bench, experiments: list[Experiment]) -> SceneStudy:
+    def of(cls, studied: StudyScene, experiments: list[Experiment]) -> SceneStudy:
         """The experiments made on a bench."""
         return cls(
-            bench.name,
-            scene_info(bench.scene),
-            views_info(bench.views),
-            bench.decided_by,
+            studied.name,
+            scene_info(studied.scene),
+            views_info(studied.views),
+            studied.decided_by,
             tuple(experiments),
-            bench.workspace.run_info(),
+            studied.workspace.run_info(),
         )
 
     def to_json(self) -> dict[str, Any]:

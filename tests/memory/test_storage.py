@@ -96,7 +96,7 @@ def test_rows_in_any_order_are_taken(storage: Storage, monkeypatch: pytest.Monke
             fetched.clear()
             np.testing.assert_array_equal(storage.take(values, rows), values[:, rows])
             assert bool(fetched) is (apart and storage.spills and not whole)
-            np.testing.assert_array_equal(mapped.read_listed(values, rows), values[:, rows])
+            np.testing.assert_array_equal(memory_rows.read_listed(values, rows), values[:, rows])
 
 
 def test_larger_planes_are_held_where_the_limit_is_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

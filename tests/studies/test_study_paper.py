@@ -44,7 +44,7 @@ from flexgs_edge.scene.source import MemorySource, SceneSource
 from flexgs_edge.studies.paper import pruning, quantization, whole
 from flexgs_edge.studies.paper.study import EXPERIMENTS, PaperStudy, study_paper
 from flexgs_edge.studies.result_tables import Table, columns
-from flexgs_edge.studies.study_scene import Bench, Setting, open_bench, scene_names
+from flexgs_edge.studies.study_scene import StudyScene, Setting, open_study_scene, scene_names
 from tiny_project import COUNT, make_project
 
 # On the OpenCL device: hundreds of points are measured here, each seven times as fast as on the twins.
@@ -58,21 +58,21 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def bench(project: Path) -> Iterator[Bench]:
-    with open_bench(project / "point_cloud.ply", "cloud", OPTIONS, SILENT, ("gs", "meson")) as opened:
+def studied(project: Path) -> Iterator[StudyScene]:
+    with open_study_scene(project / "point_cloud.ply", "cloud", OPTIONS, SILENT, ("gs", "meson")) as opened:
         yield opened
 
 
 @pytest.fixture(scope="module")
-def study(project: Path, bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> tuple[PaperStudy, Path]:
+def study(project: Path, studied: StudyScene, tmp_path_factory: pytest.TempPathFactory) -> tuple[PaperStudy, Path]:
     out = tmp_path_factory.mktemp("written") / "out"
     with pytest.MonkeyPatch.context() as patch:
         # The bench of the other tests, which has measured most points: a second one would double their time.
-        patch.setattr("flexgs_edge.studies.paper.study.open_bench", lambda *words, **more: nullcontext(bench))
+        patch.setattr("flexgs_edge.studies.paper.study.open_study_scene", lambda *words, **more: nullcontext(studied))
         return study_paper([project / "point_cloud.ply"], out, OPTIONS), out
 
 
-def drop_of(bench: Bench, project: Path, scene: SceneSource) -> float:
+def drop_of(studied: StudyScene, project: Path, scene: SceneSource) -> float:
     """Drop of `scene`, with nothing of the judge: rendered by the twins, photos read as 8-bit files, PSNRs by hand."""
     budget = MemoryBudget(2**30)
     renderer = Renderer(open_backend("numpy", budget), budget)
@@ -81,7 +81,7 @@ def drop_of(bench: Bench, project: Path, scene: SceneSource) -> float:
     for camera in cameras:
         photo = np.asarray(Image.open(project / "images" / f"{camera.name}.png"), np.float64) / 255
         errors = []
-        for source in (bench.scene.source, scene):
+        for source in (studied.scene.source, scene):
             with renderer.load(source) as loaded:
                 image = np.clip(renderer.render(loaded, camera).astype(np.float64), 0, 1)
             errors.append(np.mean((image - photo) ** 2))
@@ -89,12 +89,12 @@ def drop_of(bench: Bench, project: Path, scene: SceneSource) -> float:
     return float(np.mean(drops))
 
 
-def decoded(bench: Bench, setting: Setting) -> SceneSource:
+def decoded(studied: StudyScene, setting: Setting) -> SceneSource:
     """The scene of a setting, dequantized into memory."""
-    rows = select_rows(ranks_from_order(bench.orders[setting.score]), setting.choice, bench.has_sh)
-    quantized = quantize_scene(bench.scene.source, *rows, setting.bits, setting.groups)
+    rows = select_rows(ranks_from_order(studied.orders[setting.score]), setting.choice, studied.has_sh)
+    quantized = quantize_scene(studied.scene.source, *rows, setting.bits, setting.groups)
     arrays = {field.name: dequantize(quantized.arrays[field.name], slice(None)) for field in FIELDS}
-    degree = bench.scene.source.sh_degree
+    degree = studied.scene.source.sh_degree
     rest = np.zeros((9, quantized.count), np.float32)
     if quantized.sh_count:
         rest[:, : quantized.sh_count] = arrays["sh_rest"]
@@ -110,48 +110,48 @@ def decoded(bench: Bench, setting: Setting) -> SceneSource:
     ],
     ids=["rtn", "pruned", "meson in 7 groups"],
 )
-def test_a_point_agrees_with_direct_evaluation(bench: Bench, project: Path, setting: Setting) -> None:
-    point = bench.point(setting)
-    assert point.measurement.drop == pytest.approx(drop_of(bench, project, decoded(bench, setting)), abs=1e-4)
+def test_a_point_agrees_with_direct_evaluation(studied: StudyScene, project: Path, setting: Setting) -> None:
+    point = studied.point(setting)
+    assert point.measurement.drop == pytest.approx(drop_of(studied, project, decoded(studied, setting)), abs=1e-4)
     kept = COUNT - COUNT * setting.choice.prune // 1000
     with_sh = COUNT - COUNT * (setting.choice.prune + setting.choice.sh) // 1000
     assert point.size == container_size(kept, with_sh, 1, setting.bits, setting.groups)
-    assert bench.point(setting) is point, "measured once"
+    assert studied.point(setting) is point, "measured once"
 
 
-def test_rtn_has_one_width_and_one_range(bench: Bench) -> None:
-    rows = quantization.rtn(bench).table.rows
+def test_rtn_has_one_width_and_one_range(studied: StudyScene) -> None:
+    rows = quantization.rtn(studied).table.rows
     assert [row["bits"] for row in rows] == [2, 3, 4, 5, 6, 7, 8, None]
     sizes = [row["size"] for row in rows[:-1]]
     # A bit more costs a bit a value; planes end at whole bytes, and one group has 8 bytes a channel at every width.
     assert np.diff(sizes).tolist() == [math.ceil(COUNT / 8) * FLOATS_AT_DEGREE_1] * 6
-    assert rows[-1] == {"coding": "MPQ", "bits": None, **bench.cells(bench.point(Setting()))}
+    assert rows[-1] == {"coding": "MPQ", "bits": None, **studied.cells(studied.point(Setting()))}
 
 
-def test_attributes_change_alone(bench: Bench) -> None:
-    experiment = quantization.attributes(bench)
+def test_attributes_change_alone(studied: StudyScene) -> None:
+    experiment = quantization.attributes(studied)
     assert [row["attribute"] for row in experiment.table.rows[1::2]] == ["xyz", "dc", "rest", "opacity", "scale", "rot"]
-    fine = bench.point(Setting(bits=BitSpec.rtn(16)))
+    fine = studied.point(Setting(bits=BitSpec.rtn(16)))
     for row in experiment.table.rows[1:]:
         bits = replace(BitSpec.rtn(16), **{str(row["attribute"]): int(row["bits"] or 0)})
         assert row["size"] == container_size(COUNT, COUNT, 1, bits)
-        rise = bench.error(bench.point(Setting(bits=bits))) - bench.error(fine)
+        rise = studied.error(studied.point(Setting(bits=bits))) - studied.error(fine)
         assert row["rise"] == pytest.approx(rise, rel=1e-3)
     at_four = dict(zip(experiment.table.values("attribute", bits=4), experiment.table.values("rise", bits=4)))
     at_eight = dict(zip(experiment.table.values("attribute", bits=8), experiment.table.values("rise", bits=8)))
     assert all(at_four[name] > at_eight[name] for name in at_four)
 
 
-def test_equal_bytes_are_equal(bench: Bench) -> None:
-    table = pruning.splits(bench).table
+def test_equal_bytes_are_equal(studied: StudyScene) -> None:
+    table = pruning.splits(studied).table
     ladders = {
-        "Row-P": [bench.size(Setting(Choice(rate, 0))) for rate in range(pruning.MAX_ROWS + 1)],
-        "SH-P": [bench.size(Setting(Choice(0, rate))) for rate in range(1001)],
+        "Row-P": [studied.size(Setting(Choice(rate, 0))) for rate in range(pruning.MAX_ROWS + 1)],
+        "SH-P": [studied.size(Setting(Choice(0, rate))) for rate in range(1001)],
     }
     compared = 0
     for row in table.rows:
         choice = Choice.from_rates(float(row["prune_rate"] or 0), float(row["sh_rate"] or 0))
-        assert row["size"] == bench.size(Setting(choice))
+        assert row["size"] == studied.size(Setting(choice))
         if row["method"] not in ladders:
             assert row["size"] == row["equal_to"]
             continue
@@ -169,8 +169,8 @@ def test_equal_bytes_are_equal(bench: Bench) -> None:
     assert out_of_reach and not set(out_of_reach) & set(table.values("equal_to", method="SH-P"))
 
 
-def test_the_plane_and_the_search_on_it(bench: Bench, project: Path) -> None:
-    experiment = pruning.plane(bench)
+def test_the_plane_and_the_search_on_it(studied: StudyScene, project: Path) -> None:
+    experiment = pruning.plane(studied)
     table = experiment.table
     grid = [row for row in table.rows if row["kind"] in ("cell", "candidate")]
     assert len(grid) == sum(11 - p for p in range(10))
@@ -185,7 +185,7 @@ def test_the_plane_and_the_search_on_it(bench: Bench, project: Path) -> None:
     (answer,) = (row for row in steps if row["kind"] == "answer")
     assert (answer["prune_rate"], answer["sh_rate"], answer["size"]) == (made.prune_rate, made.sh_rate, made.size)
     choice = Choice.from_rates(made.prune_rate, made.sh_rate)
-    assert answer["drop"] == pytest.approx(drop_of(bench, project, decoded(bench, Setting(choice))), abs=1e-3)
+    assert answer["drop"] == pytest.approx(drop_of(studied, project, decoded(studied, Setting(choice))), abs=1e-3)
     assert isinstance(experiment.chart, PlaneChart)
     assert experiment.chart.answer == (made.prune_rate, made.sh_rate)
     assert experiment.chart.cells == {(row["prune_rate"], row["sh_rate"]): row["drop"] for row in grid}
@@ -199,24 +199,24 @@ def test_the_frontier_lies_where_the_loss_passes_the_limit() -> None:
     assert found == [(pytest.approx((1.25 - s / 10) / 4, abs=1e-4), s / 10) for s in range(10)]
 
 
-def test_parts_have_the_bytes_of_what_is_left(bench: Bench, project: Path) -> None:
-    table = whole.parts(bench).table
+def test_parts_have_the_bytes_of_what_is_left(studied: StudyScene, project: Path) -> None:
+    table = whole.parts(studied).table
     plain, pruned, quantized, both = table.rows
-    choice = bench.search.chosen.choice
+    choice = studied.search.chosen.choice
     kept, with_sh = COUNT - choice.pruned(COUNT), COUNT - choice.boundary(COUNT)
     assert plain["size"] == 4 * FLOATS_AT_DEGREE_1 * COUNT and plain["drop"] == 0.0
     assert pruned["size"] == 4 * (14 * kept + 9 * with_sh)
-    rows = select_rows(ranks_from_order(bench.orders["gs"]), choice, bench.has_sh)
-    arrays = bench.scene.source.select(np.concatenate(rows)).read(slice(None), [field.name for field in FIELDS])
+    rows = select_rows(ranks_from_order(studied.orders["gs"]), choice, studied.has_sh)
+    arrays = studied.scene.source.select(np.concatenate(rows)).read(slice(None), [field.name for field in FIELDS])
     arrays["sh_rest"][:, with_sh:] = 0
-    alone = MemorySource(arrays, 1, bench.scene.source.origin)
-    assert pruned["drop"] == pytest.approx(drop_of(bench, project, alone), abs=1e-3)
-    assert quantized["size"] == bench.size(Setting()) and both["size"] == bench.size(Setting(choice))
+    alone = MemorySource(arrays, 1, studied.scene.source.origin)
+    assert pruned["drop"] == pytest.approx(drop_of(studied, project, alone), abs=1e-3)
+    assert quantized["size"] == studied.size(Setting()) and both["size"] == studied.size(Setting(choice))
 
 
-def test_a_pruned_source_reads_the_same_in_any_way(bench: Bench) -> None:
-    rows = select_rows(ranks_from_order(bench.orders["gs"]), Choice(250, 500), bench.has_sh)
-    source = whole.Unquantized(bench.scene.source, *rows)
+def test_a_pruned_source_reads_the_same_in_any_way(studied: StudyScene) -> None:
+    rows = select_rows(ranks_from_order(studied.orders["gs"]), Choice(250, 500), studied.has_sh)
+    source = whole.Unquantized(studied.scene.source, *rows)
     everything = source.read(slice(None), ["sh_rest", "means"])
     assert not everything["sh_rest"][:, len(rows[0]) :].any() and everything["sh_rest"][:, : len(rows[0])].any(0).all()
     some = np.arange(0, source.count, 7)
@@ -224,8 +224,8 @@ def test_a_pruned_source_reads_the_same_in_any_way(bench: Bench) -> None:
     assert all(np.array_equal(part[name], everything[name][:, some]) for name in part)
 
 
-def test_groups_differ_in_their_ranges_alone(bench: Bench) -> None:
-    table = quantization.groups(bench).table
+def test_groups_differ_in_their_ranges_alone(studied: StudyScene) -> None:
+    table = quantization.groups(studied).table
     one, default, paper = table.rows[:3]
     assert one["extra_bytes"] == 0 and default["extra_bytes"] == 0, "400 rows make one group"
     # 1000 groups are never more than rows: 8 bytes a channel and further group.
@@ -233,22 +233,22 @@ def test_groups_differ_in_their_ranges_alone(bench: Bench) -> None:
     assert float(paper["error"] or 0) < float(one["error"] or 0)
 
 
-def test_scores_rank_the_same_rows_alike(bench: Bench) -> None:
-    table = pruning.scores(bench).table
+def test_scores_rank_the_same_rows_alike(studied: StudyScene) -> None:
+    table = pruning.scores(studied).table
     assert table.values("size", score="gs") == table.values("size", score="meson"), "every row has SH: counts decide"
     assert table.values("size", score="gs") == sorted(table.values("size", score="gs"), reverse=True)
     for score in ("gs", "meson"):
         row = next(row for row in table.rows if row["score"] == score and row["prune_rate"] == 0.4)
         choice = Choice.from_rates(0.4, float(row["sh_rate"] or 0))
-        assert row["drop"] == round(float(bench.point(Setting(choice, score=score)).measurement.drop or 0), 4)
+        assert row["drop"] == round(float(studied.point(Setting(choice, score=score)).measurement.drop or 0), 4)
 
 
-def test_rates_keep_to_their_sizes_and_say_where_they_end(bench: Bench) -> None:
-    experiment = whole.rates(bench)
+def test_rates_keep_to_their_sizes_and_say_where_they_end(studied: StudyScene) -> None:
+    experiment = whole.rates(studied)
     rows = experiment.table.rows
-    ply = bench.scene.ply_bytes
-    assert (rows[0]["kind"], rows[0]["size"]) == ("least", bench.size(Setting()))
-    assert (rows[-1]["kind"], rows[-1]["size"]) == ("most", bench.size(Setting(whole.STRONGEST)))
+    ply = studied.scene.ply_bytes
+    assert (rows[0]["kind"], rows[0]["size"]) == ("least", studied.size(Setting()))
+    assert (rows[-1]["kind"], rows[-1]["size"]) == ("most", studied.size(Setting(whole.STRONGEST)))
     for row in rows[1:-1]:
         assert int(row["size"] or 0) <= ply / int(row["wanted_ratio"] or 0)
     reached = experiment.table.values("wanted_ratio", kind="search")
@@ -258,13 +258,13 @@ def test_rates_keep_to_their_sizes_and_say_where_they_end(bench: Bench) -> None:
     assert f"not reached: {', '.join(f'{ratio}x' for ratio in missing)}" in experiment.findings[0]
 
 
-def test_times_add_up(bench: Bench) -> None:
-    experiment = whole.times(bench)
+def test_times_add_up(studied: StudyScene) -> None:
+    experiment = whole.times(studied)
     values = dict(zip(experiment.table.values("part"), experiment.table.values("value")))
     stages = sum(value for part, value in values.items() if part.startswith("stage:"))
     assert values["all stages of compress"] == pytest.approx(stages, abs=1e-3)
     steps = [value for part, value in values.items() if part.startswith("search step")]
-    assert values["stage: search"] == pytest.approx(sum(steps), abs=1e-2) and len(steps) == len(bench.search.steps)
+    assert values["stage: search"] == pytest.approx(sum(steps), abs=1e-2) and len(steps) == len(studied.search.steps)
     assert values["peak memory"] > 2**24 and experiment.timed
 
 
@@ -325,19 +325,19 @@ def test_the_same_run_gives_the_same_bytes(
 
 def test_without_photos_the_modelled_drop_decides(project: Path) -> None:
     options = replace(OPTIONS, images="none")
-    with open_bench(project / "point_cloud.ply", "cloud", options, SILENT) as bench:
-        assert bench.figure == "modelled_drop" and "no photos" in bench.decided_by
-        table = quantization.rtn(bench).table
+    with open_study_scene(project / "point_cloud.ply", "cloud", options, SILENT) as studied:
+        assert studied.figure == "modelled_drop" and "no photos" in studied.decided_by
+        table = quantization.rtn(studied).table
         assert table.values("drop") == [None] * 8 and all(value > 0 for value in table.values("modelled_drop"))
 
 
 def test_a_scene_without_held_out_views_or_sh(tmp_path: Path) -> None:
     project = make_project(tmp_path / "plain", photos=False, degree=0)
     options = replace(OPTIONS, holdout=0, select="train", max_drop=1e-4, resolution=20)
-    with open_bench(project / "point_cloud.ply", "plain", options, SILENT, ("gs", "meson")) as bench:
-        assert "9 training views" in bench.decided_by
-        found = {make.__name__: make(bench) for make in (quantization.attributes, pruning.splits, pruning.plane)}
-    assert not bench.search.reached
+    with open_study_scene(project / "point_cloud.ply", "plain", options, SILENT, ("gs", "meson")) as studied:
+        assert "9 training views" in studied.decided_by
+        found = {make.__name__: make(studied) for make in (quantization.attributes, pruning.splits, pruning.plane)}
+    assert not studied.search.reached
     assert "NOT reached" in found["plane"].findings[-1] and "no frontier" in found["plane"].findings[1]
     assert "rest" not in found["attributes"].table.values("attribute")
     # No SH: removing Gaussians is all that ADP can do, and SH-P reaches no smaller file.
@@ -346,12 +346,12 @@ def test_a_scene_without_held_out_views_or_sh(tmp_path: Path) -> None:
         assert picture(experiment.chart)[0].startswith(b"\x89PNG"), experiment.key
 
 
-def test_the_bench_searches_as_the_pipeline_does(bench: Bench) -> None:
-    fresh = adapt(bench.evaluator(Setting()), MaxDrop(4.0), "fast", best_effort=True)
+def test_the_bench_searches_as_the_pipeline_does(studied: StudyScene) -> None:
+    fresh = adapt(studied.evaluator(Setting()), MaxDrop(4.0), "fast", best_effort=True)
     assert [(s.choice, s.size, s.measurement) for s in fresh.steps] == [
-        (s.choice, s.size, s.measurement) for s in bench.search.steps
+        (s.choice, s.size, s.measurement) for s in studied.search.steps
     ]
-    assert bench.evaluator(Setting()).bits == PAPER
+    assert studied.evaluator(Setting()).bits == PAPER
 
 
 def test_missing_matplotlib_is_said_before_any_work(

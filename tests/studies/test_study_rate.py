@@ -39,7 +39,7 @@ from flexgs_edge.studies.rate.curves import Curve
 from flexgs_edge.studies.rate.points import best_points, paper_points
 from flexgs_edge.studies.rate.study import RateStudy, study_rate
 from flexgs_edge.studies.rate.trade import CODERS
-from flexgs_edge.studies.study_scene import Bench, open_bench
+from flexgs_edge.studies.study_scene import StudyScene, open_study_scene
 from synthetic import random_scene
 from tiny_project import COUNT, make_project
 
@@ -55,8 +55,8 @@ def project(short_searches: None, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 @pytest.fixture(scope="module")
-def bench(project: Path) -> Iterator[Bench]:
-    with open_bench(project / "point_cloud.ply", "cloud", OPTIONS, SILENT) as opened:
+def studied(project: Path) -> Iterator[StudyScene]:
+    with open_study_scene(project / "point_cloud.ply", "cloud", OPTIONS, SILENT) as opened:
         yield opened
 
 
@@ -98,15 +98,15 @@ def test_points_are_those_of_compress(study: tuple[RateStudy, Path], project: Pa
         assert row["bits"] == pytest.approx(8 * made.size / made.count, abs=0.01)
 
 
-def test_paper_searches_every_ratio_that_its_bits_alone_miss(bench: Bench) -> None:
-    least, *others = paper_points(bench, [2.0, 5.0, 6.0]).points
-    assert (least.variant, least.kept) == ("nothing pruned", COUNT) and bench.scene.ply_bytes / least.size > 2
+def test_paper_searches_every_ratio_that_its_bits_alone_miss(studied: StudyScene) -> None:
+    least, *others = paper_points(studied, [2.0, 5.0, 6.0]).points
+    assert (least.variant, least.kept) == ("nothing pruned", COUNT) and studied.scene.ply_bytes / least.size > 2
     assert [point.wanted for point in others] == [5.0, 6.0]
-    assert all(bench.scene.ply_bytes / point.size >= (point.wanted or 0) for point in others)
-    assert others[0].size == bench.adapt(min_ratio(5.0, bench.scene.ply_bytes, "drop")).chosen.size
+    assert all(studied.scene.ply_bytes / point.size >= (point.wanted or 0) for point in others)
+    assert others[0].size == studied.adapt(min_ratio(5.0, studied.scene.ply_bytes, "drop")).chosen.size
 
 
-def test_every_variant_is_there_and_keeps_to_the_ratio(study: tuple[RateStudy, Path], bench: Bench) -> None:
+def test_every_variant_is_there_and_keeps_to_the_ratio(study: tuple[RateStudy, Path], studied: StudyScene) -> None:
     rows = [row for row in rows_of(study, "rate") if row["method"] == "best"]
     assert [row["variant"] for row in rows] == ["whole", *CODERS, "whole", "gs ranks", "no refit", "full SH"]
     assert [row["effort"] for row in rows if row["variant"] == "whole"] == ["fast", "max"]
@@ -115,7 +115,7 @@ def test_every_variant_is_there_and_keeps_to_the_ratio(study: tuple[RateStudy, P
             assert float(str(row["ratio"])) >= RATIO
     sizes = [row["size"] for row in rows if row["variant"] not in CODERS]
     assert len(set(sizes)) == len(sizes), "nothing was taken away somewhere"
-    names = [variant.name for variant in ablations.parts_of(bench.orders["gs"], 0)]
+    names = [variant.name for variant in ablations.parts_of(studied.orders["gs"], 0)]
     assert names == ["gs ranks", "one pass", "no refit"], "no SH, nothing to choose of them"
 
 
@@ -140,14 +140,14 @@ def test_the_whole_method_costs_nothing_against_itself(study: tuple[RateStudy, P
 
 
 def test_another_format_holds_the_whole_scene(
-    study: tuple[RateStudy, Path], project: Path, bench: Bench, tmp_path: Path
+    study: tuple[RateStudy, Path], project: Path, studied: StudyScene, tmp_path: Path
 ) -> None:
     (row,) = (row for row in rows_of(study, "rate") if row["method"] == "spz")
     assert row["kept"] == COUNT
     # Rows in another order than the study's: other bytes, the same values.
-    write_foreign(tmp_path / "a.spz", bench.scene.source)
-    with bench.workspace.renderer.load(read_foreign(tmp_path / "a.spz")) as scene:
-        found = bench.judge.compare(scene)
+    write_foreign(tmp_path / "a.spz", studied.scene.source)
+    with studied.workspace.renderer.load(read_foreign(tmp_path / "a.spz")) as scene:
+        found = studied.judge.compare(scene)
     assert row["fidelity"] == pytest.approx(found.fidelity, abs=0.2)
 
 
@@ -192,20 +192,20 @@ def test_without_photos_and_without_the_converter(
     assert "flexgs-edge[formats]" in experiment.findings[-1]
 
 
-def test_a_ratio_out_of_reach_is_said(bench: Bench, project: Path) -> None:
+def test_a_ratio_out_of_reach_is_said(studied: StudyScene, project: Path) -> None:
     # A header of 2 kB is more than a thousandth of the scene.
-    found = best_points(bench, ablations.WHOLE, "fast", [1000.0])
+    found = best_points(studied, ablations.WHOLE, "fast", [1000.0])
     assert found.points == () and found.missing == ("best (whole, fast) at 1000x",)
 
 
-def test_ranks_decide_who_goes_and_costs_how_many(bench: Bench) -> None:
+def test_ranks_decide_who_goes_and_costs_how_many(studied: StudyScene) -> None:
     order = np.random.default_rng(5).permutation(COUNT)
 
     def walk(make: object) -> PruneRounds:
-        cameras = bench.views.of(bench.views.train)
-        workspace = bench.workspace
+        cameras = studied.views.of(studied.views.train)
+        workspace = studied.workspace
         with open_rounds(
-            workspace.renderer, bench.scene.source, cameras, OPTIONS, workspace.budget, workspace.clock, make=make
+            workspace.renderer, studied.scene.source, cameras, OPTIONS, workspace.budget, workspace.clock, make=make
         ) as path:  # type: ignore[arg-type]
             path.descend(0.8)
         return path

@@ -32,7 +32,7 @@ from flexgs_edge.studies.speed.front import front
 from flexgs_edge.studies.speed.scoring import spearman
 from flexgs_edge.studies.speed.study import SpeedStudy, study_speed
 from flexgs_edge.studies.speed.timing import slope
-from flexgs_edge.studies.study_scene import Bench, open_bench
+from flexgs_edge.studies.study_scene import StudyScene, open_study_scene
 from synthetic import look_from, make_camera, random_scene
 from tiny_project import COUNT, VIEWS, make_project
 
@@ -55,8 +55,8 @@ def study(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[t
 
 
 @pytest.fixture(scope="module")
-def bench(project: Path) -> Iterator[Bench]:
-    with open_bench(project / "point_cloud.ply", "cloud", replace(OPTIONS, method="paper"), SILENT) as opened:
+def studied(project: Path) -> Iterator[StudyScene]:
+    with open_study_scene(project / "point_cloud.ply", "cloud", replace(OPTIONS, method="paper"), SILENT) as opened:
         yield opened
 
 
@@ -90,8 +90,8 @@ def test_less_exact_views_are_worse_and_dead_splats_never_show(study: tuple[Spee
     assert figures["half precision", "float16"] > figures["SH degree", "1"]
 
 
-def test_psnr_of_fewer_sh_is_that_of_a_scene_without_them(study: tuple[SpeedStudy, Path], bench: Bench) -> None:
-    source, judge, renderer = bench.scene.source, bench.judge, bench.workspace.renderer
+def test_psnr_of_fewer_sh_is_that_of_a_scene_without_them(study: tuple[SpeedStudy, Path], studied: StudyScene) -> None:
+    source, judge, renderer = studied.scene.source, studied.judge, studied.workspace.renderer
     planes = source.read(slice(0, COUNT), list(FIELD))
     planes["sh_rest"] = np.zeros((0, COUNT), np.float32)
     with renderer.load(MemorySource(planes, origin=source.origin)) as scene:
@@ -113,9 +113,9 @@ def test_lower_degrees_and_half_precision_are_read_row_by_row() -> None:
     assert np.array_equal(half, whole.read(slice(2, 9), ["means"])["means"].astype(np.float16).astype(np.float32))
 
 
-def test_all_views_are_the_reference_of_a_few(study: tuple[SpeedStudy, Path], bench: Bench) -> None:
+def test_all_views_are_the_reference_of_a_few(study: tuple[SpeedStudy, Path], studied: StudyScene) -> None:
     rows = rows_of(study, "scoring")
-    train = len(bench.views.train)
+    train = len(studied.views.train)
     assert [(row["score"], row["poses"], row["views"]) for row in rows if row["score"] == "gs"] == [
         ("gs", "covering", 4), ("gs", "farthest", 4), ("gs", "even", 4), ("gs", "all", train),
     ]  # fmt: skip
@@ -124,12 +124,12 @@ def test_all_views_are_the_reference_of_a_few(study: tuple[SpeedStudy, Path], be
         assert len({r["size"] for r in rows}) == 1, "one size"
     # The paper's search found its answer by the same score.
     (whole,) = (row for row in rows if (row["score"], row["poses"]) == ("gs", "all"))
-    found = bench.search.chosen
+    found = studied.search.chosen
     assert whole["size"] == found.size and found.measurement is not None
     assert whole["drop"] == pytest.approx(found.measurement.drop, abs=1e-4)
 
 
-def test_estimates_of_everything_are_exact_and_shares_are_kept(study: tuple[SpeedStudy, Path], bench: Bench) -> None:
+def test_estimates_of_everything_are_exact_and_shares_are_kept(study: tuple[SpeedStudy, Path], studied: StudyScene) -> None:
     rows = rows_of(study, "sampling")
     for row in rows:
         assert row["trials"] == 5
@@ -137,7 +137,7 @@ def test_estimates_of_everything_are_exact_and_shares_are_kept(study: tuple[Spee
             assert (row["covered"], row["half_width"], row["rms"]) == (5, 0.0, 0.0)
     costs = [row["ms"] for row in rows if row["known"] == "nothing"]
     assert costs == sorted(costs)
-    found = bench.search.chosen.measurement
+    found = studied.search.chosen.measurement
     assert found is not None and f"fidelity {found.fidelity:.3f} dB" in study[0].scene.experiments[3].question
 
 

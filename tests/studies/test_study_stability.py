@@ -38,7 +38,7 @@ from flexgs_edge.studies.stability.breaks import BREAK, LOST, Outcome, curve, of
 from flexgs_edge.studies.stability.moved_scene import NO_TURN, Similarity
 from flexgs_edge.studies.stability.ours import Whole
 from flexgs_edge.studies.stability.study import StabilityStudy, study_stability
-from flexgs_edge.studies.study_scene import Bench, Setting, open_bench
+from flexgs_edge.studies.study_scene import StudyScene, Setting, open_study_scene
 from flexgs_edge.views.depths import visible_depths
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, make_splats, random_scene
@@ -73,9 +73,9 @@ def project(short_searches: None, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 @pytest.fixture(scope="module")
-def bench(project: Path) -> Iterator[Bench]:
+def studied(project: Path) -> Iterator[StudyScene]:
     options = replace(OPTIONS, method="best", effort="fast")
-    with open_bench(project / "point_cloud.ply", "cloud", options, SILENT) as opened:
+    with open_study_scene(project / "point_cloud.ply", "cloud", options, SILENT) as opened:
         yield opened
 
 
@@ -129,9 +129,9 @@ def test_fewer_bits_and_coarser_grids_lose_more(study: Study) -> None:
     assert number(ours["loss"]) <= 1.0
 
 
-def test_rows_of_a_setting_are_the_bench_s(study: Study, bench: Bench) -> None:
+def test_rows_of_a_setting_are_the_bench_s(study: Study, studied: StudyScene) -> None:
     (row,) = rows_of(study, "bits", method="paper (MPQ)")
-    point = bench.point(Setting())
+    point = studied.point(Setting())
     assert row["size"] == point.size and row["loss"] == pytest.approx(point.measurement.drop, abs=1e-4)
 
 
@@ -153,11 +153,11 @@ def test_removal_goes_from_mild_to_harsh(study: Study) -> None:
     assert number(ours["loss"]) < number(random["loss"])
 
 
-def test_scores_from_all_views_are_their_own_reference(study: Study, bench: Bench) -> None:
+def test_scores_from_all_views_are_their_own_reference(study: Study, studied: StudyScene) -> None:
     rows = rows_of(study, "views")
     whole = [row for row in rows if row["poses"] == "all"]
     assert [row["score"] for row in whole] == ["gs", "removal"] and {row["spearman"] for row in whole} == {1.0}
-    chosen = bench.point(Setting(bench.search.chosen.choice)).measurement
+    chosen = studied.point(Setting(studied.search.chosen.choice)).measurement
     assert whole[0]["drop"] == pytest.approx(chosen.drop, abs=1e-4)
     assert {row["poses"] for row in rows} == {"all", "farthest", "first"} and min(number(r["views"]) for r in rows) == 2
 
@@ -170,11 +170,11 @@ def test_halves_judge_both_sides(study: Study) -> None:
         assert number(half["other"]) > number(whole["other"]) - 0.05
 
 
-def test_the_worst_view_and_the_views_that_did_not_decide(study: Study, bench: Bench) -> None:
+def test_the_worst_view_and_the_views_that_did_not_decide(study: Study, studied: StudyScene) -> None:
     rows = rows_of(study, "heldout")
     assert [row["method"] for row in rows] == [*CONTENDERS, heldout.EVEN, heldout.HELD]
     assert number(rows[-1]["worst"]) <= 1.5 and number(rows[-1]["loss"]) <= 1.0
-    names = [camera.name for camera in bench.judge.cameras]
+    names = [camera.name for camera in studied.judge.cameras]
     for row in rows:
         loss, worst = number(row["loss"]), number(row["worst"])
         assert row["within"] == (worst <= number(row["allowed"]) + 1e-9) and row["view"] in names
@@ -187,19 +187,19 @@ def test_the_worst_view_and_the_views_that_did_not_decide(study: Study, bench: B
     assert number(rows[-2]["even"]) <= 1.0
 
 
-def test_a_bit_is_worth_the_same_in_each_pixel_of_fewer(bench: Bench) -> None:
+def test_a_bit_is_worth_the_same_in_each_pixel_of_fewer(studied: StudyScene) -> None:
     """Poses of a fourth of the pixels get a fourth of the multiplier."""
     given: list[float] = []
 
-    def whole_at(bench: Bench, path: PruneRounds, judge: Judge, multiplier: float) -> Whole:
+    def whole_at(studied: StudyScene, path: PruneRounds, judge: Judge, multiplier: float) -> Whole:
         given.append(multiplier)
-        return ours.whole_at(bench, path, judge, multiplier)
+        return ours.whole_at(studied, path, judge, multiplier)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(moves, "whole_at", whole_at)
         for width in (40, 20):
             place = moves.Place(
-                bench, moves.MOVES[moves.AS_IT_IS][0], bench.scene.source, replace(AMOUNTS, few_width=width)
+                studied, moves.MOVES[moves.AS_IT_IS][0], studied.scene.source, replace(AMOUNTS, few_width=width)
             )
             with place.judge() as judge:
                 place.best(judge, 1e-6)
@@ -251,12 +251,12 @@ def test_where_a_method_breaks() -> None:
     assert where_it_breaks(rows[2:], "it", lambda row: "3") == "it breaks at 3 (error: no)."
 
 
-def test_errors_are_rows_and_not_the_end(bench: Bench) -> None:
+def test_errors_are_rows_and_not_the_end(studied: StudyScene) -> None:
     def fails() -> tuple[int, MemorySource]:
         raise InputError("too far")
 
-    found = of_source(bench, fails)
-    assert found == Outcome(None, None, "too far") and found.cells(bench)["broke"] == "error: too far"
+    found = of_source(studied, fails)
+    assert found == Outcome(None, None, "too far") and found.cells(studied)["broke"] == "error: too far"
 
 
 def test_breaks_are_crossed_out_in_charts() -> None:

@@ -251,7 +251,7 @@ def _search_size(search: _Search, limit: int, refine_steps: int) -> Step:
     if not edge:
         smallest = search.by_size(box)[-1]
         return search.estimate(smallest, "refine")
-    judge = search.target.judge
+    judge = search.target.figure
 
     def loss(step: Step) -> tuple[float, int]:
         assert step.measurement is not None

@@ -11,7 +11,7 @@ from flexgs_edge.methods.paper.search import CANDIDATES
 from flexgs_edge.report.plots import LineChart, PlaneChart, Series
 from flexgs_edge.studies.experiment import Beside, Experiment
 from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
-from flexgs_edge.studies.study_scene import FIGURES, Bench, Point, Setting
+from flexgs_edge.studies.study_scene import FIGURES, StudyScene, Point, Setting
 
 DIAGONAL = tuple(range(50, 501, 50))
 """Rates p = s of the ADP curve, thousandths: a split that nothing was tuned for."""
@@ -22,10 +22,10 @@ MAX_ROWS = 980
 RATES = {"prune_rate": "p (removed)", "sh_rate": "s (SH removed)"}
 
 
-def candidates(bench: Bench) -> list[Choice]:
+def candidates(studied: StudyScene) -> list[Choice]:
     """The paper's candidates, from most to fewest bytes."""
     choices = [Choice(100 * p, 100 * s) for p, s in CANDIDATES]
-    return sorted(choices, key=lambda choice: (-bench.size(Setting(choice)), choice))
+    return sorted(choices, key=lambda choice: (-studied.size(Setting(choice)), choice))
 
 
 def nearest(sizes: Sequence[int], size: int) -> int | None:
@@ -42,31 +42,31 @@ def nearest(sizes: Sequence[int], size: int) -> int | None:
     return None if end and abs(sizes[best] - size) > step / 2 else best
 
 
-def splits(bench: Bench) -> Experiment:
+def splits(studied: StudyScene) -> Experiment:
     """ADP against row pruning only (Row-P) and SH pruning only (SH-P) at equal bytes."""
     families = {
         "Row-P": [Choice(rate, 0) for rate in range(MAX_ROWS + 1)],
         "SH-P": [Choice(0, rate) for rate in range(1001)],
     }
-    ladders = {name: [bench.size(Setting(choice)) for choice in family] for name, family in families.items()}
+    ladders = {name: [studied.size(Setting(choice)) for choice in family] for name, family in families.items()}
     levels = [("ADP p=s", Choice(rate, rate)) for rate in DIAGONAL]
-    levels += [("ADP candidate", choice) for choice in candidates(bench)]
+    levels += [("ADP candidate", choice) for choice in candidates(studied)]
     wanted: list[tuple[str, str, Choice]] = []
     for kind, choice in levels:
         wanted.append((kind, kind, choice))
         for family, members in families.items():
-            equal = nearest(ladders[family], bench.size(Setting(choice)))
+            equal = nearest(ladders[family], studied.size(Setting(choice)))
             if equal is not None:
                 wanted.append((kind, family, members[equal]))
-    found = bench.points([Setting(choice) for _, _, choice in wanted], "splits")
+    found = studied.points([Setting(choice) for _, _, choice in wanted], "splits")
     rows: list[dict[str, Cell]] = []
     for (level, method, choice), point in zip(wanted, found):
         if level == method:
             equal_to = point.size
-        rows.append({"level": level, "equal_to": equal_to, "method": method, **_rates(choice), **bench.cells(point)})
+        rows.append({"level": level, "equal_to": equal_to, "method": method, **_rates(choice), **studied.cells(point)})
     heads = columns(level="bytes as", equal_to="bytes wanted", method="method", **RATES, **FIGURES)
     table = Table(heads, tuple(rows))
-    figure = bench.figure
+    figure = studied.figure
 
     def series(label: str, level: str, method: str, line: bool = True) -> Series:
         where = {"level": level, "method": method}
@@ -88,7 +88,7 @@ def splits(bench: Bench) -> Experiment:
                 series("SH-P: SH only", "ADP p=s", "SH-P"),
                 series("ADP, the paper's 20 candidates", "ADP candidate", "ADP candidate", line=False),
             ),
-            limit=getattr(bench.target, "limit", None),
+            limit=getattr(studied.target, "limit", None),
             doublings=True,
             magnitudes=True,
         ),
@@ -117,15 +117,15 @@ def _wins(rows: Sequence[dict[str, Cell]], level: str, family: str, figure: str)
     )
 
 
-def plane(bench: Bench) -> Experiment:
+def plane(studied: StudyScene) -> Experiment:
     """The loss over (p, s), the line where the target lies, and the path of the search."""
-    search = bench.search
+    search = studied.search
     line = range(0, 1000, GRID)
     cells = [Choice(p, s) for p in line for s in range(0, 1001 - p, GRID)]
-    found = {point.setting.choice: point for point in bench.points([Setting(choice) for choice in cells], "plane")}
-    listed = set(candidates(bench))
+    found = {point.setting.choice: point for point in studied.points([Setting(choice) for choice in cells], "plane")}
+    listed = set(candidates(studied))
     rows: list[dict[str, Cell]] = [
-        {"kind": "candidate" if choice in listed else "cell", "step": None, **_rates(choice), **bench.cells(point)}
+        {"kind": "candidate" if choice in listed else "cell", "step": None, **_rates(choice), **studied.cells(point)}
         for choice, point in found.items()
     ]
     for number, step in enumerate(search.steps, 1):
@@ -137,31 +137,31 @@ def plane(bench: Bench) -> Experiment:
                 "kind": kind,
                 "step": number,
                 **_rates(step.choice),
-                **bench.figures(step.size, step.measurement),
+                **studied.figures(step.size, step.measurement),
             }
         )
-    figure = bench.figure
-    limit = getattr(bench.target, "limit", None)
+    figure = studied.figure
+    limit = getattr(studied.target, "limit", None)
     assert isinstance(limit, float)
     empty: dict[str, Cell] = dict.fromkeys(FIGURES)
-    frontier = _frontier({choice: _loss(bench, point) for choice, point in found.items()}, limit)
+    frontier = _frontier({choice: _loss(studied, point) for choice, point in found.items()}, limit)
     for p, s in frontier:
         choice = Choice(round(1000 * p), min(round(1000 * s), 1000 - round(1000 * p)))
-        size = bench.size(Setting(choice))
-        ratio = round(bench.scene.ply_bytes / size, 3)
+        size = studied.size(Setting(choice))
+        ratio = round(studied.scene.ply_bytes / size, 3)
         rows.append(
             {"kind": "frontier", "step": None, "prune_rate": p, "sh_rate": s, **empty, "size": size, "ratio": ratio}
         )
     table = Table(columns(kind="kind", step="step", **RATES, **FIGURES), tuple(rows))
     grid = [row for row in rows if row["kind"] in ("cell", "candidate")]
-    chosen = bench.point(Setting(search.chosen.choice))
-    answer = bench.cells(chosen)
-    words = f"{bench.plan.judge} = {limit:g} dB"
+    chosen = studied.point(Setting(search.chosen.choice))
+    answer = studied.cells(chosen)
+    words = f"{studied.plan.figure} = {limit:g} dB"
     return Experiment(
         "plane",
         "The plane of the two rates, and the search on it",
         f"Every cell is a measured file at the paper's bits. The line is where the {words}, interpolated between cells; dots "
-        f"are the paper's candidates; the path is the search for {bench.target.describe()} (effort {bench.options.effort}).",
+        f"are the paper's candidates; the path is the search for {studied.target.describe()} (effort {studied.options.effort}).",
         table,
         PlaneChart(
             "Loss over the two rates, and the path of the search",
@@ -178,8 +178,8 @@ def plane(bench: Bench) -> Experiment:
             _places(row for row in rows if row["kind"] == "answer")[0],
         ),
         (
-            _monotone(found, bench),
-            _slope(frontier, bench),
+            _monotone(found, studied),
+            _slope(frontier, studied),
             f"The search took {len(search.steps)} steps and chose p = {search.chosen.choice.prune / 1000:g}, "
             f"s = {search.chosen.choice.sh / 1000:g}: {answer['ratio']}x at {answer[figure]:.3f} dB"
             + ("." if search.reached else " (the target is NOT reached: this is the closest point)."),
@@ -188,7 +188,7 @@ def plane(bench: Bench) -> Experiment:
             Beside("ratio at the search's answer", f"{answer['ratio']:.1f}x", "19.5x to 28x"),
             Beside(
                 "smaller by, and loss there",
-                f"{100 * (1 - chosen.size / bench.scene.ply_bytes):.1f} %, {answer[figure]:.2f} dB",
+                f"{100 * (1 - chosen.size / studied.scene.ply_bytes):.1f} %, {answer[figure]:.2f} dB",
                 "94.9 / 96.1 / 96.4 %, 0.87 / 0.86 / 0.85 dB (Mip-NeRF360 / Tanks&Temples / Deep Blending)",
             ),
         ),
@@ -207,16 +207,16 @@ def _frontier(losses: dict[Choice, float], limit: float) -> list[tuple[float, fl
     return found
 
 
-def _monotone(found: dict[Choice, Point], bench: Bench) -> str:
+def _monotone(found: dict[Choice, Point], studied: StudyScene) -> str:
     """How often more pruning loses less, over neighbouring cells and over the sorted list."""
     rises = []
     for choice, point in found.items():
         for more in ((choice.prune + GRID, choice.sh), (choice.prune, choice.sh + GRID)):
             other = found.get(Choice(*more)) if sum(more) <= 1000 else None
             if other is not None:
-                rises.append(_loss(bench, other) - _loss(bench, point))
+                rises.append(_loss(studied, other) - _loss(studied, point))
     fell = [rise for rise in rises if rise < 0]
-    walk = [_loss(bench, found[choice]) for choice in candidates(bench)]
+    walk = [_loss(studied, found[choice]) for choice in candidates(studied)]
     back = [b - a for a, b in zip(walk, walk[1:]) if b < a]
     return (
         f"More pruning loses more between {len(rises) - len(fell)} of {len(rises)} neighbouring cells"
@@ -226,37 +226,37 @@ def _monotone(found: dict[Choice, Point], bench: Bench) -> str:
     )
 
 
-def _slope(frontier: Sequence[tuple[float, float]], bench: Bench) -> str:
+def _slope(frontier: Sequence[tuple[float, float]], studied: StudyScene) -> str:
     """How the frontier lies, against lines of equal bytes."""
     if len(frontier) < 2:
         return f"The target lies on fewer than two rows of the plane ({len(frontier)}): no frontier to speak of."
     (p, s), (q, t) = frontier[0], frontier[-1]
     across = f"{(q - p) / (t - s):.2f} in p for each s"
-    sizes = [bench.size(Setting(choice)) for choice in (Choice(0, 0), Choice(100, 0), Choice(0, 100))]
+    sizes = [studied.size(Setting(choice)) for choice in (Choice(0, 0), Choice(100, 0), Choice(0, 100))]
     equal = -(sizes[0] - sizes[2]) / (sizes[0] - sizes[1])
-    best = min(frontier, key=lambda at: bench.size(Setting(Choice.from_rates(*at))))
+    best = min(frontier, key=lambda at: studied.size(Setting(Choice.from_rates(*at))))
     return (
         f"The frontier goes from (p, s) = ({p:.2f}, {s:g}) to ({q:.2f}, {t:g}): {across} (at equal bytes: {equal:.2f}); of its "
         f"points ({best[0]:.2f}, {best[1]:g}) has the fewest bytes."
     )
 
 
-def scores(bench: Bench) -> Experiment:
+def scores(studied: StudyScene) -> Experiment:
     """Ranking by gs (hits) against meson (weights), at the paper's candidates."""
     kinds = ("gs", "meson")
-    wanted = [Setting(choice, score=score) for choice in candidates(bench) for score in kinds]
+    wanted = [Setting(choice, score=score) for choice in candidates(studied) for score in kinds]
     rows: list[dict[str, Cell]] = [
-        {"score": point.setting.score, **_rates(point.setting.choice), **bench.cells(point)}
-        for point in bench.points(wanted, "scores")
+        {"score": point.setting.score, **_rates(point.setting.choice), **studied.cells(point)}
+        for point in studied.points(wanted, "scores")
     ]
     table = Table(columns(score="score", **RATES, **FIGURES), tuple(rows))
-    figure = bench.figure
+    figure = studied.figure
     gs, meson = (table.values(figure, score=score) for score in kinds)
     gaps = [b - a for a, b in zip(gs, meson)]
-    half = bench.scene.source.count // 2
-    low = np.zeros(bench.scene.source.count, bool)
-    low[bench.orders["gs"][:half]] = True
-    same = low[bench.orders["meson"][:half]].sum() / max(half, 1)
+    half = studied.scene.source.count // 2
+    low = np.zeros(studied.scene.source.count, bool)
+    low[studied.orders["gs"][:half]] = True
+    same = low[studied.orders["meson"][:half]].sum() / max(half, 1)
     return Experiment(
         "scores",
         "Ranking by gs or by meson",
@@ -286,8 +286,8 @@ def _rates(choice: Choice) -> dict[str, Cell]:
     return {"prune_rate": choice.prune / 1000, "sh_rate": choice.sh / 1000}
 
 
-def _loss(bench: Bench, point: Point) -> float:
-    return point.measurement.loss(bench.plan.judge)
+def _loss(studied: StudyScene, point: Point) -> float:
+    return point.measurement.loss(studied.plan.figure)
 
 
 def _number(row: dict[str, Cell], column: str) -> float:

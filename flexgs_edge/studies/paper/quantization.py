@@ -10,7 +10,7 @@ from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Table, columns
-from flexgs_edge.studies.study_scene import FIGURES, Bench, Setting
+from flexgs_edge.studies.study_scene import FIGURES, StudyScene, Setting
 
 RTN_BITS = tuple(range(2, 9))
 FINE = BitSpec.rtn(16)
@@ -21,15 +21,15 @@ NAMES = {"xyz": "position", "dc": "colour", "rest": "SH", "opacity": "opacity", 
 """What people call the attributes of `--bits`."""
 
 
-def rtn(bench: Bench) -> Experiment:
+def rtn(studied: StudyScene) -> Experiment:
     """Round to nearest at one width for all channels, beside the paper's widths in sub-groups."""
-    plain = bench.points([Setting(bits=BitSpec.rtn(bits), groups=1) for bits in RTN_BITS], "RTN")
+    plain = studied.points([Setting(bits=BitSpec.rtn(bits), groups=1) for bits in RTN_BITS], "RTN")
     rows: list[dict[str, Cell]] = [
-        {"coding": "RTN", "bits": bits, **bench.cells(point)} for bits, point in zip(RTN_BITS, plain)
+        {"coding": "RTN", "bits": bits, **studied.cells(point)} for bits, point in zip(RTN_BITS, plain)
     ]
-    rows.append({"coding": "MPQ", "bits": None, **bench.cells(bench.point(Setting()))})
+    rows.append({"coding": "MPQ", "bits": None, **studied.cells(studied.point(Setting()))})
     table = Table(columns(coding="coding", bits="bits a value", **FIGURES), tuple(rows))
-    figure = bench.figure
+    figure = studied.figure
 
     def series(label: str, coding: str, notes: list[str]) -> Series:
         sizes = [size / 1e6 for size in table.values("size", coding=coding)]
@@ -59,21 +59,21 @@ def rtn(bench: Bench) -> Experiment:
     )
 
 
-def attributes(bench: Bench) -> Experiment:
+def attributes(studied: StudyScene) -> Experiment:
     """Each attribute alone at 4 and at 8 bits, all others at 16."""
-    names = [field.bits for field in FIELDS if field.width(bench.scene.source.sh_degree)]
+    names = [field.bits for field in FIELDS if field.width(studied.scene.source.sh_degree)]
     alone = [(name, bits) for name in names for bits in ALONE_BITS]
     settings = [Setting(bits=replace(FINE, **{name: bits})) for name, bits in alone]
-    floor, *found = bench.points([Setting(bits=FINE), *settings], "attributes")
+    floor, *found = studied.points([Setting(bits=FINE), *settings], "attributes")
     rows: list[dict[str, Cell]] = [
-        {"attribute": name, "bits": bits, **bench.cells(point), "rise": _scientific(bench.error(point) - base)}
-        for base in [bench.error(floor)]
+        {"attribute": name, "bits": bits, **studied.cells(point), "rise": _scientific(studied.error(point) - base)}
+        for base in [studied.error(floor)]
         for (name, bits), point in zip(alone, found)
     ]
-    rows.insert(0, {"attribute": "none", "bits": 16, **bench.cells(floor), "rise": 0.0})
+    rows.insert(0, {"attribute": "none", "bits": 16, **studied.cells(floor), "rise": 0.0})
     heads = columns(attribute="attribute", bits="bits", **FIGURES, rise="rise of the squared error")
     table = Table(heads, tuple(rows))
-    figure = bench.figure
+    figure = studied.figure
     losses = {bits: table.values(figure, bits=bits) for bits in ALONE_BITS}
     worst = max(rows, key=lambda row: float(row["rise"] or 0.0))
     mildest = min((row for row in rows if row["bits"] == 4), key=lambda row: float(row["rise"] or 0.0))
@@ -84,7 +84,7 @@ def attributes(bench: Bench) -> Experiment:
         f"{rows[0][figure]:.4f} dB. The rise is that of the mean squared error against the original's renders.",
         table,
         DotChart(
-            f"One attribute at 4 or 8 bits, all others at 16 (beside the dots: {bench.plan.judge} in dB)",
+            f"One attribute at 4 or 8 bits, all others at 16 (beside the dots: {studied.plan.figure} in dB)",
             "rise of the squared error against the original's renders",
             [NAMES[name] for name in names],
             {f"{bits} bits": table.values("rise", bits=bits) for bits in ALONE_BITS},
@@ -97,31 +97,31 @@ def attributes(bench: Bench) -> Experiment:
     )
 
 
-def groups(bench: Bench) -> Experiment:
+def groups(studied: StudyScene) -> Experiment:
     """One range a channel, sub-groups that follow N, and the paper's 1000, at the same bits."""
-    choices = {"nothing": EVERYTHING, "as the search chose": bench.search.chosen.choice}
+    choices = {"nothing": EVERYTHING, "as the search chose": studied.search.chosen.choice}
     kinds: dict[str, int | None] = {"one": 1, "default": None, "paper": PAPER_GROUPS}
     wanted = [Setting(choice, PAPER, count) for choice in choices.values() for count in kinds.values()]
-    found = iter(bench.points(wanted, "groups"))
+    found = iter(studied.points(wanted, "groups"))
     rows: list[dict[str, Cell]] = []
     for pruned, choice in choices.items():
         for kind in kinds:
             point = next(found)
-            plain = bench.size(Setting(choice, PAPER, 1))
+            plain = studied.size(Setting(choice, PAPER, 1))
             rows.append(
                 {
                     "pruned": pruned,
                     "groups": kind,
                     "extra_bytes": point.size - plain,
-                    **bench.cells(point),
-                    "error": _scientific(bench.error(point)),
+                    **studied.cells(point),
+                    "error": _scientific(studied.error(point)),
                 }
             )
     heads = columns(
         pruned="pruned", groups="groups", extra_bytes="bytes beyond one group", **FIGURES, error="squared error"
     )
     table = Table(heads, tuple(rows))
-    figure = bench.figure
+    figure = studied.figure
     one, default, paper = rows[:3]
     labels = {"one": "one range", "default": "one for 512 rows", "paper": f"{PAPER_GROUPS} (paper)"}
     return Experiment(

@@ -19,12 +19,12 @@ from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.page import study_page
 from flexgs_edge.studies.paper import pruning, quantization, whole
-from flexgs_edge.studies.study_scene import Bench, open_bench, scene_names
+from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
 from flexgs_edge.studies.written import SceneStudy, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
 
-EXPERIMENTS: tuple[Callable[[Bench], Experiment], ...] = (
+EXPERIMENTS: tuple[Callable[[StudyScene], Experiment], ...] = (
     quantization.rtn,
     quantization.attributes,
     pruning.splits,
@@ -102,18 +102,18 @@ def study_paper(
 
 
 def _study_scene(path: str | Path, name: str, options: CompressOptions, progress: Progress) -> SceneStudy:
-    with open_bench(path, name, options, progress, scores=("gs", "meson")) as bench:
+    with open_study_scene(path, name, options, progress, scores=("gs", "meson")) as studied:
         # First: several experiments build on its answer, and its steps must be measured and not remembered.
-        LOG.info("%s: searching for %s", name, bench.target.describe())
-        chosen = bench.search.chosen
+        LOG.info("%s: searching for %s", name, studied.target.describe())
+        chosen = studied.search.chosen
         LOG.info("%s: prune %g, SH %g", name, chosen.choice.prune / 1000, chosen.choice.sh / 1000)
         experiments = []
         for number, make in enumerate(EXPERIMENTS, 1):
             started = time.perf_counter()
             LOG.info("%s: experiment %d of %d, %s", name, number, len(EXPERIMENTS), make.__name__)
-            experiments.append(make(bench))
+            experiments.append(make(studied))
             LOG.info("%s: %s: %.1f s", name, experiments[-1].key, time.perf_counter() - started)
-        return SceneStudy.of(bench, experiments)
+        return SceneStudy.of(studied, experiments)
 
 
 def _write(folder: Path, scenes: Sequence[SceneStudy]) -> None:

@@ -19,7 +19,7 @@ from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
 from flexgs_edge.studies.experiment import Beside, Experiment
 from flexgs_edge.studies.paper.pruning import RATES
 from flexgs_edge.studies.result_tables import Cell, Table, columns
-from flexgs_edge.studies.study_scene import FIGURES, Bench, Setting
+from flexgs_edge.studies.study_scene import FIGURES, StudyScene, Setting
 
 RATIOS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 STRONGEST = Choice(MAX_PRUNE, 1000 - MAX_PRUNE)
@@ -59,28 +59,28 @@ class Unquantized(SceneSource):
         return planes
 
 
-def parts(bench: Bench) -> Experiment:
+def parts(studied: StudyScene) -> Experiment:
     """ADP only, MPQ only, and both, at the choice of the search."""
-    choice = bench.search.chosen.choice
-    pruned = _pruned(bench, choice)
-    with bench.workspace.renderer.load(pruned) as scene:
-        alone = measurement_of(bench.judge.compare(scene))
-    quantized, both = bench.points([Setting(), Setting(choice)], "parts")
-    none = Measurement(0.0 if bench.plan.judge == "drop" else None, None, 0.0)
-    source = bench.scene.source
+    choice = studied.search.chosen.choice
+    pruned = _pruned(studied, choice)
+    with studied.workspace.renderer.load(pruned) as scene:
+        alone = measurement_of(studied.judge.compare(scene))
+    quantized, both = studied.points([Setting(), Setting(choice)], "parts")
+    none = Measurement(0.0 if studied.plan.figure == "drop" else None, None, 0.0)
+    source = studied.scene.source
     whole = (
         4
         * source.count
         * sum(source.width(name) for name in ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats"))
     )
     rows: list[dict[str, Cell]] = [
-        {"method": "float32 values", **bench.figures(whole, none)},
-        {"method": "ADP only", **bench.figures(pruned.value_bytes, alone)},
-        {"method": "MPQ only", **bench.cells(quantized)},
-        {"method": "ADP and MPQ", **bench.cells(both)},
+        {"method": "float32 values", **studied.figures(whole, none)},
+        {"method": "ADP only", **studied.figures(pruned.value_bytes, alone)},
+        {"method": "MPQ only", **studied.cells(quantized)},
+        {"method": "ADP and MPQ", **studied.cells(both)},
     ]
     table = Table(columns(method="method", **FIGURES), tuple(rows))
-    figure = bench.figure
+    figure = studied.figure
     losses = [float(row[figure] or 0.0) for row in rows]
     words = [f"{row['method']}: {row['ratio']:.1f}x, {loss:.2f} dB" for row, loss in zip(rows, losses)]
     return Experiment(
@@ -103,24 +103,24 @@ def parts(bench: Bench) -> Experiment:
     )
 
 
-def _pruned(bench: Bench, choice: Choice) -> Unquantized:
-    return Unquantized(bench.scene.source, *select_rows(ranks_from_order(bench.orders["gs"]), choice, bench.has_sh))
+def _pruned(studied: StudyScene, choice: Choice) -> Unquantized:
+    return Unquantized(studied.scene.source, *select_rows(ranks_from_order(studied.orders["gs"]), choice, studied.has_sh))
 
 
-def rates(bench: Bench) -> Experiment:
+def rates(studied: StudyScene) -> Experiment:
     """The best that the method finds at sizes from 8 to 256 times below the PLY's, and where it ends."""
-    rows: list[dict[str, Cell]] = [_rate_row(bench, "least", None, EVERYTHING)]
-    ply = bench.scene.ply_bytes
-    for ratio in bench.progress.track(RATIOS, "rates", len(RATIOS)):
-        if bench.size(Setting(EVERYTHING)) <= ply / ratio:
+    rows: list[dict[str, Cell]] = [_rate_row(studied, "least", None, EVERYTHING)]
+    ply = studied.scene.ply_bytes
+    for ratio in studied.progress.track(RATIOS, "rates", len(RATIOS)):
+        if studied.size(Setting(EVERYTHING)) <= ply / ratio:
             continue  # the bits alone are past it: the row "least" says so
-        found = bench.adapt(min_ratio(float(ratio), ply, bench.plan.judge))
+        found = studied.adapt(min_ratio(float(ratio), ply, studied.plan.figure))
         if found.reached:
-            rows.append(_rate_row(bench, "search", ratio, found.chosen.choice))
-    rows.append(_rate_row(bench, "most", None, STRONGEST))
+            rows.append(_rate_row(studied, "search", ratio, found.chosen.choice))
+    rows.append(_rate_row(studied, "most", None, STRONGEST))
     heads = columns(kind="kind", wanted_ratio="ratio wanted", **RATES, **FIGURES)
     table = Table(heads, tuple(rows))
-    figure = bench.figure
+    figure = studied.figure
     reached = table.values("wanted_ratio", kind="search")
     low, high = rows[0], rows[-1]
     missing = [ratio for ratio in RATIOS if ratio not in reached]
@@ -140,7 +140,7 @@ def rates(bench: Bench) -> Experiment:
                 Series("the paper's curve: its two ends", [8.0, 256.0], [0.05, 9.0], line=False, published=True),
                 Series("the paper's means of three data sets", *PAPER_MEANS, line=False, published=True),
             ),
-            limit=getattr(bench.target, "limit", None),
+            limit=getattr(studied.target, "limit", None),
             doublings=True,
             magnitudes=True,
         ),
@@ -160,20 +160,20 @@ def rates(bench: Bench) -> Experiment:
     )
 
 
-def _rate_row(bench: Bench, kind: str, ratio: int | None, choice: Choice) -> dict[str, Cell]:
+def _rate_row(studied: StudyScene, kind: str, ratio: int | None, choice: Choice) -> dict[str, Cell]:
     rates = {"prune_rate": choice.prune / 1000, "sh_rate": choice.sh / 1000}
-    return {"kind": kind, "wanted_ratio": ratio, **rates, **bench.cells(bench.point(Setting(choice)))}
+    return {"kind": kind, "wanted_ratio": ratio, **rates, **studied.cells(studied.point(Setting(choice)))}
 
 
-def times(bench: Bench) -> Experiment:
+def times(studied: StudyScene) -> Experiment:
     """Seconds of every stage and of every part of a search step, and the memory of the run."""
-    steps = bench.search.steps
-    stages = dict(bench.workspace.clock.stages)
+    steps = studied.search.steps
+    stages = dict(studied.workspace.clock.stages)
     # meson is this study's question, not the method's.
     meson = stages.pop("score meson", 0.0)
     stages["search"] = sum(step.seconds for step in steps)
     whole = sum(stages.values())
-    split = _step_parts(bench, bench.search.chosen.choice)
+    split = _step_parts(studied, studied.search.chosen.choice)
     step = sum(split.values())
     memory = peak_rss()
     rows = [_time(f"stage: {name}", seconds) for name, seconds in stages.items()]
@@ -183,11 +183,11 @@ def times(bench: Bench) -> Experiment:
     rows += [_time(f"search step {number}", taken.seconds) for number, taken in enumerate(steps, 1)]
     rows.append({"part": "peak memory", "value": memory, "unit": "bytes", "paper": None})
     table = Table(columns(part="part", value="here", unit="unit", paper="paper, RTX 3090"), tuple(rows))
-    source, views = bench.scene.source, bench.views
+    source, views = studied.scene.source, studied.views
     return Experiment(
         "times",
         "Time and memory",
-        f"Wall seconds of this run: {source.count} Gaussians, {len(views.train)} training and {len(bench.plan.decide)} deciding "
+        f"Wall seconds of this run: {source.count} Gaussians, {len(views.train)} training and {len(studied.plan.decide)} deciding "
         f"views. The parts of a step are medians of {REPEATS} at the search's answer; rendering includes comparing with the "
         "references. The paper's seconds are for its own, larger scenes and 32 views on an RTX 3090: they compare shares, not "
         "machines. Memory is the largest that the process has held, earlier scenes included.",
@@ -223,14 +223,14 @@ def _time(part: str, seconds: float, paper: float | None = None) -> dict[str, Ce
     return {"part": part, "value": round(seconds, 4), "unit": "s", "paper": paper}
 
 
-def _step_parts(bench: Bench, choice: Choice) -> dict[str, float]:
+def _step_parts(studied: StudyScene, choice: Choice) -> dict[str, float]:
     """Median seconds of a step's parts, as `SceneEvaluator.measure` does them."""
-    ranks = ranks_from_order(bench.orders["gs"])
+    ranks = ranks_from_order(studied.orders["gs"])
     found: list[list[float]] = []
-    evaluator, renderer, first = bench.evaluator(Setting(choice)), bench.workspace.renderer, bench.judge.cameras[0]
+    evaluator, renderer, first = studied.evaluator(Setting(choice)), studied.workspace.renderer, studied.judge.cameras[0]
     for _ in range(REPEATS):
         marks = [time.perf_counter()]
-        select_rows(ranks, choice, bench.has_sh)
+        select_rows(ranks, choice, studied.has_sh)
         marks.append(time.perf_counter())
         with evaluator.quantized(choice) as quantized:
             marks.append(time.perf_counter())
@@ -238,7 +238,7 @@ def _step_parts(bench: Bench, choice: Choice) -> dict[str, float]:
                 for _ in range(2):
                     renderer.render(scene, first)
                     marks.append(time.perf_counter())
-                bench.judge.compare(scene)
+                studied.judge.compare(scene)
                 marks.append(time.perf_counter())
         prune, quantize, cold, warm, render = (b - a for a, b in zip(marks, marks[1:]))
         # Quantizing selects its rows itself; a scene is dequantized when the first view asks for it.

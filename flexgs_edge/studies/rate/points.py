@@ -30,7 +30,7 @@ from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.studies.rate.ablations import WHOLE, Variant
 from flexgs_edge.studies.rate.coders import coder_sizes
 from flexgs_edge.studies.result_tables import Cell, Column, columns
-from flexgs_edge.studies.study_scene import FIGURES, Bench, Setting
+from flexgs_edge.studies.study_scene import FIGURES, StudyScene, Setting
 from flexgs_edge.units import format_size
 
 LOG = logging.getLogger("flexgs_edge")
@@ -108,7 +108,7 @@ def point_columns() -> tuple[Column, ...]:
     )
 
 
-def point_row(bench: Bench, point: RatePoint) -> dict[str, Cell]:
+def point_row(studied: StudyScene, point: RatePoint) -> dict[str, Cell]:
     """The cells of a point."""
     quality = point.quality
     return {
@@ -120,46 +120,46 @@ def point_row(bench: Bench, point: RatePoint) -> dict[str, Cell]:
         "bits": round(8 * point.size / point.kept, 2),
         "psnr": None if quality.psnr is None else round(quality.psnr, 4),
         "ssim": None if point.ssim is None else round(point.ssim, 5),
-        **bench.figures(point.size, measurement_of(quality)),
+        **studied.figures(point.size, measurement_of(quality)),
         "seconds": None if point.seconds is None else round(point.seconds, 2),
     }
 
 
-def loss_of(bench: Bench, point: RatePoint) -> float:
+def loss_of(studied: StudyScene, point: RatePoint) -> float:
     """The figure that decides."""
-    return measurement_of(point.quality).loss(bench.plan.judge)
+    return measurement_of(point.quality).loss(studied.plan.figure)
 
 
-def paper_points(bench: Bench, ratios: Sequence[float]) -> Found:
+def paper_points(studied: StudyScene, ratios: Sequence[float]) -> Found:
     """`--method paper`: nothing pruned, and the least loss that its search finds in every size asked for."""
-    found = Found((_paper_point(bench, None, EVERYTHING, 0.0),))
-    least = bench.size(Setting(EVERYTHING))
+    found = Found((_paper_point(studied, None, EVERYTHING, 0.0),))
+    least = studied.size(Setting(EVERYTHING))
     for ratio in ratios:
         started = time.perf_counter()
-        target = _target(bench, ratio)
+        target = _target(studied, ratio)
         if least <= target.limit_bytes:
             continue  # nothing has to be pruned for it: the first point is all that there is to say
-        search = bench.adapt(target)
+        search = studied.adapt(target)
         if search.reached:
-            point = _paper_point(bench, ratio, search.chosen.choice, time.perf_counter() - started)
+            point = _paper_point(studied, ratio, search.chosen.choice, time.perf_counter() - started)
             found += Found((point,))
         else:
             found += Found((), (f"paper at {ratio:g}x",))
     return found
 
 
-def _paper_point(bench: Bench, ratio: float | None, choice: Choice, seconds: float) -> RatePoint:
-    evaluator = bench.evaluator(Setting(choice))
-    with evaluator.quantized(choice) as quantized, bench.workspace.renderer.load_quantized(quantized) as scene:
-        quality = _judged(bench, scene)
+def _paper_point(studied: StudyScene, ratio: float | None, choice: Choice, seconds: float) -> RatePoint:
+    evaluator = studied.evaluator(Setting(choice))
+    with evaluator.quantized(choice) as quantized, studied.workspace.renderer.load_quantized(quantized) as scene:
+        quality = _judged(studied, scene)
     kept, _ = evaluator.counts(choice)
     variant = WHOLE.name if ratio is not None else "nothing pruned"
-    effort = None if ratio is None else bench.options.effort
+    effort = None if ratio is None else studied.options.effort
     return _said(RatePoint("paper", variant, effort, ratio, evaluator.size(choice), kept, quality, seconds))
 
 
 def best_points(
-    bench: Bench, variant: Variant, effort: str, ratios: Sequence[float], recode: Sequence[float] = ()
+    studied: StudyScene, variant: Variant, effort: str, ratios: Sequence[float], recode: Sequence[float] = ()
 ) -> Found:
     """`--method best`, whole or without a part, at every ratio: one path for all of them, the weakest compression first.
 
@@ -168,13 +168,13 @@ def best_points(
     recode : sequence of float
         Ratios whose grids are also sized in other coders.
     """
-    workspace, source = bench.workspace, bench.scene.source
-    options = replace(bench.options, effort=effort, refit=variant.refit, best_effort=True)
+    workspace, source = studied.workspace, studied.scene.source
+    options = replace(studied.options, effort=effort, refit=variant.refit, best_effort=True)
     # All sizes share one path, and so its poses: those of the largest.
     largest = replace(
         options, max_drop=None, min_fidelity=None, max_size=None, min_ratio=min(ratios), max_worst_drop=None
     )
-    poses = scored_poses(bench.views.of(bench.views.train), largest, workspace.renderer, source)
+    poses = scored_poses(studied.views.of(studied.views.train), largest, workspace.renderer, source)
     found = NOTHING
     started = time.perf_counter()
     with open_rounds(
@@ -184,20 +184,20 @@ def best_points(
         options,
         workspace.budget,
         workspace.clock,
-        bench.progress,
+        studied.progress,
         variant.path,
     ) as path:
         coder = GridCoder(workspace.renderer)
         for ratio in sorted(ratios):
-            target = _target(bench, ratio)
+            target = _target(studied, ratio)
             make = grid_search(options, coder, variant.search)
             with workspace.clock.stage("search"):
-                grid, search = search_rounds(make, path, workspace.renderer, source, bench.judge, target, options)
+                grid, search = search_rounds(make, path, workspace.renderer, source, studied.judge, target, options)
             seconds = time.perf_counter() - started
             if search.reached:
-                plan = replace(bench.plan, target=target)
-                size = coder.size(grid, make_settings(options, plan, bench.scene, bench.views, search, None))
-                quality = _judged_source(bench, grid)
+                plan = replace(studied.plan, target=target)
+                size = coder.size(grid, make_settings(options, plan, studied.scene, studied.views, search, None))
+                quality = _judged_source(studied, grid)
                 point = RatePoint("best", variant.name, effort, ratio, size, grid.count, quality, seconds)
                 found += Found((_said(point),))
                 if ratio in recode:
@@ -214,7 +214,7 @@ def _recoded(grid: GridScene, point: RatePoint) -> tuple[RatePoint, ...]:
     return tuple(replace(point, variant=name, size=size, seconds=None) for name, size in sizes.items())
 
 
-def peer_points(bench: Bench, folder: Path) -> Found:
+def peer_points(studied: StudyScene, folder: Path) -> Found:
     """The whole scene, unpruned, in the formats of other programs.
 
     Parameters
@@ -227,38 +227,38 @@ def peer_points(bench: Bench, folder: Path) -> Found:
         name = suffix[1:]
         try:
             check_converter(f"a {suffix} to compare with")
-            found += Found((_said(_peer_point(bench, name, format, folder / f"scene{suffix}")),))
+            found += Found((_said(_peer_point(studied, name, format, folder / f"scene{suffix}")),))
         except InputError as error:  # no converter, or a scene that this format cannot hold
             LOG.warning("%s left out: %s", name, error)
             found += Found((), (f"{name} ({error})",))
     return found
 
 
-def _peer_point(bench: Bench, name: str, format: Format, place: Path) -> RatePoint:
-    source = bench.scene.source
+def _peer_point(studied: StudyScene, name: str, format: Format, place: Path) -> RatePoint:
+    source = studied.scene.source
     with ExitStack() as stack:
-        files = stack.enter_context(open_files(format, place, False, bench.workspace.budget, None, None))
+        files = stack.enter_context(open_files(format, place, False, studied.workspace.budget, None, None))
         started = time.perf_counter()
         # In the order that `compress` writes rows in: bytes repeat along a curve.
         path, decoded = files.write(source.select(near_order(source)))
         seconds = time.perf_counter() - started
-        with bench.workspace.renderer.load(decoded) as scene:
-            quality = _judged(bench, scene)
+        with studied.workspace.renderer.load(decoded) as scene:
+            quality = _judged(studied, scene)
         return RatePoint(name, WHOLE.name, None, None, path.stat().st_size, decoded.count, quality, seconds)
 
 
-def _target(bench: Bench, ratio: float) -> MaxSize:
-    return min_ratio(ratio, bench.scene.ply_bytes, bench.plan.judge)
+def _target(studied: StudyScene, ratio: float) -> MaxSize:
+    return min_ratio(ratio, studied.scene.ply_bytes, studied.plan.figure)
 
 
-def _judged_source(bench: Bench, grid: GridScene) -> Quality:
-    with bench.workspace.renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
-        return _judged(bench, scene)
+def _judged_source(studied: StudyScene, grid: GridScene) -> Quality:
+    with studied.workspace.renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
+        return _judged(studied, scene)
 
 
-def _judged(bench: Bench, scene: DeviceScene) -> Quality:
-    with bench.workspace.clock.stage("measure"):
-        return bench.judge.compare(scene, with_ssim=True, progress=bench.progress)
+def _judged(studied: StudyScene, scene: DeviceScene) -> Quality:
+    with studied.workspace.clock.stage("measure"):
+        return studied.judge.compare(scene, with_ssim=True, progress=studied.progress)
 
 
 def _said(point: RatePoint) -> RatePoint:

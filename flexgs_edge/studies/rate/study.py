@@ -22,7 +22,7 @@ from flexgs_edge.studies.page import study_page
 from flexgs_edge.studies.rate import trade
 from flexgs_edge.studies.rate.ablations import WHOLE, parts_of
 from flexgs_edge.studies.rate.points import MAX, Found, best_points, paper_points, peer_points
-from flexgs_edge.studies.study_scene import Bench, open_bench, scene_names
+from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
 from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
@@ -87,10 +87,10 @@ def study_rate(
     check_folder(output, options.force)
     with atomic_folder(output, options.force) as folder:
         (name,) = scene_names([scene])
-        with open_bench(scene, name, options, progress) as bench:
+        with open_study_scene(scene, name, options, progress) as studied:
             every, without = sorted({*ratios, *ablations}), sorted(set(ablations))
-            made = _experiments(bench, folder, every, without, ablation_effort, sorted(set(distilled)))
-            found = SceneStudy.of(bench, made)
+            made = _experiments(studied, folder, every, without, ablation_effort, sorted(set(distilled)))
+            found = SceneStudy.of(studied, made)
         page = study_page("Bytes and quality", _INTRO, [write_scene(folder, found)])
         (folder / "index.html").write_text(page, encoding="utf-8")
     LOG.info("wrote %s", Path(output) / "index.html")
@@ -116,31 +116,31 @@ def _check(ratios: Sequence[float], ablations: Sequence[float], effort: str, dis
 
 
 def _experiments(
-    bench: Bench,
+    studied: StudyScene,
     folder: Path,
     ratios: Sequence[float],
     ablations: Sequence[float],
     ablation_effort: str,
     distilled: Sequence[float],
 ) -> list[Experiment]:
-    effort = bench.options.effort
+    effort = studied.options.effort
     recode = ablations if ablation_effort == effort else ()
-    found = best_points(bench, WHOLE, effort, ratios, recode) + paper_points(bench, ratios)
+    found = best_points(studied, WHOLE, effort, ratios, recode) + paper_points(studied, ratios)
     if distilled:
         try:
-            found += best_points(bench, WHOLE, MAX, distilled)
+            found += best_points(studied, WHOLE, MAX, distilled)
         except BudgetError as error:  # a descent stays in memory as a whole
             found += Found((), (f"best ({MAX}: {error})",))
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder) as place:
-        found += peer_points(bench, Path(place))
-    variants = parts_of(bench.orders["gs"], bench.scene.source.sh_degree) if ablations else ()
+        found += peer_points(studied, Path(place))
+    variants = parts_of(studied.orders["gs"], studied.scene.source.sh_degree) if ablations else ()
     if ablations and ablation_effort != effort:
-        found += best_points(bench, WHOLE, ablation_effort, ratios, ablations)
+        found += best_points(studied, WHOLE, ablation_effort, ratios, ablations)
     for variant in variants:
-        found += best_points(bench, variant, ablation_effort, ablations)
-    made = [trade.rate(bench, found.points, found.missing, effort)]
-    if bench.plan.judge == "drop":
-        made.append(trade.fidelity(bench, found.points, effort))
+        found += best_points(studied, variant, ablation_effort, ablations)
+    made = [trade.rate(studied, found.points, found.missing, effort)]
+    if studied.plan.figure == "drop":
+        made.append(trade.fidelity(studied, found.points, effort))
     if ablations:
-        made.append(trade.parts(bench, found.points, variants, ablation_effort, ablations))
+        made.append(trade.parts(studied, found.points, variants, ablation_effort, ablations))
     return made

@@ -10,7 +10,7 @@ from flexgs_edge.studies.rate.ablations import WHOLE, Variant
 from flexgs_edge.studies.rate.curves import Curve
 from flexgs_edge.studies.rate.points import MAX, RatePoint, loss_of, point_columns, point_row
 from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
-from flexgs_edge.studies.study_scene import FIGURES, Bench
+from flexgs_edge.studies.study_scene import FIGURES, StudyScene
 
 CODERS = {
     "order-0 entropy": "a bound for coders that take each integer by itself, their tables free",
@@ -21,12 +21,12 @@ CODERS = {
 FIDELITY_WORDS = "fidelity: PSNR against the original's renders"
 
 
-def rate(bench: Bench, points: Sequence[RatePoint], missing: Sequence[str], effort: str) -> Experiment:
+def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str], effort: str) -> Experiment:
     """Bytes and the deciding figure of every method; the table holds all points of the study."""
-    table = Table(point_columns(), tuple(point_row(bench, point) for point in points))
-    with_photos = bench.plan.judge == "drop"
-    figure = bench.figure if with_photos else "fidelity"
-    findings = list(_comparisons(bench, points, effort))
+    table = Table(point_columns(), tuple(point_row(studied, point) for point in points))
+    with_photos = studied.plan.figure == "drop"
+    figure = studied.figure if with_photos else "fidelity"
+    findings = list(_comparisons(studied, points, effort))
     if missing:
         findings.append(f"Left out or not reached: {'; '.join(missing)}.")
     return Experiment(
@@ -44,10 +44,10 @@ def rate(bench: Bench, points: Sequence[RatePoint], missing: Sequence[str], effo
     )
 
 
-def fidelity(bench: Bench, points: Sequence[RatePoint], effort: str) -> Experiment:
+def fidelity(studied: StudyScene, points: Sequence[RatePoint], effort: str) -> Experiment:
     """The same against the original's renders, where the photos decide: how far the picture moved at all."""
     names = ("method", "wanted_ratio", "variant", "effort", "size", "ratio", "fidelity")
-    rows = [point_row(bench, point) for point in points if _on_curve(point.method, point.variant, point.effort, effort)]
+    rows = [point_row(studied, point) for point in points if _on_curve(point.method, point.variant, point.effort, effort)]
     heads = {column.name: column for column in point_columns()}
     table = Table(tuple(heads[name] for name in names), tuple({name: row[name] for name in names} for row in rows))
     return Experiment(
@@ -102,17 +102,17 @@ def _note(row: dict[str, Cell]) -> str:
     return "" if row["wanted_ratio"] is None or row["method"] != "best" else f"{row['wanted_ratio']:g}x"
 
 
-def _comparisons(bench: Bench, points: Sequence[RatePoint], effort: str) -> Iterable[str]:
+def _comparisons(studied: StudyScene, points: Sequence[RatePoint], effort: str) -> Iterable[str]:
     """Sentences on best against each other method and effort, at equal loss."""
-    figure = FIGURES[bench.figure].removesuffix(" (dB)")
+    figure = FIGURES[studied.figure].removesuffix(" (dB)")
     best = _points(points, "best", WHOLE.name, effort)
     paper = {point.wanted: point for point in _points(points, "paper", WHOLE.name, effort)}
     pairs = [(point, paper[point.wanted]) for point in best if point.wanted in paper]
     if pairs:
-        words = ", ".join(f"{a.wanted:g}x: {loss_of(bench, a):.2f} / {loss_of(bench, b):.2f} dB" for a, b in pairs)
+        words = ", ".join(f"{a.wanted:g}x: {loss_of(studied, a):.2f} / {loss_of(studied, b):.2f} dB" for a, b in pairs)
         yield f"{figure.capitalize()} of best / paper at equal ratios: {words}."
-    curve = _curve(bench, best)
-    shares = [share for share in (_share(bench, curve, point) for point in paper.values()) if share is not None]
+    curve = _curve(studied, best)
+    shares = [share for share in (_share(studied, curve, point) for point in paper.values()) if share is not None]
     if shares:
         yield (
             f"At equal {figure} best needs {min(shares):.0%} to {max(shares):.0%} of paper's bytes "
@@ -120,11 +120,11 @@ def _comparisons(bench: Bench, points: Sequence[RatePoint], effort: str) -> Iter
         )
     for point in points:
         if point.method not in ("best", "paper"):
-            share, loss = _share(bench, curve, point), loss_of(bench, point)
+            share, loss = _share(studied, curve, point), loss_of(studied, point)
             than = (
                 f"best needs {share:.0%} of its bytes there" if share is not None else "beyond the ends of best's curve"
             )
-            yield f"{point.method}: {bench.scene.ply_bytes / point.size:.1f}x at {loss:.3f} dB of {figure}; {than}."
+            yield f"{point.method}: {studied.scene.ply_bytes / point.size:.1f}x at {loss:.3f} dB of {figure}; {than}."
     others = sorted({p.effort for p in points if p.effort not in (None, effort) and p.variant == WHOLE.name} - {None})
     whole = _modelled(best)
     for other in others:
@@ -142,34 +142,34 @@ def _points(points: Iterable[RatePoint], method: str, variant: str, effort: str 
     return [p for p in points if (p.method, p.variant, p.effort) == (method, variant, effort)]
 
 
-def _curve(bench: Bench, points: Iterable[RatePoint]) -> Curve:
-    return Curve((point.size, loss_of(bench, point)) for point in points)
+def _curve(studied: StudyScene, points: Iterable[RatePoint]) -> Curve:
+    return Curve((point.size, loss_of(studied, point)) for point in points)
 
 
 def _modelled(points: Iterable[RatePoint]) -> Curve:
     return Curve((point.size, point.quality.modelled_drop) for point in points)
 
 
-def _share(bench: Bench, curve: Curve, point: RatePoint) -> float | None:
+def _share(studied: StudyScene, curve: Curve, point: RatePoint) -> float | None:
     """Bytes on the curve over the point's, at its loss."""
-    size = curve.size(loss_of(bench, point))
+    size = curve.size(loss_of(studied, point))
     return None if size is None else size / point.size
 
 
 def parts(
-    bench: Bench, points: Sequence[RatePoint], variants: Sequence[Variant], effort: str, ratios: Sequence[float]
+    studied: StudyScene, points: Sequence[RatePoint], variants: Sequence[Variant], effort: str, ratios: Sequence[float]
 ) -> Experiment:
     """What every part is worth: bytes at equal loss and loss at equal bytes, against the whole method at the same effort."""
-    figure = FIGURES[bench.figure].removesuffix(" (dB)")
+    figure = FIGURES[studied.figure].removesuffix(" (dB)")
     whole = _points(points, "best", WHOLE.name, effort)
-    curve = _curve(bench, whole)
+    curve = _curve(studied, whole)
     modelled = _modelled(whole)
     known = {**{variant.name: variant.words for variant in (WHOLE, *variants)}, **CODERS}
     rows: list[dict[str, Cell]] = []
     for name, words in known.items():
         for point in _points(points, "best", name, effort):
             if point.wanted in ratios:
-                rows.append(_part_row(bench, curve, modelled, point, words))
+                rows.append(_part_row(studied, curve, modelled, point, words))
     heads = columns(
         variant="taken away",
         instead="in its place",
@@ -205,17 +205,17 @@ def parts(
     )
 
 
-def _part_row(bench: Bench, curve: Curve, modelled: Curve, point: RatePoint, words: str) -> dict[str, Cell]:
-    row = point_row(bench, point)
+def _part_row(studied: StudyScene, curve: Curve, modelled: Curve, point: RatePoint, words: str) -> dict[str, Cell]:
+    row = point_row(studied, point)
     loss = curve.loss(point.size)
     return {
         "variant": point.variant,
         "instead": words,
         "wanted_ratio": point.wanted,
         **{name: row[name] for name in FIGURES},
-        "more_bytes": _more(point.size, curve.size(loss_of(bench, point))),
+        "more_bytes": _more(point.size, curve.size(loss_of(studied, point))),
         "more_modelled": _more(point.size, modelled.size(point.quality.modelled_drop)),
-        "more_loss": None if loss is None else round(loss_of(bench, point) - loss, 4) + 0.0,
+        "more_loss": None if loss is None else round(loss_of(studied, point) - loss, 4) + 0.0,
     }
 
 

@@ -17,7 +17,7 @@ from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Table, columns
 from flexgs_edge.studies.speed.front import front
 from flexgs_edge.studies.speed.timing import draw_seconds, median
-from flexgs_edge.studies.study_scene import Bench
+from flexgs_edge.studies.study_scene import StudyScene
 from flexgs_edge.views.references import to_half
 
 REPEATS = 5
@@ -113,11 +113,11 @@ def ways(source: SceneSource, extent: str) -> Iterator[Way]:
         yield Way("resolution", f"1/{shrink}", source, extent, shrink)
 
 
-def drawing(bench: Bench, repeats: int = REPEATS) -> Experiment:
+def drawing(studied: StudyScene, repeats: int = REPEATS) -> Experiment:
     """Time of a view against its PSNR to the exact one."""
-    options, judge, workspace = bench.options, bench.judge, bench.workspace
+    options, judge, workspace = studied.options, studied.judge, studied.workspace
     assert options.near is not None and options.background is not None and options.extent is not None
-    every = list(ways(bench.scene.source, options.extent))
+    every = list(ways(studied.scene.source, options.extent))
     seconds: list[list[float]] = [[] for _ in every]
     errors: list[list[float]] = [[] for _ in every]
     renderers = {options.extent: workspace.renderer}
@@ -126,7 +126,7 @@ def drawing(bench: Bench, repeats: int = REPEATS) -> Experiment:
             renderers[extent] = Renderer(
                 workspace.backend, workspace.budget, options.near, options.background, extent, bool(options.antialiased)
             )
-    for turn in bench.progress.track(range(repeats), "drawing", repeats):
+    for turn in studied.progress.track(range(repeats), "drawing", repeats):
         for place, way in enumerate(every):
             renderer, cameras = renderers[way.extent], way.cameras(judge.cameras)
             with renderer.load(way.source) as scene:
@@ -137,7 +137,7 @@ def drawing(bench: Bench, repeats: int = REPEATS) -> Experiment:
                     ]
             renderer.release()  # two renderers share one budget
     rows = _rows(every, seconds, errors, len(judge.cameras))
-    return _experiment(bench, every, rows, repeats)
+    return _experiment(studied, every, rows, repeats)
 
 
 def _rows(
@@ -163,7 +163,7 @@ def _rows(
     ]
 
 
-def _experiment(bench: Bench, every: Sequence[Way], rows: list[dict[str, Cell]], repeats: int) -> Experiment:
+def _experiment(studied: StudyScene, every: Sequence[Way], rows: list[dict[str, Cell]], repeats: int) -> Experiment:
     table = Table(
         columns(
             kind="what is less",
@@ -185,7 +185,7 @@ def _experiment(bench: Bench, every: Sequence[Way], rows: list[dict[str, Cell]],
     return Experiment(
         "drawing",
         "Time of a view and what it is worth",
-        f"The {len(bench.judge.cameras)} deciding views ({bench.judge.cameras[0].width}x{bench.judge.cameras[0].height}), "
+        f"The {len(studied.judge.cameras)} deciding views ({studied.judge.cameras[0].width}x{studied.judge.cameras[0].height}), "
         "drawn whole and read back, in less exact ways; PSNR is against the exact views, mean over the views that differ. "
         f"Times are the least of {repeats} rounds over all settings, with the scene loaded. Splats below an opacity of 1/255 "
         "never show. Half precision is that of the stored values: they are drawn in single precision, so its time is that "

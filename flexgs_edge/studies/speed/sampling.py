@@ -16,7 +16,7 @@ from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
 from flexgs_edge.studies.speed.tile_sampling import Estimate, TileSampler, tile_errors, tile_values
 from flexgs_edge.studies.speed.timing import draw_seconds, stage_seconds
-from flexgs_edge.studies.study_scene import Bench, Setting
+from flexgs_edge.studies.study_scene import StudyScene, Setting
 
 SHARES = (0.05, 0.1, 0.2, 0.5, 1.0)
 TRIALS = 200
@@ -49,25 +49,25 @@ class Costs:
         return self.fixed + share * self.by_pixels
 
 
-def sampling(bench: Bench, trials: int = TRIALS) -> Experiment:
+def sampling(studied: StudyScene, trials: int = TRIALS) -> Experiment:
     """Intervals from samples of every size, by what is known before."""
-    chosen = bench.search.chosen.choice
-    maps, costs = _maps(bench, chosen, timed=True)
+    chosen = studied.search.chosen.choice
+    maps, costs = _maps(studied, chosen, timed=True)
     assert costs is not None
-    values = [tile_values(camera.height, camera.width) for camera in bench.judge.cameras]
+    values = [tile_values(camera.height, camera.width) for camera in studied.judge.cameras]
     known: dict[str, list[np.ndarray] | None] = {BY_PLACE: None}
     words = []
-    for name, choice in _earlier(bench, chosen).items():
-        known[name] = _maps(bench, choice)[0]
-        loss = bench.point(Setting(choice)).measurement.modelled_drop
+    for name, choice in _earlier(studied, chosen).items():
+        known[name] = _maps(studied, choice)[0]
+        loss = studied.point(Setting(choice)).measurement.modelled_drop
         words.append(f"{name}: p = {choice.prune / 1000:g}, s = {choice.sh / 1000:g}, modelled drop {loss:.2f} dB")
-    truth = bench.point(Setting(chosen)).measurement.fidelity
+    truth = studied.point(Setting(chosen)).measurement.fidelity
     rows: list[dict[str, Cell]] = []
     for name, expected in known.items():
         for share in SHARES:
             found = trial_estimates(values, maps, expected, share, trials)
             rows.append(_row(name, share, found, truth, costs))
-    return _experiment(bench, rows, trials, truth, costs, chosen, words)
+    return _experiment(studied, rows, trials, truth, costs, chosen, words)
 
 
 def trial_estimates(
@@ -84,14 +84,14 @@ def trial_estimates(
     return [sampler.estimate(tiles, errors[tiles]) for tiles in drawn]
 
 
-def _earlier(bench: Bench, chosen: Choice) -> dict[str, Choice]:
+def _earlier(studied: StudyScene, chosen: Choice) -> dict[str, Choice]:
     """Steps of the search whose pictures may tell where errors of its answer are."""
-    steps = bench.search.steps
+    steps = studied.search.steps
     place = next(i for i, step in enumerate(steps) if step.choice == chosen)
     before = [step for step in steps[:place] if step.measurement is not None]
     if not before:
         return {}
-    loss = bench.point(Setting(chosen)).measurement.modelled_drop
+    loss = studied.point(Setting(chosen)).measurement.modelled_drop
     nearest = min(before, key=lambda step: abs(step.measurement.modelled_drop - loss) if step.measurement else math.inf)
     found = {FIRST: before[0].choice}
     if nearest.choice != before[0].choice:
@@ -99,10 +99,10 @@ def _earlier(bench: Bench, chosen: Choice) -> dict[str, Choice]:
     return found
 
 
-def _maps(bench: Bench, choice: Choice, timed: bool = False) -> tuple[list[np.ndarray], Costs | None]:
+def _maps(studied: StudyScene, choice: Choice, timed: bool = False) -> tuple[list[np.ndarray], Costs | None]:
     """Squared errors by tile of each deciding view; with `timed` also what measuring takes."""
-    judge, renderer = bench.judge, bench.workspace.renderer
-    evaluator = bench.evaluator(Setting(choice))
+    judge, renderer = studied.judge, studied.workspace.renderer
+    evaluator = studied.evaluator(Setting(choice))
     with evaluator.quantized(choice) as quantized, renderer.load_quantized(quantized) as scene:
         maps, compare = [], 0.0
         for i, camera in enumerate(judge.cameras):
@@ -144,7 +144,7 @@ def _row(name: str, share: float, found: Sequence[Estimate], truth: float | None
 
 
 def _experiment(
-    bench: Bench,
+    studied: StudyScene,
     rows: list[dict[str, Cell]],
     trials: int,
     truth: float | None,
@@ -172,7 +172,7 @@ def _experiment(
         "sampling",
         "Fidelity from a part of the tiles",
         f"The answer of the paper's search (p = {chosen.prune / 1000:g}, s = {chosen.sh / 1000:g}; fidelity {full} when "
-        f"measured whole) over the {len(bench.judge.cameras)} deciding views, estimated {trials} times from tiles of error "
+        f"measured whole) over the {len(studied.judge.cameras)} deciding views, estimated {trials} times from tiles of error "
         "maps that are known whole. Tiles of a view are cut into strata of equal expected error, and two are drawn from "
         f"each: expected from the map of another step of the search ({'; '.join(words) or 'it had none before its answer'}), "
         "or with nothing known, strata being runs of neighbours. The interval is one of 95 %, by the delta method. The "

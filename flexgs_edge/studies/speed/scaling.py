@@ -16,7 +16,7 @@ from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Table, columns
 from flexgs_edge.studies.speed.scoring import view_counts
 from flexgs_edge.studies.speed.timing import STAGES, draw_seconds, slope, stage_seconds
-from flexgs_edge.studies.study_scene import Bench
+from flexgs_edge.studies.study_scene import StudyScene
 
 REPEATS = 5
 PARTS = (0.125, 0.25, 0.5, 1.0)
@@ -36,9 +36,9 @@ class Load:
     cameras: Sequence[Camera]
 
 
-def scaling(bench: Bench, repeats: int = REPEATS) -> Experiment:
+def scaling(studied: StudyScene, repeats: int = REPEATS) -> Experiment:
     """Times of loads that grow in one respect at a time."""
-    source, cameras = bench.scene.source, bench.judge.cameras
+    source, cameras = studied.scene.source, studied.judge.cameras
     loads = [Load("Gaussians", len(rows), source.select(rows), cameras) for rows in _subsets(source.count)]
     for side in SIDES:
         views = [c.scaled(max(round(side * c.width), 1), max(round(side * c.height), 1)) for c in cameras]
@@ -46,16 +46,16 @@ def scaling(bench: Bench, repeats: int = REPEATS) -> Experiment:
         loads.append(Load("pixels", pixels, source, views))
     times: list[list[float]] = [[] for _ in loads]
     stages: list[list[dict[str, float]]] = [[] for _ in loads]
-    renderer = bench.workspace.renderer
-    for _ in bench.progress.track(range(repeats), "scaling", repeats):
+    renderer = studied.workspace.renderer
+    for _ in studied.progress.track(range(repeats), "scaling", repeats):
         for place, load in enumerate(loads):
             with renderer.load(load.source) as scene:
                 times[place].append(draw_seconds(renderer, scene, load.cameras) / len(load.cameras))
                 stages[place].append(stage_seconds(renderer, scene, load.cameras))
     renderer.release()
     rows = [_row(load, passes, parts) for load, passes, parts in zip(loads, times, stages)]
-    rows += _by_views(bench, repeats)
-    return _experiment(bench, rows, repeats)
+    rows += _by_views(studied, repeats)
+    return _experiment(studied, rows, repeats)
 
 
 def _subsets(count: int) -> list[np.ndarray]:
@@ -74,13 +74,13 @@ def _columns(by_stage: dict[str, float]) -> dict[str, Cell]:
     return {name.replace(" ", "_"): by_stage.get(name) for name in STAGES}
 
 
-def _by_views(bench: Bench, repeats: int) -> list[dict[str, Cell]]:
+def _by_views(studied: StudyScene, repeats: int) -> list[dict[str, Cell]]:
     """Hits and weights of every Gaussian over ever more training poses."""
-    renderer, cameras = bench.workspace.renderer, bench.views.of(bench.views.train)
+    renderer, cameras = studied.workspace.renderer, studied.views.of(studied.views.train)
     counts = view_counts(len(cameras))
     spread = {count: [cameras[i * len(cameras) // count] for i in range(count)] for count in counts}
     times: dict[int, list[float]] = {count: [] for count in counts}
-    with renderer.load(bench.scene.source) as scene:
+    with renderer.load(studied.scene.source) as scene:
         gather_statistics(renderer, scene, cameras[:1])
         for _ in range(repeats):
             for count, poses in spread.items():
@@ -94,7 +94,7 @@ def _by_views(bench: Bench, repeats: int) -> list[dict[str, Cell]]:
     ]
 
 
-def _experiment(bench: Bench, rows: list[dict[str, Cell]], repeats: int) -> Experiment:
+def _experiment(studied: StudyScene, rows: list[dict[str, Cell]], repeats: int) -> Experiment:
     table = Table(
         columns(
             kind="what grows",
@@ -107,16 +107,16 @@ def _experiment(bench: Bench, rows: list[dict[str, Cell]], repeats: int) -> Expe
     series, findings = [], []
     for kind in dict.fromkeys(str(row["kind"]) for row in rows):
         amounts, times = table.values("amount", kind=kind), table.values("ms", kind=kind)
-        whole = amounts.index(_whole(bench, kind, amounts))
+        whole = amounts.index(_whole(studied, kind, amounts))
         relative = [amount / amounts[whole] for amount in amounts]
         series.append(Series(kind, relative, [round(found / times[whole], 5) for found in times]))
         if len(amounts) > 1:
             findings.append(_words(table, kind, amounts, times))
-    camera = bench.judge.cameras[0]
+    camera = studied.judge.cameras[0]
     return Experiment(
         "scaling",
         "How times grow",
-        f"Gaussians and pixels: ms of a view, mean of the {len(bench.judge.cameras)} deciding ones, drawn and read back; and "
+        f"Gaussians and pixels: ms of a view, mean of the {len(studied.judge.cameras)} deciding ones, drawn and read back; and "
         "the stages of it with a wait after every kernel, which is why they may sum to more. Gaussians are left out by "
         "chance, so fewer of them cover less of the picture. Pixels: both sides times "
         f"{', '.join(f'{side:g}' for side in SIDES)} from {camera.width}x{camera.height}. Views: ms of counting hits and "
@@ -136,9 +136,9 @@ def _experiment(bench: Bench, rows: list[dict[str, Cell]], repeats: int) -> Expe
     )
 
 
-def _whole(bench: Bench, kind: str, amounts: list[int]) -> int:
+def _whole(studied: StudyScene, kind: str, amounts: list[int]) -> int:
     """The amount that the scene has by itself."""
-    cameras = bench.judge.cameras
+    cameras = studied.judge.cameras
     pixels = sum(camera.width * camera.height for camera in cameras) // len(cameras)
     return pixels if kind == "pixels" else max(amounts)
 

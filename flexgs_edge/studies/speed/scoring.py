@@ -19,7 +19,7 @@ from flexgs_edge.report.plots import LineChart, Series
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Table, columns
 from flexgs_edge.studies.speed.front import front
-from flexgs_edge.studies.study_scene import FIGURES, RANK_BYTES, Bench
+from flexgs_edge.studies.study_scene import FIGURES, RANK_BYTES, StudyScene
 
 FEWEST = 4
 SCORES = {"gs": "the paper's score gs", "removal": "measured costs of removal"}
@@ -66,17 +66,17 @@ def _ranks(values: np.ndarray) -> np.ndarray:
     return (np.cumsum(counts) - (counts + 1) / 2)[place]
 
 
-def scoring(bench: Bench) -> list[Experiment]:
+def scoring(studied: StudyScene) -> list[Experiment]:
     """Scores from ever more views: their time, their ranks and the quality that they leave."""
-    rows = score_rows(bench)
-    best = front([float(row["seconds"] or 0) for row in rows], [-float(row[bench.figure] or 0) for row in rows])
+    rows = score_rows(studied)
+    best = front([float(row["seconds"] or 0) for row in rows], [-float(row[studied.figure] or 0) for row in rows])
     for row, on in zip(rows, best):
         row["front"] = on
-    count = len(bench.views.train)
-    return [_quality(bench, rows, count), _stability(rows, count)]
+    count = len(studied.views.train)
+    return [_quality(studied, rows, count), _stability(rows, count)]
 
 
-def score_rows(bench: Bench, fewest: int = FEWEST, orders: Sequence[str] = COMPARED) -> list[dict[str, Cell]]:
+def score_rows(studied: StudyScene, fewest: int = FEWEST, orders: Sequence[str] = COMPARED) -> list[dict[str, Cell]]:
     """Rows of each score from ever more views, and from all of them: seconds, ranks, and what the answer of the search is worth.
 
     Parameters
@@ -86,10 +86,10 @@ def score_rows(bench: Bench, fewest: int = FEWEST, orders: Sequence[str] = COMPA
     orders : sequence of str
         Of `ORDERS`: which views make a set.
     """
-    cameras = bench.views.of(bench.views.train)
+    cameras = studied.views.of(studied.views.train)
     counts = view_counts(len(cameras), fewest)
-    positions = some_positions(bench.scene.source)
-    covering = covering_order(cameras, positions, bench.workspace.renderer.near, len(cameras))
+    positions = some_positions(studied.scene.source)
+    covering = covering_order(cameras, positions, studied.workspace.renderer.near, len(cameras))
     spread = farthest_order(cameras)
     places: dict[str, Callable[[int], list[int]]] = {
         "covering": lambda count: sorted(covering[:count]),
@@ -99,16 +99,16 @@ def score_rows(bench: Bench, fewest: int = FEWEST, orders: Sequence[str] = COMPA
     }
     sets: list[tuple[str, int, list[Camera]]] = [(ALL, len(cameras), cameras)]
     sets += [(name, n, [cameras[i] for i in places[name](n)]) for n in counts[:-1] for name in orders]
-    choice = bench.search.chosen.choice  # before the scene is loaded below: it draws others
+    choice = studied.search.chosen.choice  # before the scene is loaded below: it draws others
     rows: list[dict[str, Cell]] = []
-    budget = bench.workspace.budget
-    size = (8 * len(sets) + RANK_BYTES) * bench.scene.source.count
+    budget = studied.workspace.budget
+    size = (8 * len(sets) + RANK_BYTES) * studied.scene.source.count
     budget.take("scores of several sets of poses", size)
     try:
         for score in SCORES:
-            found = _scores(bench, score, sets)
+            found = _scores(studied, score, sets)
             for (poses, count, _), (values, seconds) in zip(sets, found):
-                evaluator = _evaluator(bench, order_from_scores(values))
+                evaluator = _evaluator(studied, order_from_scores(values))
                 rows.append(
                     {
                         "score": score,
@@ -117,7 +117,7 @@ def score_rows(bench: Bench, fewest: int = FEWEST, orders: Sequence[str] = COMPA
                         "seconds": round(seconds, 4),
                         "spearman": round(spearman(values, found[0][0]), 4),
                         "unseen": int(np.count_nonzero(values == (-np.inf if score == "gs" else 0.0))),
-                        **bench.figures(evaluator.size(choice), evaluator.measure(choice)),
+                        **studied.figures(evaluator.size(choice), evaluator.measure(choice)),
                     }
                 )
     finally:
@@ -126,16 +126,16 @@ def score_rows(bench: Bench, fewest: int = FEWEST, orders: Sequence[str] = COMPA
     return rows
 
 
-def _scores(bench: Bench, score: str, sets: Sequence[tuple[str, int, list[Camera]]]) -> list[tuple[np.ndarray, float]]:
+def _scores(studied: StudyScene, score: str, sets: Sequence[tuple[str, int, list[Camera]]]) -> list[tuple[np.ndarray, float]]:
     """Scores ([N] f64) and seconds of each set of poses."""
-    source, renderer = bench.scene.source, bench.workspace.renderer
+    source, renderer = studied.scene.source, studied.workspace.renderer
     storage = sum_bytes(2) + moment_bytes(source.sh_degree)
     found = []
     with renderer.load(source, storage) as scene:
         make: dict[str, Callable[[list[Camera]], np.ndarray]] = {
-            "gs": lambda poses: score_scene(renderer, scene, source, poses, "gs", bench.progress),
+            "gs": lambda poses: score_scene(renderer, scene, source, poses, "gs", studied.progress),
             # With the costs of SH, as a search by measured costs asks for them: they come from the same pass.
-            "removal": lambda poses: measure_costs(renderer, scene, poses, progress=bench.progress).removal,
+            "removal": lambda poses: measure_costs(renderer, scene, poses, progress=studied.progress).removal,
         }
         make[score](sets[0][2][:1])
         for _, _, poses in sets:
@@ -146,18 +146,18 @@ def _scores(bench: Bench, score: str, sets: Sequence[tuple[str, int, list[Camera
     return found
 
 
-def _evaluator(bench: Bench, order: np.ndarray) -> SceneEvaluator:
-    """As `bench.evaluator`, with rows in another order."""
-    bits, groups = bench.options.bit_spec()
+def _evaluator(studied: StudyScene, order: np.ndarray) -> SceneEvaluator:
+    """As `studied.evaluator`, with rows in another order."""
+    bits, groups = studied.options.bit_spec()
     assert bits is not None
-    workspace = bench.workspace
+    workspace = studied.workspace
     return SceneEvaluator(
-        bench.scene.source, order, bench.has_sh, bits, groups, workspace.renderer, bench.judge, workspace.budget
+        studied.scene.source, order, studied.has_sh, bits, groups, workspace.renderer, studied.judge, workspace.budget
     )
 
 
-def _quality(bench: Bench, rows: list[dict[str, Cell]], count: int) -> Experiment:
-    figure, choice = bench.figure, bench.search.chosen.choice
+def _quality(studied: StudyScene, rows: list[dict[str, Cell]], count: int) -> Experiment:
+    figure, choice = studied.figure, studied.search.chosen.choice
     table = Table(
         columns(
             **HEADS,

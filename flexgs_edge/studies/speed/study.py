@@ -21,7 +21,7 @@ from flexgs_edge.studies.speed.presets import presets
 from flexgs_edge.studies.speed.sampling import sampling
 from flexgs_edge.studies.speed.scaling import scaling
 from flexgs_edge.studies.speed.scoring import scoring
-from flexgs_edge.studies.study_scene import Bench, open_bench, scene_names
+from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
 from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
@@ -82,8 +82,8 @@ def study_speed(
     check_folder(output, options.force)
     with atomic_folder(output, options.force) as folder:
         (name,) = scene_names([scene])
-        with open_bench(scene, name, replace(options, method="paper"), progress) as bench:
-            found = SceneStudy.of(bench, _on_bench(bench, parts, repeats, trials))
+        with open_study_scene(scene, name, replace(options, method="paper"), progress) as studied:
+            found = SceneStudy.of(studied, _on_bench(studied, parts, repeats, trials))
         if "presets" in parts:
             # With the bench's memory given back: these are runs of their own.
             found = replace(found, experiments=(*found.experiments, presets(scene, options, progress)))
@@ -109,16 +109,16 @@ def _check(parts: Sequence[str], repeats: int, trials: int) -> None:
             raise InputError(f"{word} {value}: expected 1 or more")
 
 
-def _on_bench(bench: Bench, parts: Sequence[str], repeats: int, trials: int) -> list[Experiment]:
+def _on_bench(studied: StudyScene, parts: Sequence[str], repeats: int, trials: int) -> list[Experiment]:
     makers: dict[str, Callable[[], list[Experiment]]] = {
-        "drawing": lambda: [drawing(bench, repeats)],
-        "scoring": lambda: scoring(bench),
-        "sampling": lambda: [sampling(bench, trials)],
-        "scaling": lambda: [scaling(bench, repeats)],
+        "drawing": lambda: [drawing(studied, repeats)],
+        "scoring": lambda: scoring(studied),
+        "sampling": lambda: [sampling(studied, trials)],
+        "scaling": lambda: [scaling(studied, repeats)],
     }
     made: list[Experiment] = []
     for part, make in makers.items():
         if part in parts:
-            LOG.info("%s: %s", bench.name, part)
+            LOG.info("%s: %s", studied.name, part)
             made += make()
     return made

@@ -9,7 +9,7 @@ from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.packed.quantize import array_bytes
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.source import MemorySource, SceneSource
-from flexgs_edge.studies.study_scene import RANK_BYTES, Bench
+from flexgs_edge.studies.study_scene import RANK_BYTES, StudyScene
 
 HALF_LARGEST = float(np.finfo(np.float16).max)
 RANGE_BYTES = 8
@@ -44,12 +44,12 @@ def half_positions(source: SceneSource) -> MemorySource:
     return MemorySource(planes, source.sh_degree, source.origin)
 
 
-def add_plain_orders(bench: Bench, removal: np.ndarray) -> None:
+def add_plain_orders(studied: StudyScene, removal: np.ndarray) -> None:
     """Put the orders by chance, opacity, volume and measured costs of removal ([N] f64) beside those that the bench has."""
-    source = bench.scene.source
-    bench.workspace.budget.take("ranks by four more scores", 4 * RANK_BYTES * source.count)
+    source = studied.scene.source
+    studied.workspace.budget.take("ranks by four more scores", 4 * RANK_BYTES * source.count)
     planes = source.read(slice(0, source.count), ["opacity_logits", "log_scales"])
-    bench.orders["random"] = np.random.default_rng(0).permutation(source.count)
-    bench.orders["opacity"] = order_from_scores(planes["opacity_logits"][0])
-    bench.orders["volume"] = order_from_scores(planes["log_scales"].sum(axis=0, dtype=np.float64))
-    bench.orders["dSE"] = order_from_scores(removal)
+    studied.orders["random"] = np.random.default_rng(0).permutation(source.count)
+    studied.orders["opacity"] = order_from_scores(planes["opacity_logits"][0])
+    studied.orders["volume"] = order_from_scores(planes["log_scales"].sum(axis=0, dtype=np.float64))
+    studied.orders["dSE"] = order_from_scores(removal)

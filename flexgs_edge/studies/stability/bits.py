@@ -32,28 +32,28 @@ from flexgs_edge.studies.stability.breaks import (
     where_it_breaks,
 )
 from flexgs_edge.studies.stability.ours import Whole
-from flexgs_edge.studies.study_scene import Bench, Setting
+from flexgs_edge.studies.study_scene import StudyScene, Setting
 
 TENSOR, CHANNEL, GROUPS, MPQ, BEST = "RTN, per tensor", "RTN, per channel", "RTN, sub-groups", "paper (MPQ)", "best"
 ORDERS = ("file", "shuffled", "curve")
 
 
-def rounding(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
+def rounding(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
     """Plain rounding from 8 bits down, in ever finer ranges, and ever coarser grids of best."""
     rows: list[dict[str, Cell]] = []
 
     def add(method: str, bits: int | None, coarser: float | None, found: Outcome) -> None:
-        rows.append({"method": method, "bits": bits, "coarser": coarser, **found.cells(bench)})
+        rows.append({"method": method, "bits": bits, "coarser": coarser, **found.cells(studied)})
 
-    source = bench.scene.source
-    for bits in bench.progress.track(amounts.bits, "bits", len(amounts.bits)):
+    source = studied.scene.source
+    for bits in studied.progress.track(amounts.bits, "bits", len(amounts.bits)):
         spec = BitSpec.rtn(bits)
-        add(TENSOR, bits, None, of_source(bench, lambda: tensor_rounded(source, bits)))  # noqa: B023
-        add(CHANNEL, bits, None, of_setting(bench, Setting(bits=spec, groups=1)))
-        add(GROUPS, bits, None, of_setting(bench, Setting(bits=spec)))
-    add(MPQ, None, None, of_setting(bench, Setting()))
+        add(TENSOR, bits, None, of_source(studied, lambda: tensor_rounded(source, bits)))  # noqa: B023
+        add(CHANNEL, bits, None, of_setting(studied, Setting(bits=spec, groups=1)))
+        add(GROUPS, bits, None, of_setting(studied, Setting(bits=spec)))
+    add(MPQ, None, None, of_setting(studied, Setting()))
     for factor in amounts.coarser:
-        add(BEST, None, factor, of_source(bench, lambda: _coarser(ours, factor)))  # noqa: B023
+        add(BEST, None, factor, of_source(studied, lambda: _coarser(ours, factor)))  # noqa: B023
     table = Table(columns(method="method", bits="bits a value", coarser="steps, times", **LOSSES), tuple(rows))
     parts = {method: [row for row in rows if row["method"] == method] for method in (TENSOR, CHANNEL, GROUPS)}
     own = [row for row in rows if row["method"] == BEST]
@@ -67,7 +67,7 @@ def rounding(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
         LineChart(
             "Fewer bits: where each way of rounding breaks",
             "ratio to the PLY",
-            f"loss: {bench.plan.judge} (dB)",
+            f"loss: {studied.plan.figure} (dB)",
             (
                 *(curve(part, method, "ratio") for method, part in parts.items()),
                 curve([row for row in rows if row["method"] == MPQ], MPQ, "ratio", line=False),
@@ -102,9 +102,9 @@ def _of_grid(grid: GridScene) -> tuple[int, MemorySource]:
     return coded_size(grid, {}), MemorySource(from_grid(grid), origin=grid.origin)
 
 
-def groups(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
+def groups(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
     """Rows that share a range, from few to all, in three orders of the rows."""
-    source = bench.scene.source
+    source = studied.scene.source
     count = source.count
     orders = {
         "file": np.arange(count),
@@ -112,13 +112,13 @@ def groups(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
         "curve": near_order(source),
     }
     rows: list[dict[str, Cell]] = []
-    for name in bench.progress.track(ORDERS, "groups", len(ORDERS)):
+    for name in studied.progress.track(ORDERS, "groups", len(ORDERS)):
         turned = source.select(orders[name]) if name != "file" else source
-        evaluator = _evaluator(bench, turned, bench.has_sh[orders[name]])
+        evaluator = _evaluator(studied, turned, studied.has_sh[orders[name]])
         for ranges in dict.fromkeys(max(count // (share or count), 1) for share in amounts.group_rows):
             evaluator.groups, together = ranges, count // ranges
             rows.append(
-                {"order": name, "together": together, **of_choice(bench, lambda: evaluator).cells(bench)}  # noqa: B023
+                {"order": name, "together": together, **of_choice(studied, lambda: evaluator).cells(studied)}  # noqa: B023
             )
     shuffled = orders["shuffled"][: ours.grid.count]
     sizes = [ours.size, coded_size(_reordered(ours.grid, np.argsort(shuffled, kind="stable")), {})]
@@ -133,7 +133,7 @@ def groups(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
         LineChart(
             "Rows that share a range",
             "rows a group (log)",
-            f"loss: {bench.plan.judge} (dB)",
+            f"loss: {studied.plan.figure} (dB)",
             tuple(curve(part, f"{name} order", "together") for name, part in parts.items()),
             limit=BREAK,
             log_x=True,
@@ -159,7 +159,7 @@ def _reordered(grid: GridScene, order: np.ndarray) -> GridScene:
     return to_grid(planes, grid.sh_degrees[order], grid.steps, grid.origin, rename=False)[0]
 
 
-def _evaluator(bench: Bench, source: SceneSource, has_sh: np.ndarray, bits: BitSpec = PAPER) -> SceneEvaluator:
-    workspace = bench.workspace
+def _evaluator(studied: StudyScene, source: SceneSource, has_sh: np.ndarray, bits: BitSpec = PAPER) -> SceneEvaluator:
+    workspace = studied.workspace
     order = np.arange(source.count)
-    return SceneEvaluator(source, order, has_sh, bits, None, workspace.renderer, bench.judge, workspace.budget)
+    return SceneEvaluator(source, order, has_sh, bits, None, workspace.renderer, studied.judge, workspace.budget)

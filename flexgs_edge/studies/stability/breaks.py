@@ -17,7 +17,7 @@ from flexgs_edge.report.plots import Series
 from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.studies.result_tables import Cell, Row
-from flexgs_edge.studies.study_scene import Bench, Setting
+from flexgs_edge.studies.study_scene import StudyScene, Setting
 
 BREAK = 3.0
 """dB lost from which a method is said to have broken: twice the squared error."""
@@ -42,76 +42,76 @@ class Outcome:
     quality: Quality | None
     error: str | None = None
 
-    def cells(self, bench: Bench) -> dict[str, Cell]:
+    def cells(self, studied: StudyScene) -> dict[str, Cell]:
         """Cells of `LOSSES`."""
         quality = self.quality
         if quality is None or self.size is None:
             return {**dict.fromkeys(LOSSES), "broke": f"error: {self.error}"}
-        loss = mean_loss(bench, quality.views)
+        loss = mean_loss(studied, quality.views)
         fidelity = quality.fidelity
         return {
             "size": self.size,
-            "ratio": round(bench.scene.ply_bytes / self.size, 3),
+            "ratio": round(studied.scene.ply_bytes / self.size, 3),
             "loss": round(loss, 4),
-            "worst": round(max(view_loss(bench, view) for view in quality.views), 4),
+            "worst": round(max(view_loss(studied, view) for view in quality.views), 4),
             "fidelity": None if fidelity is None else round(fidelity, 4),
             "broke": LOST if loss > BREAK else None,
         }
 
 
-def view_loss(bench: Bench, view: ViewQuality) -> float:
+def view_loss(studied: StudyScene, view: ViewQuality) -> float:
     """What decides, for one view: its drop against the photo, else its modelled drop; dB."""
-    if bench.plan.judge == "drop" and view.drop is not None:
+    if studied.plan.figure == "drop" and view.drop is not None:
         return view.drop
-    return modelled_drop(view.error, bench.options.base_psnr)
+    return modelled_drop(view.error, studied.options.base_psnr)
 
 
-def mean_loss(bench: Bench, views: Sequence[ViewQuality]) -> float:
+def mean_loss(studied: StudyScene, views: Sequence[ViewQuality]) -> float:
     """The figure that decides, over some views, dB."""
-    if bench.plan.judge == "drop":
-        return math.fsum(view_loss(bench, view) for view in views) / len(views)
-    return Quality(tuple(views), bench.options.base_psnr).modelled_drop
+    if studied.plan.figure == "drop":
+        return math.fsum(view_loss(studied, view) for view in views) / len(views)
+    return Quality(tuple(views), studied.options.base_psnr).modelled_drop
 
 
-def outcome(bench: Bench, make: Callable[[], tuple[int, AbstractContextManager[DeviceScene]]]) -> Outcome:
+def outcome(studied: StudyScene, make: Callable[[], tuple[int, AbstractContextManager[DeviceScene]]]) -> Outcome:
     """The quality of what `make` gives (bytes, and the scene to draw), or its error."""
     try:
         size, loaded = make()
         with loaded as scene:
-            return Outcome(size, bench.judge.compare(scene))
+            return Outcome(size, studied.judge.compare(scene))
     except FlexGSError as error:
         return Outcome(None, None, str(error))
 
 
-def of_source(bench: Bench, make: Callable[[], tuple[int, SceneSource]]) -> Outcome:
+def of_source(studied: StudyScene, make: Callable[[], tuple[int, SceneSource]]) -> Outcome:
     """The same for a source."""
 
     def load() -> tuple[int, AbstractContextManager[DeviceScene]]:
         size, source = make()
-        return size, bench.workspace.renderer.load(source)
+        return size, studied.workspace.renderer.load(source)
 
-    return outcome(bench, load)
+    return outcome(studied, load)
 
 
-def of_setting(bench: Bench, setting: Setting) -> Outcome:
+def of_setting(studied: StudyScene, setting: Setting) -> Outcome:
     """The same for a setting of the bench."""
-    return of_choice(bench, lambda: bench.evaluator(setting), setting.choice)
+    return of_choice(studied, lambda: studied.evaluator(setting), setting.choice)
 
 
-def of_choice(bench: Bench, make: Callable[[], SceneEvaluator], choice: Choice = EVERYTHING) -> Outcome:
+def of_choice(studied: StudyScene, make: Callable[[], SceneEvaluator], choice: Choice = EVERYTHING) -> Outcome:
     """The same for a choice of an evaluator."""
 
     def load() -> tuple[int, AbstractContextManager[DeviceScene]]:
         evaluator = make()
-        return evaluator.size(choice), drawn(bench, evaluator, choice)
+        return evaluator.size(choice), drawn(studied, evaluator, choice)
 
-    return outcome(bench, load)
+    return outcome(studied, load)
 
 
 @contextmanager
-def drawn(bench: Bench, evaluator: SceneEvaluator, choice: Choice) -> Iterator[DeviceScene]:
+def drawn(studied: StudyScene, evaluator: SceneEvaluator, choice: Choice) -> Iterator[DeviceScene]:
     """A choice of an evaluator, quantized and loaded."""
-    with evaluator.quantized(choice) as quantized, bench.workspace.renderer.load_quantized(quantized) as scene:
+    with evaluator.quantized(choice) as quantized, studied.workspace.renderer.load_quantized(quantized) as scene:
         yield scene
 
 

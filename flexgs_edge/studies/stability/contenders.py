@@ -11,7 +11,7 @@ from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.studies.paper.pruning import nearest
 from flexgs_edge.studies.stability.breaks import drawn
 from flexgs_edge.studies.stability.ours import Whole
-from flexgs_edge.studies.study_scene import Bench, Setting
+from flexgs_edge.studies.study_scene import StudyScene, Setting
 
 BEST, PAPER, RTN, ROWS, SH = "best", "paper", "RTN, 8 bits", "rows only", "SH only"
 MARGIN = "best, --views-margin"
@@ -27,42 +27,42 @@ class Contenders:
 
     Parameters
     ----------
-    bench : Bench
+    studied : StudyScene
     ours, guarded : Whole
         The results of best, of given poses and of made ones as well.
     """
 
-    def __init__(self, bench: Bench, ours: Whole, guarded: Whole) -> None:
-        self.bench, self.wholes = bench, {BEST: ours, MARGIN: guarded}
-        paper = Setting(bench.search.chosen.choice)
-        size = bench.size(paper)
+    def __init__(self, studied: StudyScene, ours: Whole, guarded: Whole) -> None:
+        self.studied, self.wholes = studied, {BEST: ours, MARGIN: guarded}
+        paper = Setting(studied.search.chosen.choice)
+        size = studied.size(paper)
         self.settings = {
             PAPER: paper,
             RTN: Setting(bits=BitSpec.rtn(8), groups=1),
-            ROWS: Setting(_of_size(bench, size, lambda rate: Choice(min(rate, 980), 0))),
-            SH: Setting(_of_size(bench, size, lambda rate: Choice(0, rate))),
+            ROWS: Setting(_of_size(studied, size, lambda rate: Choice(min(rate, 980), 0))),
+            SH: Setting(_of_size(studied, size, lambda rate: Choice(0, rate))),
         }
         self.names = (*self.wholes, *self.settings)
 
     def size(self, name: str) -> int:
         """Bytes of the file."""
-        return self.wholes[name].size if name in self.wholes else self.bench.size(self.settings[name])
+        return self.wholes[name].size if name in self.wholes else self.studied.size(self.settings[name])
 
     @contextmanager
     def loaded(self, name: str) -> Iterator[DeviceScene]:
         """What its file decodes to, to draw."""
         if name in self.wholes:
-            with self.bench.workspace.renderer.load(self.wholes[name].source) as scene:
+            with self.studied.workspace.renderer.load(self.wholes[name].source) as scene:
                 yield scene
         else:
             setting = self.settings[name]
-            with drawn(self.bench, self.bench.evaluator(setting), setting.choice) as scene:
+            with drawn(self.studied, self.studied.evaluator(setting), setting.choice) as scene:
                 yield scene
 
 
-def _of_size(bench: Bench, size: int, choice: Callable[[int], Choice]) -> Choice:
+def _of_size(studied: StudyScene, size: int, choice: Callable[[int], Choice]) -> Choice:
     ladder = [choice(rate) for rate in range(1001)]
-    sizes = [bench.size(Setting(one)) for one in ladder]
+    sizes = [studied.size(Setting(one)) for one in ladder]
     place = nearest(sizes, size)
     # Out of reach: the end that is nearer.
     return ladder[place] if place is not None else ladder[-1 if size < sizes[-1] else 0]

@@ -29,7 +29,7 @@ from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
 from flexgs_edge.studies.stability.amounts import Amounts
 from flexgs_edge.studies.stability.breaks import BREAK, LOSSES, Outcome, curve, number, of_choice, of_source
 from flexgs_edge.studies.stability.ours import Whole, search, walked
-from flexgs_edge.studies.study_scene import Bench, Setting
+from flexgs_edge.studies.study_scene import StudyScene, Setting
 
 BEST, PAPER, RTN = "best", "paper", "RTN, 8 bits"
 IN_A_ROW, DIRECT = "two targets", "one target"
@@ -72,34 +72,34 @@ class Copies:
         self.ply.unlink(missing_ok=True)
 
 
-def generations(bench: Bench, path: PruneRounds, ours: Whole, amounts: Amounts, folder: Path) -> Experiment:
+def generations(studied: StudyScene, path: PruneRounds, ours: Whole, amounts: Amounts, folder: Path) -> Experiment:
     """Every generation of three methods, against the first original; and two targets in a row."""
     copies = Copies(folder)
     rows: list[dict[str, Cell]] = []
 
     def add(method: str, generation: int, count: int, found: Outcome) -> None:
-        rows.append({"method": method, "generation": generation, "kept": count, **found.cells(bench)})
+        rows.append({"method": method, "generation": generation, "kept": count, **found.cells(studied)})
 
     whole = ours
-    for generation in bench.progress.track(range(1, amounts.generations + 1), "generations", amounts.generations):
+    for generation in studied.progress.track(range(1, amounts.generations + 1), "generations", amounts.generations):
         if generation > 1:
-            whole = _again(bench, copies.of_grid(whole), ours.size)
-        add(BEST, generation, whole.grid.count, of_source(bench, lambda: (whole.size, whole.source)))  # noqa: B023
+            whole = _again(studied, copies.of_grid(whole), ours.size)
+        add(BEST, generation, whole.grid.count, of_source(studied, lambda: (whole.size, whole.source)))  # noqa: B023
     for method, setting in (
-        (PAPER, Setting(bench.search.chosen.choice)),
+        (PAPER, Setting(studied.search.chosen.choice)),
         (RTN, Setting(bits=BitSpec.rtn(8), groups=1)),
     ):
-        evaluator, choice = bench.evaluator(setting), setting.choice
+        evaluator, choice = studied.evaluator(setting), setting.choice
         for generation in range(1, amounts.generations + 1):
             if generation > 1:
                 source = copies.of_choice(evaluator, choice)
-                evaluator, choice = _evaluator(bench, source, np.arange(source.count), setting), EVERYTHING
+                evaluator, choice = _evaluator(studied, source, np.arange(source.count), setting), EVERYTHING
             count = evaluator.counts(choice)[0]
-            add(method, generation, count, of_choice(bench, lambda: evaluator, choice))  # noqa: B023
-    first = search(bench, path, MaxSize(int(FIRST_TIMES * ours.size) + SETTINGS_MOST, bench.plan.judge))
-    second = _again(bench, copies.of_grid(first), ours.size)
-    add(f"{BEST}, {IN_A_ROW}", 2, second.grid.count, of_source(bench, lambda: (second.size, second.source)))
-    add(f"{PAPER}, {IN_A_ROW}", 2, *_paper_in_a_row(bench, copies))
+            add(method, generation, count, of_choice(studied, lambda: evaluator, choice))  # noqa: B023
+    first = search(studied, path, MaxSize(int(FIRST_TIMES * ours.size) + SETTINGS_MOST, studied.plan.figure))
+    second = _again(studied, copies.of_grid(first), ours.size)
+    add(f"{BEST}, {IN_A_ROW}", 2, second.grid.count, of_source(studied, lambda: (second.size, second.source)))
+    add(f"{PAPER}, {IN_A_ROW}", 2, *_paper_in_a_row(studied, copies))
     copies.remove()
     table = Table(columns(method="method", generation="generation", kept="Gaussians kept", **LOSSES), tuple(rows))
     parts = {name: [row for row in rows if row["method"] == name] for name in (BEST, PAPER, RTN)}
@@ -114,7 +114,7 @@ def generations(bench: Bench, path: PruneRounds, ours: Whole, amounts: Amounts, 
         LineChart(
             "Loss of every generation",
             "generation",
-            f"loss: {bench.plan.judge} (dB)",
+            f"loss: {studied.plan.figure} (dB)",
             (
                 *(curve(part, name, "generation") for name, part in parts.items()),
                 *(curve(part, f"{name}, {IN_A_ROW}", "generation", line=False) for name, part in pairs.items()),
@@ -129,23 +129,23 @@ def generations(bench: Bench, path: PruneRounds, ours: Whole, amounts: Amounts, 
     )
 
 
-def _again(bench: Bench, source: SceneSource, size: int) -> Whole:
+def _again(studied: StudyScene, source: SceneSource, size: int) -> Whole:
     """The measured method on a scene, to so many bytes, as `compress` does it."""
-    workspace, target = bench.workspace, MaxSize(size + SETTINGS_MOST, bench.plan.judge)
+    workspace, target = studied.workspace, MaxSize(size + SETTINGS_MOST, studied.plan.figure)
     renderer, budget = workspace.renderer, workspace.budget
     # The limit has room for settings, as every search counts them.
     found = kept_as_it_is(
-        GridCoder(renderer), renderer, source, bench.judge, target, bench.options, budget, lambda result: None
+        GridCoder(renderer), renderer, source, studied.judge, target, studied.options, budget, lambda result: None
     )
     if found is not None:
         grid, _ = found
         return Whole(grid, coded_size(grid, {}), 0.0, np.arange(grid.count), 0, True)
-    with walked(bench, source, bench.views.of(bench.views.train)) as path:
-        return search(bench, path, target)
+    with walked(studied, source, studied.views.of(studied.views.train)) as path:
+        return search(studied, path, target)
 
 
-def _evaluator(bench: Bench, source: SceneSource, order: np.ndarray, setting: Setting) -> SceneEvaluator:
-    workspace = bench.workspace
+def _evaluator(studied: StudyScene, source: SceneSource, order: np.ndarray, setting: Setting) -> SceneEvaluator:
+    workspace = studied.workspace
     return SceneEvaluator(
         source,
         order,
@@ -153,23 +153,23 @@ def _evaluator(bench: Bench, source: SceneSource, order: np.ndarray, setting: Se
         setting.bits,
         setting.groups,
         workspace.renderer,
-        bench.judge,
+        studied.judge,
         workspace.budget,
     )
 
 
-def _paper_in_a_row(bench: Bench, copies: Copies) -> tuple[int, Outcome]:
-    last = Setting(bench.search.chosen.choice)
-    size = bench.size(last)
-    first = bench.adapt(MaxSize(int(FIRST_TIMES * size), bench.plan.judge)).chosen.choice
-    source = copies.of_choice(bench.evaluator(Setting(first)), first)
-    renderer = bench.workspace.renderer
+def _paper_in_a_row(studied: StudyScene, copies: Copies) -> tuple[int, Outcome]:
+    last = Setting(studied.search.chosen.choice)
+    size = studied.size(last)
+    first = studied.adapt(MaxSize(int(FIRST_TIMES * size), studied.plan.figure)).chosen.choice
+    source = copies.of_choice(studied.evaluator(Setting(first)), first)
+    renderer = studied.workspace.renderer
     with renderer.load(source) as scene:
-        order = order_from_scores(score_scene(renderer, scene, source, bench.views.of(bench.views.train)))
+        order = order_from_scores(score_scene(renderer, scene, source, studied.views.of(studied.views.train)))
     renderer.release()
-    evaluator = _evaluator(bench, source, order, last)
-    found = adapt(evaluator, MaxSize(size, bench.plan.judge), bench.options.effort, best_effort=True).chosen.choice
-    return evaluator.counts(found)[0], of_choice(bench, lambda: evaluator, found)
+    evaluator = _evaluator(studied, source, order, last)
+    found = adapt(evaluator, MaxSize(size, studied.plan.figure), studied.options.effort, best_effort=True).chosen.choice
+    return evaluator.counts(found)[0], of_choice(studied, lambda: evaluator, found)
 
 
 def _beyond(rows: list[dict[str, Cell]], name: str) -> str:

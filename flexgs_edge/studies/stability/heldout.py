@@ -19,7 +19,7 @@ from flexgs_edge.studies.stability.breaks import BREAK, LOST, mean_loss, number,
 from flexgs_edge.studies.stability.contenders import BEST, MARGIN, WORDS, Contenders
 from flexgs_edge.studies.stability.ours import Whole, search
 from flexgs_edge.studies.stability.unseen_poses import TILE_SIDE, evenly, worst_tile
-from flexgs_edge.studies.study_scene import Bench
+from flexgs_edge.studies.study_scene import StudyScene
 
 WORST_TIMES, WORST_MORE = 1.5, 0.2
 """The worst view may lose this many times the mean, and so many dB more."""
@@ -42,31 +42,31 @@ HEADS = {
 }
 
 
-def held_out(bench: Bench, path: PruneRounds, contenders: Contenders, amounts: Amounts) -> Experiment:
+def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amounts: Amounts) -> Experiment:
     """Every contender, best when only the even held-out views decide, and with its worst view held, view by view."""
-    cameras = bench.judge.cameras
+    cameras = studied.judge.cameras
     whole: dict[str, Whole] = {}
     if amounts.even and len(cameras) > 1:
-        whole[EVEN] = _decided_on_even(bench, path)
-        if isinstance(bench.target, MaxDrop):
-            limit = WORST_TIMES * bench.target.limit
-            whole[HELD] = search(bench, path, WorstToo(bench.target, limit, bench.target.judge))
+        whole[EVEN] = _decided_on_even(studied, path)
+        if isinstance(studied.target, MaxDrop):
+            limit = WORST_TIMES * studied.target.limit
+            whole[HELD] = search(studied, path, WorstToo(studied.target, limit, studied.target.figure))
     rows = []
-    train = evenly(bench.views.of(bench.views.train), len(cameras))
-    renderer = bench.workspace.renderer
-    with renderer.load(bench.scene.source) as scene:
+    train = evenly(studied.views.of(studied.views.train), len(cameras))
+    renderer = studied.workspace.renderer
+    with renderer.load(studied.scene.source) as scene:
         originals = [renderer.render(scene, camera) for camera in train]
     for name in (*contenders.names, *whole):
         loaded = renderer.load(whole[name].source) if name in whole else contenders.loaded(name)
         with loaded as scene:
-            quality = bench.judge.compare(scene)
-            tiles = [worst_tile(renderer.render(scene, c), bench.judge.original(i)) for i, c in enumerate(cameras)]
+            quality = studied.judge.compare(scene)
+            tiles = [worst_tile(renderer.render(scene, c), studied.judge.original(i)) for i, c in enumerate(cameras)]
             errors = [mse(renderer.render(scene, c), original) for c, original in zip(train, originals)]
         size = whole[name].size if name in whole else contenders.size(name)
-        rows.append(_row(bench, name, size, quality, tiles, errors))
+        rows.append(_row(studied, name, size, quality, tiles, errors))
     renderer.release()
     table = Table(columns(**HEADS), tuple(rows))
-    views = "photos" if bench.plan.judge == "drop" else "renders of the original"
+    views = "photos" if studied.plan.figure == "drop" else "renders of the original"
     return Experiment(
         "heldout",
         "The worst view, and views that decided nothing",
@@ -77,7 +77,7 @@ def held_out(bench: Bench, path: PruneRounds, contenders: Contenders, amounts: A
         table,
         BarChart(
             "Mean and worst held-out view",
-            f"loss: {bench.plan.judge} (dB)",
+            f"loss: {studied.plan.figure} (dB)",
             [str(row["method"]).replace(", ", ",\n") for row in rows],
             {
                 "mean": table.values("loss"),
@@ -94,31 +94,31 @@ def held_out(bench: Bench, path: PruneRounds, contenders: Contenders, amounts: A
     )
 
 
-def _decided_on_even(bench: Bench, path: PruneRounds) -> Whole:
-    workspace, source = bench.workspace, bench.scene.source
+def _decided_on_even(studied: StudyScene, path: PruneRounds) -> Whole:
+    workspace, source = studied.workspace, studied.scene.source
     judge = Judge(
         workspace.renderer,
         source,
-        bench.views,
-        bench.judge.indices[::2],
+        studied.views,
+        studied.judge.indices[::2],
         workspace.budget,
-        bench.plan.judge == "drop",
-        bench.options.base_psnr,
+        studied.plan.figure == "drop",
+        studied.options.base_psnr,
     )
     try:
         with workspace.renderer.load(source) as original:
-            judge.prepare(original, bench.progress)
-        return search(bench, path, bench.target, judge)
+            judge.prepare(original, studied.progress)
+        return search(studied, path, studied.target, judge)
     finally:
         judge.close()
 
 
 def _row(
-    bench: Bench, name: str, size: int, quality: Quality, tiles: Sequence[float], errors: Sequence[float]
+    studied: StudyScene, name: str, size: int, quality: Quality, tiles: Sequence[float], errors: Sequence[float]
 ) -> dict[str, Cell]:
     views = quality.views
-    losses = [view_loss(bench, view) for view in views]
-    loss, worst = mean_loss(bench, views), max(losses)
+    losses = [view_loss(studied, view) for view in views]
+    loss, worst = mean_loss(studied, views), max(losses)
     allowed = WORST_TIMES * max(loss, 0.0) + WORST_MORE
     at = int(np.argmax(tiles))
     return {
@@ -129,8 +129,8 @@ def _row(
         "allowed": round(allowed, 4),
         "within": worst <= allowed,
         "view": views[losses.index(worst)].name,
-        "even": _some(bench, views[::2]),
-        "odd": _some(bench, views[1::2]),
+        "even": _some(studied, views[::2]),
+        "odd": _some(studied, views[1::2]),
         "fidelity": _decibel(quality.fidelity),
         "training": _decibel(mean_psnr([psnr(error) for error in errors])),
         "tile": _decibel(psnr(tiles[at])),
@@ -139,8 +139,8 @@ def _row(
     }
 
 
-def _some(bench: Bench, views: Sequence[ViewQuality]) -> float | None:
-    return round(mean_loss(bench, views), 4) if views else None
+def _some(studied: StudyScene, views: Sequence[ViewQuality]) -> float | None:
+    return round(mean_loss(studied, views), 4) if views else None
 
 
 def _decibel(value: float | None) -> float | None:

@@ -33,7 +33,7 @@ from flexgs_edge.studies.stability.breaks import BREAK, LOST, number
 from flexgs_edge.studies.stability.moved_scene import NO_TURN, Similarity
 from flexgs_edge.studies.stability.ours import Whole, scored_pixels, walked, whole_at
 from flexgs_edge.studies.stability.unseen_poses import evenly
-from flexgs_edge.studies.study_scene import Bench
+from flexgs_edge.studies.study_scene import StudyScene
 
 AWAY = np.array([0.6, -0.64, 0.48])
 """Direction of the moves: along no axis."""
@@ -82,7 +82,7 @@ class Place:
 
     Parameters
     ----------
-    bench : Bench
+    studied : StudyScene
         Of the scene as it is.
     move : Similarity
     source : SceneSource
@@ -91,13 +91,13 @@ class Place:
         How many poses, and how wide.
     """
 
-    def __init__(self, bench: Bench, move: Similarity, source: SceneSource, amounts: Amounts) -> None:
-        self.bench, self.source = bench, source
-        train, judges = few_views(bench, amounts)
+    def __init__(self, studied: StudyScene, move: Similarity, source: SceneSource, amounts: Amounts) -> None:
+        self.studied, self.source = studied, source
+        train, judges = few_views(studied, amounts)
         cameras = [move.camera(camera) for camera in (*train, *judges)]
         places = list(range(len(cameras)))
         self.views = ViewSet(cameras, None, places[: len(train)], places[len(train) :], "moved", None)
-        options, workspace = bench.options, bench.workspace
+        options, workspace = studied.options, studied.workspace
         assert options.near is not None and options.background is not None and options.extent is not None
         self.renderer = Renderer(
             workspace.backend,
@@ -111,7 +111,7 @@ class Place:
     @contextmanager
     def judge(self) -> Iterator[Judge]:
         """The judge of this place, with the renders of the moved original."""
-        judge = Judge(self.renderer, self.source, self.views, self.views.held_out, self.bench.workspace.budget)
+        judge = Judge(self.renderer, self.source, self.views, self.views.held_out, self.studied.workspace.budget)
         try:
             with self.renderer.load(self.source) as original:
                 judge.prepare(original)
@@ -123,8 +123,8 @@ class Place:
     def best(self, judge: Judge, price: float) -> Found:
         """The measured method where a bit is worth so much squared error of each pixel that is scored."""
         train = self.views.of(self.views.train)
-        with walked(self.bench, self.source, train, self.renderer) as path:
-            whole = whole_at(self.bench, path, judge, price * scored_pixels(path))
+        with walked(self.studied, self.source, train, self.renderer) as path:
+            whole = whole_at(self.studied, path, judge, price * scored_pixels(path))
         return Found(whole.rows, whole.size, self._fidelity(judge, whole.source))
 
     def paper(self, judge: Judge, choice: Choice) -> Found:
@@ -133,10 +133,10 @@ class Place:
         with self.renderer.load(self.source) as scene:
             order = order_from_scores(score_scene(self.renderer, scene, self.source, train))
         has_sh = nonzero_sh(self.source)
-        bits, groups = self.bench.options.bit_spec()
+        bits, groups = self.studied.options.bit_spec()
         assert bits is not None
         evaluator = SceneEvaluator(
-            self.source, order, has_sh, bits, groups, self.renderer, judge, self.bench.workspace.budget
+            self.source, order, has_sh, bits, groups, self.renderer, judge, self.studied.workspace.budget
         )
         rows = np.sort(np.concatenate(select_rows(ranks_from_order(order), choice, has_sh)))
         return Found(rows, evaluator.size(choice), evaluator.measure(choice).fidelity)
@@ -150,25 +150,25 @@ class Place:
             return judge.compare(scene).fidelity
 
 
-def few_views(bench: Bench, amounts: Amounts) -> tuple[list[Camera], list[Camera]]:
+def few_views(studied: StudyScene, amounts: Amounts) -> tuple[list[Camera], list[Camera]]:
     """Poses that score and poses that judge, few and small."""
-    train, _ = limit_width(bench.views.of(bench.views.train), amounts.few_width)
-    judges, _ = limit_width(bench.judge.cameras, amounts.few_width)
+    train, _ = limit_width(studied.views.of(studied.views.train), amounts.few_width)
+    judges, _ = limit_width(studied.judge.cameras, amounts.few_width)
     return [train[i] for i in farthest_order(train)[: amounts.few]], evenly(judges, max(amounts.few // 2, 1))
 
 
-def moves(bench: Bench, ours: Whole, amounts: Amounts, folder: Path) -> Experiment:
+def moves(studied: StudyScene, ours: Whole, amounts: Amounts, folder: Path) -> Experiment:
     """Every move by every method, against the scene as it is."""
-    train, _ = few_views(bench, amounts)
+    train, _ = few_views(studied, amounts)
     price = ours.multiplier / ours.pixels
     rows: list[dict[str, Cell]] = []
     names = (AS_IT_IS, *amounts.moves)
     still: dict[str, Found] = {}
     pictures: list[np.ndarray] = []
-    for name in bench.progress.track(names, "moves", len(names)):
+    for name in studied.progress.track(names, "moves", len(names)):
         move, wide = MOVES[name]
         path = folder / "moved.ply"
-        place = Place(bench, move, moved_file(bench.scene.source, move, wide, path), amounts)
+        place = Place(studied, move, moved_file(studied.scene.source, move, wide, path), amounts)
         with place.judge() as judge:
             seen = [judge.original(i).copy() for i in range(len(judge.cameras))]
             pictures = pictures or seen
@@ -176,7 +176,7 @@ def moves(bench: Bench, ours: Whole, amounts: Amounts, folder: Path) -> Experime
             input_fidelity = mean_psnr([psnr(mse(a, b)) for a, b in zip(seen, pictures)])
             runs: dict[str, Callable[[], Found]] = {
                 BEST: lambda: place.best(judge, price),  # noqa: B023
-                PAPER: lambda: place.paper(judge, bench.search.chosen.choice),  # noqa: B023
+                PAPER: lambda: place.paper(judge, studied.search.chosen.choice),  # noqa: B023
                 HALF: lambda: place.half(judge),  # noqa: B023
             }
             for method, run in runs.items():

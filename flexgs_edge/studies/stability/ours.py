@@ -21,7 +21,7 @@ from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import MemorySource, SceneSource
-from flexgs_edge.studies.study_scene import Bench
+from flexgs_edge.studies.study_scene import StudyScene
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +66,14 @@ class FixedSearch(GridSearch):
 
 @contextmanager
 def walked(
-    bench: Bench,
+    studied: StudyScene,
     source: SceneSource,
     cameras: Sequence[Camera],
     renderer: Renderer | None = None,
     margin: bool = False,
 ) -> Iterator[PruneRounds]:
     """The path of prune and rescore over some poses (`margin`: and made ones), for as many searches as wanted."""
-    workspace, options = bench.workspace, replace(bench.options, views_margin=margin)
+    workspace, options = studied.workspace, replace(studied.options, views_margin=margin)
     renderer = renderer or workspace.renderer
     with open_rounds(
         renderer,
@@ -82,7 +82,7 @@ def walked(
         options,
         workspace.budget,
         workspace.clock,
-        bench.progress,
+        studied.progress,
     ) as path:
         yield path
 
@@ -92,30 +92,30 @@ def scored_pixels(path: PruneRounds) -> int:
     return sum(camera.width * camera.height for camera in path.cameras)
 
 
-def search(bench: Bench, path: PruneRounds, target: Target, judge: Judge | None = None) -> Whole:
+def search(studied: StudyScene, path: PruneRounds, target: Target, judge: Judge | None = None) -> Whole:
     """The search for a target along a path; the closest result where it cannot be met."""
-    judge = judge or bench.judge
-    made = _search(bench, path, judge, path.renderer)
-    with bench.workspace.clock.stage("search"):
+    judge = judge or studied.judge
+    made = _search(studied, path, judge, path.renderer)
+    with studied.workspace.clock.stage("search"):
         found = made.run(target, best_effort=True)
     multiplier = found.chosen.multiplier
     return _whole(made, found.product, multiplier, found.reached)
 
 
-def whole_at(bench: Bench, path: PruneRounds, judge: Judge, multiplier: float) -> Whole:
+def whole_at(studied: StudyScene, path: PruneRounds, judge: Judge, multiplier: float) -> Whole:
     """The whole result at a multiplier, without a search."""
-    made = _search(bench, path, judge, path.renderer)
-    with bench.workspace.clock.stage("search"):
+    made = _search(studied, path, judge, path.renderer)
+    with studied.workspace.clock.stage("search"):
         grid = made.at(multiplier)
     return _whole(made, grid, multiplier, True)
 
 
-def _search(bench: Bench, path: PruneRounds, judge: Judge, renderer: Renderer) -> FixedSearch:
+def _search(studied: StudyScene, path: PruneRounds, judge: Judge, renderer: Renderer) -> FixedSearch:
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=path.origin)) as scene:
             return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))
 
-    options = replace(bench.options, refit=True)
+    options = replace(studied.options, refit=True)
     made = grid_search(options, GridCoder(renderer), FixedSearch)(path, measure, lambda step: None)
     assert isinstance(made, FixedSearch)
     return made

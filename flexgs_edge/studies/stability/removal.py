@@ -40,28 +40,28 @@ from flexgs_edge.studies.stability.breaks import (
     where_it_breaks,
 )
 from flexgs_edge.studies.stability.ours import Whole, search, walked
-from flexgs_edge.studies.study_scene import Bench, Setting
+from flexgs_edge.studies.study_scene import StudyScene, Setting
 
 SCORES = ("random", "opacity", "volume", "gs", "meson", "dSE")
 SH_ONLY, BEST = "SH only", "best's path"
 HEADS = {"scores": "scored", "same": "loss on the same half (dB)", "other": "loss on the other half (dB)"}
 
 
-def pruning(bench: Bench, path: PruneRounds, amounts: Amounts) -> Experiment:
+def pruning(studied: StudyScene, path: PruneRounds, amounts: Amounts) -> Experiment:
     """Shares of the Gaussians removed by each score, and shares that lose their SH; 16 bits stand for untouched values."""
     costs = path.snapshots[0]
-    removal = np.full(bench.scene.source.count, -np.inf)
+    removal = np.full(studied.scene.source.count, -np.inf)
     removal[path.rows[costs.rows]] = costs.costs.removal
-    add_plain_orders(bench, removal)
+    add_plain_orders(studied, removal)
     rows: list[dict[str, Cell]] = []
-    for score in bench.progress.track(SCORES, "pruning", len(SCORES)):
+    for score in studied.progress.track(SCORES, "pruning", len(SCORES)):
         for share in amounts.pruned:
-            found = of_setting(bench, Setting(Choice(share, 0), FINE, score=score))
-            rows.append({"method": score, "share": share / 1000, **found.cells(bench)})
+            found = of_setting(studied, Setting(Choice(share, 0), FINE, score=score))
+            rows.append({"method": score, "share": share / 1000, **found.cells(studied)})
     for share in (*amounts.pruned, 1000):
-        found = of_setting(bench, Setting(Choice(0, share), FINE))
-        rows.append({"method": SH_ONLY, "share": share / 1000, **found.cells(bench)})
-    rows += _path_rows(bench, path, max(amounts.pruned))
+        found = of_setting(studied, Setting(Choice(0, share), FINE))
+        rows.append({"method": SH_ONLY, "share": share / 1000, **found.cells(studied)})
+    rows += _path_rows(studied, path, max(amounts.pruned))
     names = (*SCORES, BEST)
     table = Table(columns(method="by", share="share", **LOSSES), tuple(rows))
     parts = {name: [row for row in rows if row["method"] == name] for name in (*names, SH_ONLY)}
@@ -77,7 +77,7 @@ def pruning(bench: Bench, path: PruneRounds, amounts: Amounts) -> Experiment:
         LineChart(
             "Removing more and more: where each score breaks",
             "share of the Gaussians removed (SH only: share that lost its SH)",
-            f"loss: {bench.plan.judge} (dB)",
+            f"loss: {studied.plan.figure} (dB)",
             tuple(curve(part, name, "share") for name, part in parts.items()),
             limit=BREAK,
             magnitudes=True,
@@ -89,29 +89,29 @@ def pruning(bench: Bench, path: PruneRounds, amounts: Amounts) -> Experiment:
     )
 
 
-def _path_rows(bench: Bench, path: PruneRounds, most: int) -> list[dict[str, Cell]]:
+def _path_rows(studied: StudyScene, path: PruneRounds, most: int) -> list[dict[str, Cell]]:
     """The snapshots of the path, until so many thousandths are gone."""
-    keep = EFFORTS[bench.options.effort].keep
-    count = bench.scene.source.count
+    keep = EFFORTS[studied.options.effort].keep
+    count = studied.scene.source.count
     while path.snapshots[-1].count > (1 - most / 1000) * count and path.snapshots[-1].count > 16:
         path.descend(keep)
     rows: list[dict[str, Cell]] = []
     for snapshot in path.snapshots[1:]:
         share = 1 - snapshot.count / count
-        size = bench.size(Setting(Choice(min(round(1000 * share), 999), 0), FINE))
+        size = studied.size(Setting(Choice(min(round(1000 * share), 999), 0), FINE))
         planes = snapshot.planes
-        found = of_source(bench, lambda: (size, MemorySource(planes, origin=path.origin)))  # noqa: B023
-        rows.append({"method": BEST, "share": round(share, 4), **found.cells(bench)})
+        found = of_source(studied, lambda: (size, MemorySource(planes, origin=path.origin)))  # noqa: B023
+        rows.append({"method": BEST, "share": round(share, 4), **found.cells(studied)})
     return rows
 
 
-def views(bench: Bench, amounts: Amounts) -> Experiment:
+def views(studied: StudyScene, amounts: Amounts) -> Experiment:
     """Scores from ever more views: ranks against those from all, and what removing by them costs."""
-    count = len(bench.views.train)
-    choice = bench.search.chosen.choice
+    count = len(studied.views.train)
+    choice = studied.search.chosen.choice
     rows = [
-        {**row, "broke": LOST if number(row, bench.figure) > BREAK else None}
-        for row in score_rows(bench, amounts.fewest, ("farthest", "first"))
+        {**row, "broke": LOST if number(row, studied.figure) > BREAK else None}
+        for row in score_rows(studied, amounts.fewest, ("farthest", "first"))
     ]
     for row in rows:
         row.pop("seconds")
@@ -145,13 +145,13 @@ def views(bench: Bench, amounts: Amounts) -> Experiment:
         LineChart(
             "Views scored, and what they are worth at one size",
             "views scored (log)",
-            f"loss: {bench.plan.judge} (dB)",
-            tuple(curve(part, f"{score}, {poses}", "views", bench.figure) for (score, poses), part in series.items()),
+            f"loss: {studied.plan.figure} (dB)",
+            tuple(curve(part, f"{score}, {poses}", "views", studied.figure) for (score, poses), part in series.items()),
             limit=BREAK,
             log_x=True,
             magnitudes=True,
         ),
-        tuple(_settled(part, f"{score}, {poses}", bench.figure) for (score, poses), part in series.items()),
+        tuple(_settled(part, f"{score}, {poses}", studied.figure) for (score, poses), part in series.items()),
     )
 
 
@@ -181,36 +181,36 @@ def longest_axis(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
     return axis, float(np.median(places @ axis))
 
 
-def halves(bench: Bench, ours: Whole) -> Experiment | None:
+def halves(studied: StudyScene, ours: Whole) -> Experiment | None:
     """Scores from one half of the training poses, judged on held-out views of that half and of the other."""
-    cameras = bench.views.of(bench.views.train)
+    cameras = studied.views.of(studied.views.train)
     axis, middle = longest_axis(cameras)
     near = half_of(cameras, axis, middle)
-    judges = half_of(bench.judge.cameras, axis, middle)
+    judges = half_of(studied.judge.cameras, axis, middle)
     if not (judges.any() and (~judges).any() and near.any()):
         return None
     some = [camera for camera, side in zip(cameras, near) if side]
     rows: list[dict[str, Cell]] = []
 
     def add(method: str, scored: str, views: tuple[ViewQuality, ...]) -> None:
-        same = mean_loss(bench, [view for view, side in zip(views, judges) if side])
-        other = mean_loss(bench, [view for view, side in zip(views, judges) if not side])
+        same = mean_loss(studied, [view for view, side in zip(views, judges) if side])
+        other = mean_loss(studied, [view for view, side in zip(views, judges) if not side])
         broke = LOST if max(same, other) > BREAK else None
         rows.append(
             {"method": method, "scores": scored, "same": round(same, 4), "other": round(other, 4), "broke": broke}
         )
 
-    choice = bench.search.chosen.choice
+    choice = studied.search.chosen.choice
     for score in SCORED:
         for scored, poses in (("all", cameras), ("one half", some)):
-            evaluator = _ranked(bench, _score(bench, score, poses))
-            found = of_choice(bench, lambda: evaluator, choice)  # noqa: B023
+            evaluator = _ranked(studied, _score(studied, score, poses))
+            found = of_choice(studied, lambda: evaluator, choice)  # noqa: B023
             assert found.quality is not None
             add(f"paper, {score}", scored, found.quality.views)
-    with walked(bench, bench.scene.source, some) as path:
-        half = search(bench, path, MaxSize(ours.size + SETTINGS_MOST, bench.plan.judge))
+    with walked(studied, studied.scene.source, some) as path:
+        half = search(studied, path, MaxSize(ours.size + SETTINGS_MOST, studied.plan.figure))
     for scored, whole in (("all", ours), ("one half", half)):
-        found = of_source(bench, lambda: (whole.size, whole.source))  # noqa: B023
+        found = of_source(studied, lambda: (whole.size, whole.source))  # noqa: B023
         assert found.quality is not None
         add("best", scored, found.quality.views)
     table = Table(columns(method="method", **HEADS, broke="broken by"), tuple(rows))
@@ -224,7 +224,7 @@ def halves(bench: Bench, ours: Whole) -> Experiment | None:
         table,
         BarChart(
             "Scored from one side, judged on both",
-            f"loss: {bench.plan.judge} (dB)",
+            f"loss: {studied.plan.figure} (dB)",
             methods,
             {
                 "all poses, that side": table.values("same", scores="all"),
@@ -248,21 +248,21 @@ def _one_side(rows: Sequence[Row], method: str) -> str:
     )
 
 
-def _score(bench: Bench, score: str, cameras: Sequence[Camera]) -> np.ndarray:
-    renderer, source = bench.workspace.renderer, bench.scene.source
+def _score(studied: StudyScene, score: str, cameras: Sequence[Camera]) -> np.ndarray:
+    renderer, source = studied.workspace.renderer, studied.scene.source
     with renderer.load(source) as scene:
         if score == "gs":
-            values = score_scene(renderer, scene, source, cameras, "gs", bench.progress)
+            values = score_scene(renderer, scene, source, cameras, "gs", studied.progress)
         else:
-            values = measure_costs(renderer, scene, cameras, sh_costs=False, progress=bench.progress).removal
+            values = measure_costs(renderer, scene, cameras, sh_costs=False, progress=studied.progress).removal
     renderer.release()
     return order_from_scores(values)
 
 
-def _ranked(bench: Bench, order: np.ndarray) -> SceneEvaluator:
-    bits, groups = bench.options.bit_spec()
+def _ranked(studied: StudyScene, order: np.ndarray) -> SceneEvaluator:
+    bits, groups = studied.options.bit_spec()
     assert isinstance(bits, BitSpec)
-    workspace = bench.workspace
+    workspace = studied.workspace
     return SceneEvaluator(
-        bench.scene.source, order, bench.has_sh, bits, groups, workspace.renderer, bench.judge, workspace.budget
+        studied.scene.source, order, studied.has_sh, bits, groups, workspace.renderer, studied.judge, workspace.budget
     )

@@ -24,7 +24,7 @@ from flexgs_edge.studies.stability.amounts import Amounts
 from flexgs_edge.studies.stability.baselines import tensor_rounded
 from flexgs_edge.studies.stability.breaks import BREAK, LOSSES, Outcome, of_choice, of_source, where_it_breaks
 from flexgs_edge.studies.stability.ours import Whole
-from flexgs_edge.studies.study_scene import Bench
+from flexgs_edge.studies.study_scene import StudyScene
 
 BITS = 8
 METHODS = ("RTN, per tensor", "RTN, per channel", "RTN, sub-groups", "paper (MPQ)", "best")
@@ -79,11 +79,11 @@ def strays_of(planes: dict[str, np.ndarray], size: float, direction: np.ndarray)
     return {name: values.astype(np.float32) for name, values in made.items()}
 
 
-def strays(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
+def strays(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
     """Quantizers with and without strays; the strays are part of what is coded, and in no view."""
-    source = bench.scene.source
+    source = studied.scene.source
     planes = source.read(slice(0, source.count), list(FIELD))
-    cameras = [camera.moved(source.origin) for camera in bench.views.cameras]
+    cameras = [camera.moved(source.origin) for camera in studied.views.cameras]
     rows: list[dict[str, Cell]] = []
     hidden = True
     for size in amounts.outliers:
@@ -93,8 +93,8 @@ def strays(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
             direction = unseen_direction(cameras, np.median(planes["means"], axis=1), far)
             hidden &= direction is not None
             added = strays_of(planes, size, np.array([0.0, 0.0, 1.0]) if direction is None else direction)
-        for method, found in _coded(bench, ours, planes, added):
-            rows.append({"method": method, "spreads": size, **found.cells(bench)})
+        for method, found in _coded(studied, ours, planes, added):
+            rows.append({"method": method, "spreads": size, **found.cells(studied)})
     table = Table(columns(method="method", spreads="strays, in spreads", **LOSSES), tuple(rows))
     parts = {method: [row for row in rows if row["method"] == method] for method in METHODS}
     note = "" if hidden else " Cameras look all around here: the strays are in some views."
@@ -108,7 +108,7 @@ def strays(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
         table,
         BarChart(
             "A few stray values, and what they cost all others",
-            f"loss: {bench.plan.judge} (dB)",
+            f"loss: {studied.plan.figure} (dB)",
             ["none" if not size else f"{size:g} spreads" for size in amounts.outliers],
             {method: [row["loss"] for row in part] for method, part in parts.items()},  # type: ignore[misc]
             limit=BREAK,
@@ -123,25 +123,25 @@ def strays(bench: Bench, ours: Whole, amounts: Amounts) -> Experiment:
 
 
 def _coded(
-    bench: Bench, ours: Whole, planes: dict[str, np.ndarray], added: dict[str, np.ndarray] | None
+    studied: StudyScene, ours: Whole, planes: dict[str, np.ndarray], added: dict[str, np.ndarray] | None
 ) -> list[tuple[str, Outcome]]:
-    origin = bench.scene.source.origin
+    origin = studied.scene.source.origin
     whole = planes if added is None else _joined(planes, added)
-    source = MemorySource(whole, bench.scene.source.sh_degree, origin)
-    has_sh = np.concatenate([bench.has_sh, np.ones(source.count - len(bench.has_sh), bool)])
-    workspace = bench.workspace
+    source = MemorySource(whole, studied.scene.source.sh_degree, origin)
+    has_sh = np.concatenate([studied.has_sh, np.ones(source.count - len(studied.has_sh), bool)])
+    workspace = studied.workspace
 
     def evaluator(bits: BitSpec, groups: int | None) -> SceneEvaluator:
         order = np.arange(source.count)
-        return SceneEvaluator(source, order, has_sh, bits, groups, workspace.renderer, bench.judge, workspace.budget)
+        return SceneEvaluator(source, order, has_sh, bits, groups, workspace.renderer, studied.judge, workspace.budget)
 
     rtn = BitSpec.rtn(BITS)
     return [
-        (METHODS[0], of_source(bench, lambda: tensor_rounded(source, BITS))),
-        (METHODS[1], of_choice(bench, lambda: evaluator(rtn, 1))),
-        (METHODS[2], of_choice(bench, lambda: evaluator(rtn, None))),
-        (METHODS[3], of_choice(bench, lambda: evaluator(PAPER, None))),
-        (METHODS[4], of_source(bench, lambda: _best(ours, added))),
+        (METHODS[0], of_source(studied, lambda: tensor_rounded(source, BITS))),
+        (METHODS[1], of_choice(studied, lambda: evaluator(rtn, 1))),
+        (METHODS[2], of_choice(studied, lambda: evaluator(rtn, None))),
+        (METHODS[3], of_choice(studied, lambda: evaluator(PAPER, None))),
+        (METHODS[4], of_source(studied, lambda: _best(ours, added))),
     ]
 
 

@@ -29,7 +29,7 @@ from flexgs_edge.studies.stability.ours import Whole, search, walked
 from flexgs_edge.studies.stability.searches import searches
 from flexgs_edge.studies.stability.strays import strays
 from flexgs_edge.studies.stability.unseen_poses import poses
-from flexgs_edge.studies.study_scene import Bench, open_bench, scene_names
+from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
 from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
@@ -95,8 +95,8 @@ def study_stability(
     check_folder(output, options.force)
     with atomic_folder(output, options.force) as folder:
         (name,) = scene_names([scene])
-        with open_bench(scene, name, options, progress, scores=("gs", "meson")) as bench:
-            found = SceneStudy.of(bench, _experiments(bench, amounts, folder))
+        with open_study_scene(scene, name, options, progress, scores=("gs", "meson")) as studied:
+            found = SceneStudy.of(studied, _experiments(studied, amounts, folder))
         page = study_page("Stability", _INTRO, [write_scene(folder, found)])
         (folder / "index.html").write_text(page, encoding="utf-8")
     LOG.info("wrote %s", Path(output) / "index.html")
@@ -111,48 +111,48 @@ _INTRO = (
 )
 
 
-def _experiments(bench: Bench, amounts: Amounts, folder: Path) -> list[Experiment]:
-    source, train = bench.scene.source, bench.views.of(bench.views.train)
-    bench.workspace.budget.require(
+def _experiments(studied: StudyScene, amounts: Amounts, folder: Path) -> list[Experiment]:
+    source, train = studied.scene.source, studied.views.of(studied.views.train)
+    studied.workspace.budget.require(
         "copies of the scene", COPIES * source.count * sum(4 * source.width(name) for name in FIELD)
     )
     temporary = tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder)
     with temporary as place:
         # First: two paths at once would take twice the memory.
-        with walked(bench, source, train, margin=True) as path:
-            guarded = search(bench, path, bench.target)
-        with walked(bench, source, train) as path:
-            return _along_the_path(bench, path, guarded, amounts, Path(place))
+        with walked(studied, source, train, margin=True) as path:
+            guarded = search(studied, path, studied.target)
+        with walked(studied, source, train) as path:
+            return _along_the_path(studied, path, guarded, amounts, Path(place))
 
 
-def _along_the_path(bench: Bench, path: PruneRounds, guarded: Whole, amounts: Amounts, place: Path) -> list[Experiment]:
+def _along_the_path(studied: StudyScene, path: PruneRounds, guarded: Whole, amounts: Amounts, place: Path) -> list[Experiment]:
     made: list[Experiment] = []
 
     @contextmanager
     def part(name: str) -> Iterator[None]:
-        LOG.info("%s: %s", bench.name, name)
-        with bench.workspace.clock.stage(name):
+        LOG.info("%s: %s", studied.name, name)
+        with studied.workspace.clock.stage(name):
             yield
 
     with part("results at the target"):
-        ours = search(bench, path, bench.target)
-        contenders = Contenders(bench, ours, guarded)
+        ours = search(studied, path, studied.target)
+        contenders = Contenders(studied, ours, guarded)
     with part("bits"):
-        made += [bits.rounding(bench, ours, amounts), bits.groups(bench, ours, amounts), strays(bench, ours, amounts)]
+        made += [bits.rounding(studied, ours, amounts), bits.groups(studied, ours, amounts), strays(studied, ours, amounts)]
     with part("views"):
-        made.append(removal.views(bench, amounts))
-        if amounts.halves and (sides := removal.halves(bench, ours)) is not None:
+        made.append(removal.views(studied, amounts))
+        if amounts.halves and (sides := removal.halves(studied, ours)) is not None:
             made.append(sides)
     with part("held-out views"):
-        made.append(held_out(bench, path, contenders, amounts))
+        made.append(held_out(studied, path, contenders, amounts))
     with part("poses"):
-        made += poses(bench, contenders, amounts)
+        made += poses(studied, contenders, amounts)
     with part("moves"):
-        made.append(moves(bench, ours, amounts, place))
+        made.append(moves(studied, ours, amounts, place))
     with part("generations"):
-        made.append(generations(bench, path, ours, amounts, place))
+        made.append(generations(studied, path, ours, amounts, place))
     # Last: it walks the path down to its end.
     with part("pruning"):
-        made.insert(3, removal.pruning(bench, path, amounts))
+        made.insert(3, removal.pruning(studied, path, amounts))
     made.append(searches(EFFORT))
     return made

@@ -17,7 +17,7 @@ from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
 from flexgs_edge.studies.stability.amounts import Amounts
 from flexgs_edge.studies.stability.breaks import BREAK, LOST, curve, number
 from flexgs_edge.studies.stability.contenders import BEST, WORDS, Contenders
-from flexgs_edge.studies.study_scene import Bench
+from flexgs_edge.studies.study_scene import StudyScene
 from flexgs_edge.views.depths import visible_depths
 
 TILE_SIDE = 64
@@ -64,11 +64,11 @@ def above(camera: Camera, depth: float, degrees: float) -> Camera:
     return replace(camera, rotation=turn @ camera.rotation, translation=turn @ (camera.translation - pivot) + pivot)
 
 
-def make_poses(bench: Bench, amounts: Amounts) -> list[Poses]:
+def make_poses(studied: StudyScene, amounts: Amounts) -> list[Poses]:
     """All sets, the training poses first."""
-    train = bench.views.of(bench.views.train)
-    base = evenly(bench.judge.cameras, amounts.poses)
-    depths = visible_depths(bench.workspace.renderer, bench.scene.source, base)
+    train = studied.views.of(studied.views.train)
+    base = evenly(studied.judge.cameras, amounts.poses)
+    depths = visible_depths(studied.workspace.renderer, studied.scene.source, base)
     near = [min(train, key=lambda other: float(np.linalg.norm(other.center - camera.center))) for camera in base]
     made = [Poses(TRAINING, None, evenly(train, amounts.poses)), Poses(HELD_OUT, None, base)]
     made += [
@@ -111,10 +111,10 @@ class Seen:
         return {name: None if value is None else round(value, 3) for name, value in figures.items()}
 
 
-def look(bench: Bench, contenders: Contenders, cameras: Sequence[Camera]) -> dict[str, Seen]:
+def look(studied: StudyScene, contenders: Contenders, cameras: Sequence[Camera]) -> dict[str, Seen]:
     """Every contender against the original over some views."""
-    renderer = bench.workspace.renderer
-    with renderer.load(bench.scene.source) as scene:
+    renderer = studied.workspace.renderer
+    with renderer.load(studied.scene.source) as scene:
         originals = [renderer.render(scene, camera) for camera in cameras]
     found = {}
     for name in contenders.names:
@@ -129,13 +129,13 @@ def look(bench: Bench, contenders: Contenders, cameras: Sequence[Camera]) -> dic
     return found
 
 
-def poses(bench: Bench, contenders: Contenders, amounts: Amounts) -> list[Experiment]:
+def poses(studied: StudyScene, contenders: Contenders, amounts: Amounts) -> list[Experiment]:
     """Fidelity from poses that were never scored: by distance, and by all else."""
     rows: list[dict[str, Cell]] = []
     base: dict[str, float] = {}
-    every = make_poses(bench, amounts)
-    for made in bench.progress.track(every, "poses", len(every)):
-        for name, seen in look(bench, contenders, made.cameras).items():
+    every = make_poses(studied, amounts)
+    for made in studied.progress.track(every, "poses", len(every)):
+        for name, seen in look(studied, contenders, made.cameras).items():
             cells = seen.cells()
             # Identical pictures have no fidelity: nothing is below it, and it is below nothing.
             fidelity = math.inf if cells["fidelity"] is None else number(cells, "fidelity")

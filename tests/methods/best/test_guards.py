@@ -89,7 +89,7 @@ def test_the_worst_view_in_words() -> None:
     found = Measurement(None, 39.0, 0.9, Measurement(None, 34.0, 2.0))
     assert target.excess(1, found) == pytest.approx(np.log(2.0 / 1.5))
     assert target.report(1000, found).endswith("modelled drop 2.000 dB in the worst view")
-    assert target.judge == "fidelity" and target.limit == 38 and target.limit_bytes is None
+    assert target.figure == "fidelity" and target.limit == 38 and target.limit_bytes is None
 
 
 def test_measurements_know_the_worst_view() -> None:
