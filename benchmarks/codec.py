@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Bench, backend_of, check, parse
+from benchmarks.harness import SCENES, Timer, backend_of, check, parse
 from flexgs_edge.codec.open_fgs import verify
 from flexgs_edge.codec.v2.container import channel_bytes, coded_size, write_grid
 from flexgs_edge.codec.v2.encode import encode_grid
@@ -69,7 +69,7 @@ def main() -> None:
         __doc__, repeats=3, more=[("--rows", {"type": int, "default": 1_000_000, "help": "default: %(default)s"})]
     )
     backend, _ = backend_of(options)
-    bench = Bench(backend.name, options.repeats)
+    timer = Timer(backend.name, options.repeats)
     steps = StepSizes(0.0025, 0.25, 0.05, 0.4, 0.08, (0.09, 0.09, 0.09))
     planes, degrees = some_rows(SCENES[options.scene] / "point_cloud.ply", options.rows, steps)
     count = len(degrees)
@@ -84,9 +84,9 @@ def main() -> None:
             check(np.array_equal(plane, expected[name]), f"{name} through file and PLY")
         del expected
         note = f"{count} Gaussians, {np.count_nonzero(degrees) / count:.0%} of them with SH; file and PLY checked"
-        bench.add("codec: size", [8 * size / count], "bits/Gaussian", note)
+        timer.add("codec: size", [8 * size / count], "bits/Gaussian", note)
         sh = sum(bytes_ for name, bytes_ in channel_bytes(path).items() if name.startswith("sh"))
-        bench.add("codec: size of the SH", [8 * sh / count], "bits/Gaussian", note)
+        timer.add("codec: size of the SH", [8 * sh / count], "bits/Gaussian", note)
 
         def rate(label: str, run: Callable[[], Any]) -> None:
             wall, cpu = [], []
@@ -96,7 +96,7 @@ def main() -> None:
                 spared = result.run.startup_seconds + result.run.compile_seconds if hasattr(result, "run") else 0.0
                 wall.append(count / (time.perf_counter() - start[0] - spared) / 1e6)
                 cpu.append(count / (time.process_time() - start[1]) / 1e6)
-            bench.add(label, wall, "M/s", f"{note}; by processor time {np.median(cpu):.3g} M/s")
+            timer.add(label, wall, "M/s", f"{note}; by processor time {np.median(cpu):.3g} M/s")
 
         rate("codec: to grid", lambda: to_grid(planes, degrees, steps, np.zeros(3)))
         rate("codec: encode to a file", lambda: write_grid(path, grid, {}, force=True))

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Bench, check
+from benchmarks.harness import SCENES, Timer, check
 from flexgs_edge.codec.v2.container import channel_bytes, write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.constants import DEFAULT_NEAR
@@ -36,6 +36,7 @@ from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.references import References
 
 STEPS = (0.002, 0.2, 0.04, 0.3, 0.06)
@@ -69,7 +70,7 @@ def channels(grid: GridScene) -> dict[str, np.ndarray]:
     return named | {f"sh {degree}": band for degree, band in enumerate(grid.sh, start=1)}
 
 
-def report(bench: Bench, path: Path, what: str) -> float:
+def report(timer: Timer, path: Path, what: str) -> float:
     """One result a channel; returns the bits of the whole file a Gaussian."""
     source = GridSource(path)
     grid, coded = source.grid(), channel_bytes(path)
@@ -79,12 +80,12 @@ def report(bench: Bench, path: Path, what: str) -> float:
         parts = [part for part in rest if part == name or (part.startswith(f"{name} ") and part != "sh degree")]
         bits = 8 * sum(rest.pop(part) for part in parts) / grid.count
         bound = entropy_bits(planes) / grid.count
-        bench.add(f"{what}: {name}", [bits], "bits/Gaussian", f"order-0 entropy of {len(planes)} planes: {bound:.4g}")
+        timer.add(f"{what}: {name}", [bits], "bits/Gaussian", f"order-0 entropy of {len(planes)} planes: {bound:.4g}")
     other = 8 * sum(rest.values()) / grid.count
-    bench.add(f"{what}: tables, lanes and header", [other], "bits/Gaussian")
+    timer.add(f"{what}: tables, lanes and header", [other], "bits/Gaussian")
     whole = 8 * path.stat().st_size / grid.count
     check(abs(8 * sum(coded.values()) / grid.count - whole) < 1e-6, "channels add up to the file")
-    bench.add(f"{what}: whole file", [whole], "bits/Gaussian", f"{grid.count} Gaussians, {path.stat().st_size} bytes")
+    timer.add(f"{what}: whole file", [whole], "bits/Gaussian", f"{grid.count} Gaussians, {path.stat().st_size} bytes")
     return whole
 
 
@@ -97,7 +98,7 @@ def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str |
     backend = open_backend(device, budget)
     source, cameras = scene.source, views.of(views.train)
     renderer = Renderer(backend, budget, near=DEFAULT_NEAR)
-    judge = Judge(renderer, source, views, views.held_out, budget)
+    judge = Judge(Bench(renderer), source, views, views.held_out)
     try:
         with renderer.load(source) as original:
             judge.prepare(original, progress)
@@ -110,7 +111,7 @@ def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str |
         degrees = np.full(source.count, source.sh_degree, np.uint8)
         with targets:
             mended = refit_colours(
-                renderer, start, degrees, source.origin, cameras, targets, ROUNDS, False, SUBSETS, progress
+                Bench(renderer), start, degrees, source.origin, cameras, targets, ROUNDS, False, SUBSETS, progress
             )
         write_grid(output, recolour(grid, mended["sh_dc"], exact["sh_rest"]), {}, force=True)
         decoded = GridSource(output)
@@ -130,20 +131,20 @@ def main() -> None:
     parser.add_argument("--file", type=Path, help="a .fgs of version 2 instead")
     parser.add_argument("--steps", type=float, nargs=5, default=STEPS, help="default: %(default)s")
     options = parser.parse_args()
-    bench = Bench("NumPy", 1)
+    timer = Timer("NumPy", 1)
     if options.file is not None:
-        report(bench, options.file, options.file.name)
+        report(timer, options.file, options.file.name)
         return
     kinds = ("position", "scale", "rotation", "opacity", "dc")
     steps = StepSizes(**dict(zip(kinds, options.steps, strict=True)), sh=(), chroma=CHROMA)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "base.fgs"
         quality = base_payload(SCENES[options.scene] / "point_cloud.ply", path, steps, options.device, Progress())
-        whole = report(bench, path, "base")
+        whole = report(timer, path, "base")
     assert quality.drop is not None and quality.fidelity is not None
     note = f"SH exact, constant refitted, held-out photos; steps {', '.join(f'{step:g}' for step in options.steps)}"
-    bench.add("base: drop", [quality.drop], "dB", note)
-    bench.add("base: fidelity", [quality.fidelity], "dB", note)
+    timer.add("base: drop", [quality.drop], "dB", note)
+    timer.add("base: fidelity", [quality.fidelity], "dB", note)
     if options.scene == "fox" and tuple(options.steps) == STEPS:
         check(whole <= MOST_BITS and quality.drop <= MOST_DROP, f"at most {MOST_BITS} bits at {MOST_DROP} dB")
 

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness import ROOT, SCENES, Bench, check, parse
+from benchmarks.harness import ROOT, SCENES, Timer, check, parse
 
 
 def compress(scene: str, device: str | None, folder: Path, cache: Path) -> tuple[float, int, dict[str, Any]]:
@@ -58,13 +58,13 @@ def main() -> None:
     check(len(sums) == 1, "the same bytes in every run")
     result = warm[0][2]
     device = result["run"]["device"]["name"] if result["run"]["device"] else "none"
-    bench = Bench(device, options.repeats)
+    timer = Timer(device, options.repeats)
     note = f"{size} bytes in every run, verified"
     for label, runs in (("cold", cold), ("warm", warm)):
         peak = max(run[1] for run in runs)
-        bench.add(f"compress, {label}", [run[0] for run in runs], "s", f"{note}; PoCL's kernel cache {label}", peak)
+        timer.add(f"compress, {label}", [run[0] for run in runs], "s", f"{note}; PoCL's kernel cache {label}", peak)
     for stage in result["run"]["stages"]:
-        bench.add(
+        timer.add(
             f"compress: {stage}", [run[2]["run"]["stages"][stage] for run in warm], "s", "kernel cache warm", peak
         )
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Bench, backend_of, parse
+from benchmarks.harness import SCENES, Timer, backend_of, parse
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.made import at_distance, between
 from flexgs_edge.codec.open_fgs import open_fgs
@@ -54,7 +54,7 @@ def main() -> None:
     )
     options = parse(__doc__, repeats=1, scene="sample", more=more)
     backend, budget = backend_of(options)
-    bench = Bench(backend.name, 1)
+    timer = Timer(backend.name, 1)
     path = SCENES[options.scene] / "point_cloud.ply"
     scene, companions = load_scene(path), companions_of(path)
     drawing = resolve_drawing(CompressOptions(), scene, companions)
@@ -80,22 +80,22 @@ def main() -> None:
             result = compress(path, place, chosen)
             seconds = time.process_time() - started
             label = f"{options.scene}, {options.effort}, margin {'on' if margin else 'off'}"
-            bench.add(f"{label}: bytes", [result.size], "B")
-            bench.add(f"{label}: processor seconds", [seconds], "s")
+            timer.add(f"{label}: bytes", [result.size], "B")
+            timer.add(f"{label}: processor seconds", [seconds], "s")
             quality = result.quality
             assert quality is not None
             worst = quality.worst
             assert worst is not None
             mean, most = (quality.drop, worst.drop) if quality.drop is not None else (quality.modelled_drop, None)
-            bench.add(f"{label}: mean drop", [mean], "dB")
+            timer.add(f"{label}: mean drop", [mean], "dB")
             if most is not None:
-                bench.add(f"{label}: worst view's drop", [most], "dB", f"allowed {1.5 * mean + 0.2:.3f}")
+                timer.add(f"{label}: worst view's drop", [most], "dB", f"allowed {1.5 * mean + 0.2:.3f}")
             coded = open_fgs(place)
             for kind, cameras in sets.items():
                 found = fidelities(renderer, scene.source, coded, cameras)
                 usual = mean_psnr(list(found))
                 assert usual is not None
-                bench.add(f"{label}: {kind}", [usual], "dB", f"worst {found.min():.2f}")
+                timer.add(f"{label}: {kind}", [usual], "dB", f"worst {found.min():.2f}")
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ def revision() -> str:
     return done.stdout.strip() or "unknown"
 
 
-class Bench:
+class Timer:
     """Prints each result as a JSON line as soon as it is known.
 
     Parameters

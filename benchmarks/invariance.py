@@ -18,7 +18,7 @@ from unittest import mock
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Bench, check
+from benchmarks.harness import SCENES, Timer, check
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.inria import inria_json
 from flexgs_edge.cameras.read import read_cameras
@@ -78,7 +78,7 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
 
         return recorded
 
-    with mock.patch("flexgs_edge.commands.compress.grid_search", recording):
+    with mock.patch("flexgs_edge.methods.best.method.grid_search", recording):
         result = compress(path, output, method="best", near=near, force=True, progress=progress, **words)
     assert result.search is not None
     chosen = steps[result.search.steps.index(result.search.chosen)]
@@ -147,10 +147,10 @@ def main() -> None:
         words["resolution"] = options.resolution
     with tempfile.TemporaryDirectory() as scratch:
         found, note = compare(SCENES[options.scene], Path(scratch), options.factor, Progress(), **words)
-    bench = Bench(options.device or "default", 1)
-    bench.add(f"scaled {options.factor:g}x and turned: kept Gaussians that are the same", [found.same], "share", note)
-    bench.add(f"scaled {options.factor:g}x and turned: the same at one multiplier", [found.choice], "share", note)
-    bench.add(f"scaled {options.factor:g}x and turned: bytes", [found.bytes_ratio], "ratio", note)
+    timer = Timer(options.device or "default", 1)
+    timer.add(f"scaled {options.factor:g}x and turned: kept Gaussians that are the same", [found.same], "share", note)
+    timer.add(f"scaled {options.factor:g}x and turned: the same at one multiplier", [found.choice], "share", note)
+    timer.add(f"scaled {options.factor:g}x and turned: bytes", [found.bytes_ratio], "ratio", note)
     check(found.same >= LEAST_SAME and abs(found.bytes_ratio - 1) <= MOST_BYTES, "the same Gaussians and bytes")
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Bench, backend_of, check, parse
+from benchmarks.harness import SCENES, Timer, backend_of, check, parse
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.constants import TILE
 from flexgs_edge.io.ply import PlySource
@@ -55,7 +55,7 @@ __kernel void peak(const uint rounds, __global const float *records, __global fl
 """The blend's step for vectors of which every lane counts; splats, pixels and colours never leave the nearest cache."""
 
 
-def bench_peak(bench: Bench, backend: OpenCLBackend) -> float:
+def bench_peak(timer: Timer, backend: OpenCLBackend) -> float:
     """Lanes a second of the arithmetic alone, on all cores."""
     session, width = backend.session, backend.width
     source = load_source("dequantize.cl") + ARITHMETIC  # that file for the constants and helpers before it
@@ -76,17 +76,17 @@ def bench_peak(bench: Bench, backend: OpenCLBackend) -> float:
     check(bool(np.isfinite(sums).all() and (sums > 0).all()), "sums of light of the arithmetic alone")
     lanes = ITEMS * ROUNDS * BLOCKS * width
     seconds = []
-    for _ in range(bench.repeats):
+    for _ in range(timer.repeats):
         start = time.perf_counter()
         run()
         seconds.append(time.perf_counter() - start)
-    bench.add("arithmetic alone", [lanes / s / 1e9 for s in seconds], "G lanes/s", f"W = {width}, all cores")
+    timer.add("arithmetic alone", [lanes / s / 1e9 for s in seconds], "G lanes/s", f"W = {width}, all cores")
     held.release()
     out.release()
     return lanes / min(seconds)
 
 
-def bench_share(bench: Bench, backend: OpenCLBackend, renderer: Renderer, folder: Path, peak: float) -> None:
+def bench_share(timer: Timer, backend: OpenCLBackend, renderer: Renderer, folder: Path, peak: float) -> None:
     """The blend of real views, lane by lane."""
     cameras = read_cameras(folder / "cameras.json")
     cameras = cameras[:: max(len(cameras) // VIEWS, 1)][:VIEWS]
@@ -103,7 +103,7 @@ def bench_share(bench: Bench, backend: OpenCLBackend, renderer: Renderer, folder
             blended += int(np.unpackbits(masks.view(np.uint8)).sum()) * 16
         hits = int(statistics.hits.sum())
         seconds = []
-        for _ in range(bench.repeats):
+        for _ in range(timer.repeats):
             backend.profile = defaultdict(float)
             for camera in cameras:
                 renderer.render(scene, camera)
@@ -112,10 +112,10 @@ def bench_share(bench: Bench, backend: OpenCLBackend, renderer: Renderer, folder
     cores = len(os.sched_getaffinity(0))
     listed = pairs * TILE * TILE
     each = [s * 1e9 * cores / listed for s in seconds]
-    bench.add("blend, by listed tile pixel and core", each, "ns", f"{len(cameras)} views, {cores} cores")
-    bench.add("lanes of listed blocks, of listed tile pixels", [blended / listed], "share")
-    bench.add("useful lanes (blended pixels), of lanes of listed blocks", [hits / blended], "share")
-    bench.add("blend: useful lanes, of the arithmetic alone", [hits / s / peak for s in seconds], "share")
+    timer.add("blend, by listed tile pixel and core", each, "ns", f"{len(cameras)} views, {cores} cores")
+    timer.add("lanes of listed blocks, of listed tile pixels", [blended / listed], "share")
+    timer.add("useful lanes (blended pixels), of lanes of listed blocks", [hits / blended], "share")
+    timer.add("blend: useful lanes, of the arithmetic alone", [hits / s / peak for s in seconds], "share")
 
 
 def main() -> None:
@@ -123,10 +123,10 @@ def main() -> None:
     backend, budget = backend_of(options)
     check(isinstance(backend, OpenCLBackend), "an OpenCL device")
     assert isinstance(backend, OpenCLBackend)
-    bench = Bench(backend.name, options.repeats)
-    peak = bench_peak(bench, backend)
+    timer = Timer(backend.name, options.repeats)
+    peak = bench_peak(timer, backend)
     renderer = Renderer(backend, budget)
-    bench_share(bench, backend, renderer, SCENES[options.scene], peak)
+    bench_share(timer, backend, renderer, SCENES[options.scene], peak)
     renderer.release()
 
 

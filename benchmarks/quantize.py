@@ -10,7 +10,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Bench, backend_of, check, parse
+from benchmarks.harness import SCENES, Timer, backend_of, check, parse
 from flexgs_edge.codec.v1.packed_source import QuantizedSource
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.methods.paper.prune import nonzero_sh
@@ -42,14 +42,14 @@ def quantize_in_a_loop(scene: QuantizedScene, source: MemorySource) -> dict[str,
     return decoded
 
 
-def bench_against_loop(bench: Bench, source: PlySource) -> None:
+def bench_against_loop(timer: Timer, source: PlySource) -> None:
     """Both ways there and back, in turn."""
     planes = source.read(slice(0, source.count), list(FIELD))
     copies = -(-LARGE // source.count)
     large = MemorySource({k: np.ascontiguousarray(np.tile(v, copies)[:, :LARGE]) for k, v in planes.items()})
     rows = np.arange(LARGE), np.zeros(0, np.int64)
     loop, ours, ratios = [], [], []
-    for _ in range(bench.repeats):
+    for _ in range(timer.repeats):
         start = time.perf_counter()
         quantized = quantize_scene(large, *rows)
         back = QuantizedSource(quantized).read(slice(0, LARGE), list(FIELD))
@@ -66,15 +66,15 @@ def bench_against_loop(bench: Bench, source: PlySource) -> None:
     note = (
         f"{LARGE} Gaussians of SH degree {source.sh_degree} in memory, there and back; the loop's values within a step"
     )
-    bench.add("quantize and dequantize, NumPy", ours, "ms", note)
-    bench.add("quantize and dequantize, a loop over groups", loop, "ms", note)
-    bench.add("a loop over groups, of ours", ratios, "times", note)
+    timer.add("quantize and dequantize, NumPy", ours, "ms", note)
+    timer.add("quantize and dequantize, a loop over groups", loop, "ms", note)
+    timer.add("a loop over groups, of ours", ratios, "times", note)
 
 
 def main() -> None:
     options = parse(__doc__, repeats=7)
     backend, budget = backend_of(options)
-    bench = Bench(backend.name, options.repeats)
+    timer = Timer(backend.name, options.repeats)
     source = PlySource(SCENES[options.scene] / "point_cloud.ply")
     has_sh = nonzero_sh(source)
     rows = np.flatnonzero(has_sh), np.flatnonzero(~has_sh)
@@ -88,10 +88,10 @@ def main() -> None:
         ours = backend.read(chunk.means)[:, : chunk.count]
         check(np.array_equal(ours, host.read(slice(0, chunk.count), ["means"])["means"]), "dequantized positions")
 
-    bench.time(
+    timer.time(
         "quantize", lambda: quantize_scene(source, *rows), "ns/Gaussian", source.count, f"{note}, read from the PLY"
     )
-    bench.time(
+    timer.time(
         "dequantize, NumPy", lambda: host.read(slice(0, source.count), list(FIELD)), "ns/Gaussian", source.count, note
     )
 
@@ -108,11 +108,11 @@ def main() -> None:
         seconds.append(backend.profile["dequantize"])
     backend.profile = None
     values = [s * 1e9 / source.count for s in seconds[1:]]
-    bench.add("dequantize, kernel", values, "ns/Gaussian", f"{note}, first positions checked")
+    timer.add("dequantize, kernel", values, "ns/Gaussian", f"{note}, first positions checked")
     check(min(values) > 0, "the kernel ran")
-    bench.time("load a quantized scene", load, "ms", 1, note)
-    bench.repeats = min(bench.repeats, 3)
-    bench_against_loop(bench, source)
+    timer.time("load a quantized scene", load, "ms", 1, note)
+    timer.repeats = min(timer.repeats, 3)
+    bench_against_loop(timer, source)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Bench, check
+from benchmarks.harness import SCENES, Timer, check
 from flexgs_edge.cameras.camera import Camera, split_views
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.constants import ALPHA_MAX, ALPHA_MIN, FIXED_ERROR, TILE, TRANSMITTANCE_MIN
@@ -31,6 +31,7 @@ from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.progress import Progress
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.views.bench import Bench
 
 ROUNDING = 2.0**-22
 """A pixel's difference from the image without a Gaussian is off by about this times alpha / (1 - alpha): float32 rounds what
@@ -190,23 +191,23 @@ def compare_in_float64(
     return Exactness(measured, *blended.T)
 
 
-def report(bench: Bench, name: str, found: Exactness) -> None:
+def report(timer: Timer, name: str, found: Exactness) -> None:
     """Relative differences by size of the error, and the share beyond 1e-4 and 1 %."""
     exponents = np.floor(np.log10(np.maximum(found.rendered, 1e-16)) / 2).astype(int)
     for exponent in np.unique(exponents):
         relative = found.relative[exponents == exponent]
         label = f"{name}: error 1e{2 * exponent} to 1e{2 * exponent + 2}"
-        bench.add(label, relative.tolist(), "relative", f"off by more than 1 %: {(relative > 0.01).sum()}")
+        timer.add(label, relative.tolist(), "relative", f"off by more than 1 %: {(relative > 0.01).sum()}")
     for limit in (1e-4, 1e-2):
         for what, shown in (("off", found.relative), ("off, beyond what rounding explains,", found.beyond_noise)):
             note = f"{(shown > limit).sum()} of {len(shown)} Gaussians"
-            bench.add(f"{name}: {what} by more than {limit:g}", [float((shown > limit).mean())], "share", note)
+            timer.add(f"{name}: {what} by more than {limit:g}", [float((shown > limit).mean())], "share", note)
     off = found.relative > 1e-4
     largest = abs(found.measured - found.rendered)[off].max(initial=0.0)
     above = f"{(found.rendered > found.floor(1e-4)).sum()} of {len(off)} Gaussians are above"
-    bench.add(f"{name}: least error above which all are within 1e-4", [found.floor(1e-4)], "squared error", above)
-    bench.add(f"{name}: largest difference of those that are not", [float(largest)], "squared error", f"{off.sum()}")
-    bench.add(f"{name}: total measured / blended again", [found.measured.sum() / found.rendered.sum()], "ratio")
+    timer.add(f"{name}: least error above which all are within 1e-4", [found.floor(1e-4)], "squared error", above)
+    timer.add(f"{name}: largest difference of those that are not", [float(largest)], "squared error", f"{off.sum()}")
+    timer.add(f"{name}: total measured / blended again", [found.measured.sum() / found.rendered.sum()], "ratio")
 
 
 def main() -> None:
@@ -231,11 +232,13 @@ def main() -> None:
             renderer = Renderer(backend, budget)
             with renderer.load(source) as scene:
                 if rows is None:
-                    rows = spread_over_range(measure_costs(renderer, scene, poses, False).removal, options.gaussians)
+                    rows = spread_over_range(
+                        measure_costs(Bench(renderer), scene, poses, False).removal, options.gaussians
+                    )
                 least = 0.0 if name == "ending off" else TRANSMITTANCE_MIN
                 found = compare_in_float64(renderer, scene, poses, rows, least, Progress())
             renderer.release()
-            report(Bench(backend.name, 1), name, found)
+            report(Timer(backend.name, 1), name, found)
             backend.close()
     worst = float(found.beyond_noise.max())
     check(worst <= 1e-4, f"exact with early ending off but for rounding, got a difference of {worst:.2g}")

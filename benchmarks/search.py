@@ -10,7 +10,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Bench, backend_of, check, parse
+from benchmarks.harness import SCENES, Timer, backend_of, check, parse
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.io.model_folder import find_companions
 from flexgs_edge.methods.paper.evaluator import SceneEvaluator
@@ -22,6 +22,7 @@ from flexgs_edge.run.inputs import load_scene, resolve_drawing
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.view_set import find_views
+from flexgs_edge.views.bench import Bench
 
 CHOICE = Choice(400, 400)
 """Where the search begins: 40 % of the Gaussians pruned, a further 40 % without SH."""
@@ -31,13 +32,13 @@ PARTS = ("prune and quantize", "dequantize, render and compare")
 def main() -> None:
     options = parse(__doc__, repeats=5)
     backend, budget = backend_of(options)
-    bench = Bench(backend.name, options.repeats)
+    timer = Timer(backend.name, options.repeats)
     path = SCENES[options.scene] / "point_cloud.ply"
     scene, companions = load_scene(path), find_companions(path)
     views = find_views(resolve_drawing(ViewOptions(), scene, companions), companions, scene.source)
     assert views is not None
     renderer = Renderer(backend, budget)
-    judge = Judge(renderer, scene.source, views, views.held_out, budget)
+    judge = Judge(Bench(renderer), scene.source, views, views.held_out)
     with renderer.load(scene.source) as original:
         judge.prepare(original)
     # Which Gaussians go does not change the cost of a step much: by opacity and volume will do.
@@ -52,7 +53,7 @@ def main() -> None:
         check(sum(array.nbytes for array in quantized.arrays.values()) == bits, "bytes as predicted")
 
     note = f"{len(views.held_out)} held-out views" + (" with photos" if views.photos else "") + ", kernels built before"
-    bench.time("search step", lambda: evaluator.measure(CHOICE), "s", 1, note)
+    timer.time("search step", lambda: evaluator.measure(CHOICE), "s", 1, note)
     parts: dict[str, list[float]] = defaultdict(list)
     for _ in range(options.repeats):
         marks = [time.perf_counter()]
@@ -64,7 +65,7 @@ def main() -> None:
         for name, start, stop in zip(PARTS, marks, marks[1:]):
             parts[name].append(stop - start)
     for name, seconds in parts.items():
-        bench.add(f"search step: {name}", seconds, "s")
+        timer.add(f"search step: {name}", seconds, "s")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from benchmarks.harness import Bench, backend_of, check, parse
+from benchmarks.harness import Timer, backend_of, check, parse
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.source import MemorySource
@@ -45,7 +45,7 @@ def main() -> None:
     cx, cy = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
     camera = Camera("random", WIDTH, HEIGHT, np.eye(3), np.zeros(3), FOCAL, FOCAL, cx, cy)
     renderer = Renderer(backend, budget)
-    bench = Bench(backend.name, options.repeats)
+    timer = Timer(backend.name, options.repeats)
     with renderer.load(random_splats()) as scene:
         image = renderer.render(scene, camera)
         check(bool(np.isfinite(image).all()), "an image of finite numbers")
@@ -53,12 +53,12 @@ def main() -> None:
         check(bool(abs(image.mean() - 0.5) < 0.05 and image.std() < 0.25), "an even picture")
         check(np.array_equal(image, renderer.render(scene, camera)), "the same picture again")
         note = f"{COUNT} splats, {WIDTH}x{HEIGHT}, kernels built before"
-        bench.time("random splats: view", lambda: renderer.render(scene, camera), "ms", 1, note)
+        timer.time("random splats: view", lambda: renderer.render(scene, camera), "ms", 1, note)
         backend.profile = defaultdict(float)
         renderer.render(scene, camera)
         for stage, kernels in STAGES.items():
             seconds = sum(backend.profile[kernel] for kernel in kernels)
-            bench.add(f"random splats: {stage}", [seconds * 1e3], "ms", "a wait after each kernel")
+            timer.add(f"random splats: {stage}", [seconds * 1e3], "ms", "a wait after each kernel")
     renderer.release()
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Bench, backend_of, check, parse
+from benchmarks.harness import SCENES, Timer, backend_of, check, parse
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.kernels.open_backend import open_backend
@@ -28,9 +28,9 @@ def main() -> None:
     twins = Renderer(open_backend("numpy", budget), budget)
     with twins.load(source) as scene:
         check(np.array_equal(twins.render(scene, camera), expected), "the kernels' bits")
-        bench = Bench("numpy", options.repeats)
+        timer = Timer("numpy", options.repeats)
         note = f"{camera.width}x{camera.height}, {source.count} Gaussians, same bits as {backend.name}"
-        bench.time("view on the twins", lambda: twins.render(scene, camera), "s", 1, note)
+        timer.time("view on the twins", lambda: twins.render(scene, camera), "s", 1, note)
     twins.release()
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Bench, backend_of, check, parse, run_module
+from benchmarks.harness import SCENES, Timer, backend_of, check, parse, run_module
 from flexgs_edge.cameras.camera import Camera, split_views
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.io.ply import PlySource
@@ -36,7 +36,7 @@ def tile_pairs(renderer: Renderer) -> int:
     return int(renderer.backend.read(buffers.ends)[-1])
 
 
-def bench_views(bench: Bench, renderer: Renderer, scene: DeviceScene, cameras: list[Camera]) -> None:
+def bench_views(timer: Timer, renderer: Renderer, scene: DeviceScene, cameras: list[Camera]) -> None:
     """Whole views, then stage by stage with a wait after every kernel."""
     chosen = cameras[:: max(len(cameras) // VIEWS, 1)][:VIEWS]
     pairs = []
@@ -50,21 +50,21 @@ def bench_views(bench: Bench, renderer: Renderer, scene: DeviceScene, cameras: l
         for camera in chosen:
             renderer.render(scene, camera)
 
-    bench.time("view", all_views, "ms", len(chosen), note)
+    timer.time("view", all_views, "ms", len(chosen), note)
     backend, by_stage = renderer.backend, defaultdict(list)
-    for _ in range(bench.repeats):
+    for _ in range(timer.repeats):
         backend.profile = defaultdict(float)
         all_views()
         for stage, kernels in STAGES.items():
             by_stage[stage].append(sum(backend.profile[kernel] for kernel in kernels) / len(chosen))
     backend.profile = None
     for stage, seconds in by_stage.items():
-        bench.add(f"view: {stage}", [s * 1e3 for s in seconds], "ms", "a wait after each kernel")
-        bench.add(f"view: {stage}, by pair", [s * 1e9 / (sum(pairs) / len(pairs)) for s in seconds], "ns/pair")
+        timer.add(f"view: {stage}", [s * 1e3 for s in seconds], "ms", "a wait after each kernel")
+        timer.add(f"view: {stage}, by pair", [s * 1e9 / (sum(pairs) / len(pairs)) for s in seconds], "ns/pair")
 
 
 def bench_counting(
-    bench: Bench, renderer: Renderer, scene: DeviceScene, cameras: list[Camera], golden: np.ndarray | None
+    timer: Timer, renderer: Renderer, scene: DeviceScene, cameras: list[Camera], golden: np.ndarray | None
 ) -> None:
     """Hits and weights of every Gaussian over the training views."""
     train, _ = split_views(len(cameras))
@@ -76,21 +76,21 @@ def bench_counting(
             renderer.add_statistics(scene, cameras[view], statistics)
         counted.append(statistics.hits)
 
-    bench.repeats = min(bench.repeats, 3)
+    timer.repeats = min(timer.repeats, 3)
     count()
     if golden is not None:
         check(abs(counted[0].sum() - golden.sum()) <= 1e-4 * golden.sum(), "hits over the training views")
-    bench.time(
+    timer.time(
         "hit counting",
         count,
         "s",
         1,
         f"{len(train)} training views" + (", total checked" if golden is not None else ""),
     )
-    bench_scores(bench, renderer, scene, [cameras[view] for view in train])
+    bench_scores(timer, renderer, scene, [cameras[view] for view in train])
 
 
-def bench_scores(bench: Bench, renderer: Renderer, scene: DeviceScene, cameras: list[Camera]) -> None:
+def bench_scores(timer: Timer, renderer: Renderer, scene: DeviceScene, cameras: list[Camera]) -> None:
     """Hit counting and removal costs over drawing the same views: each view in turn, so that all see the same machine."""
     statistics = Statistics.zeros(scene.count)
     ways: dict[str, Callable[[Camera], object]] = {
@@ -98,8 +98,8 @@ def bench_scores(bench: Bench, renderer: Renderer, scene: DeviceScene, cameras: 
         "hit counting": lambda camera: renderer.add_statistics(scene, camera, statistics),
         "removal costs": lambda camera: renderer.read_sums(renderer.removal_sums(scene, camera), 2, scene.count),
     }
-    found = np.empty((len(ways), bench.repeats, len(cameras)))
-    for repeat in range(bench.repeats):
+    found = np.empty((len(ways), timer.repeats, len(cameras)))
+    for repeat in range(timer.repeats):
         for place, camera in enumerate(cameras):
             for way, draw in enumerate(ways.values()):
                 start = time.perf_counter()
@@ -108,10 +108,10 @@ def bench_scores(bench: Bench, renderer: Renderer, scene: DeviceScene, cameras: 
     totals = found.sum(axis=2)
     for way, name in enumerate(ways):
         if way:
-            bench.add(f"{name} over drawing", (totals[way] / totals[0]).tolist(), "x", f"{len(cameras)} training views")
+            timer.add(f"{name} over drawing", (totals[way] / totals[0]).tolist(), "x", f"{len(cameras)} training views")
 
 
-def bench_descent(bench: Bench, renderer: Renderer, source: PlySource, cameras: list[Camera]) -> None:
+def bench_descent(timer: Timer, renderer: Renderer, source: PlySource, cameras: list[Camera]) -> None:
     """Gradients of all values of every Gaussian, and steps along them, against drawing the same views; by processor time."""
     chosen = cameras[:: max(len(cameras) // VIEWS, 1)][:VIEWS]
     planes = source.read(slice(0, source.count), list(FIELD))
@@ -119,19 +119,19 @@ def bench_descent(bench: Bench, renderer: Renderer, source: PlySource, cameras: 
     with renderer.load(source) as scene:
         targets = [(0.9 * renderer.render_planes(scene, camera)).astype(np.float16) for camera in chosen]
         drawn = [
-            _processor_ms(chosen, lambda k: renderer.render_planes(scene, chosen[k])) for _ in range(bench.repeats)
+            _processor_ms(chosen, lambda k: renderer.render_planes(scene, chosen[k])) for _ in range(timer.repeats)
         ]
     with Descent(renderer, planes, np.full(source.count, source.sh_degree), source.origin, chosen[0]) as descent:
         found: dict[str, list[float]] = {"gradients": [], "step": []}
-        for _ in range(bench.repeats):
+        for _ in range(timer.repeats):
             found["gradients"].append(_processor_ms(chosen, lambda k: descent.differentiate(chosen[k], targets[k])))
             found["step"].append(_processor_ms(chosen, lambda k: descent.step(chosen[k], targets[k], rates)))
         check(all(np.isfinite(part).all() and part.any() for part in descent.gradients().values()), "gradients")
     note = f"{len(chosen)} views; processor time of all cores, the view included"
     for name, values in found.items():
-        bench.add(f"descent: {name}", values, "ms", note)
+        timer.add(f"descent: {name}", values, "ms", note)
     ratios = [a / b - 1 for a, b in zip(found["gradients"], drawn, strict=True)]
-    bench.add("descent: backward over forward", ratios, "x", "gradients without their view, over the view")
+    timer.add("descent: backward over forward", ratios, "x", "gradients without their view, over the view")
 
 
 def _processor_ms(chosen: list[Camera], run: Callable[[int], object]) -> float:
@@ -143,7 +143,7 @@ def _processor_ms(chosen: list[Camera], run: Callable[[int], object]) -> float:
     return (time.process_time() - start) / len(chosen) * 1e3
 
 
-def bench_first_image(bench: Bench, scene: str, device: str | None) -> None:
+def bench_first_image(timer: Timer, scene: str, device: str | None) -> None:
     """From the start of a process to its first image, without and with the compiler's cache."""
     arguments = ["--first-image", "--scene", scene, *(["--device", device] if device else [])]
     cold: list[float] = []
@@ -155,8 +155,8 @@ def bench_first_image(bench: Bench, scene: str, device: str | None) -> None:
                 start = time.perf_counter()
                 run_module("view", *arguments, environment=environment)
                 values.append(time.perf_counter() - start)
-    bench.add("first image, cold", cold, "s", "new process, PoCL's kernel cache empty")
-    bench.add("first image, warm", warm, "s", "new process, PoCL's kernel cache filled")
+    timer.add("first image, cold", cold, "s", "new process, PoCL's kernel cache empty")
+    timer.add("first image, warm", warm, "s", "new process, PoCL's kernel cache filled")
 
 
 def main() -> None:
@@ -170,13 +170,13 @@ def main() -> None:
             check(bool(renderer.render(scene, cameras[0]).any()), "an empty image")
             return
         golden = _check_image(renderer, scene, cameras, options)
-        bench = Bench(backend.name, options.repeats)
-        bench_views(bench, renderer, scene, cameras)
-        bench_counting(bench, renderer, scene, cameras, golden)
-    bench_descent(bench, renderer, PlySource(folder / "point_cloud.ply"), cameras)
+        timer = Timer(backend.name, options.repeats)
+        bench_views(timer, renderer, scene, cameras)
+        bench_counting(timer, renderer, scene, cameras, golden)
+    bench_descent(timer, renderer, PlySource(folder / "point_cloud.ply"), cameras)
     renderer.release()
     if not backend.is_numpy and "POCL_CACHE_DIR" not in os.environ:
-        bench_first_image(bench, options.scene, options.device)
+        bench_first_image(timer, options.scene, options.device)
 
 
 def _check_image(

@@ -114,8 +114,8 @@ fi
 
 # The default method and the free memory are the program's to know.
 known=$("$VENV/bin/python" -c '
-from flexgs_edge.budget import available_memory
-from flexgs_edge.pipeline.options import CompressOptions
+from flexgs_edge.memory.process import available_memory
+from flexgs_edge.run.options import CompressOptions
 print(CompressOptions.method, available_memory() // 2**20)')
 read -r default_method free <<<"$known"
 method=${method:-$default_method}

@@ -9,18 +9,16 @@ from typing import Any
 
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
-from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.lpips import Lpips
 from flexgs_edge.report.results import EvaluateResult
-from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.companions import companions_of, merge_companions
-from flexgs_edge.run.inputs import load_scene, resolve_drawing, scene_info
+from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.open_bench import Workspace
+from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.reporter import Reporter
-from flexgs_edge.run.view_set import WITHOUT_VIEWS, find_views, views_info
+from flexgs_edge.run.run import open_run
+from flexgs_edge.run.view_set import views_info
 
 
 def evaluate(
@@ -59,33 +57,26 @@ def evaluate(
     if not 0.0 < base_psnr < 200.0:
         raise InputError(f"--base-psnr {base_psnr:g}: expected decibels between 0 and 200")
     reporter = Reporter.maybe(report, force)
-    clock = Stopwatch()
-    budget = MemoryBudget.from_limit(options.memory_limit)
-    with clock.stage("open"):
-        companions = merge_companions(companions_of(against), companions_of(input))
-        reference = load_scene(against, options.drop_invalid)
-        scene = load_scene(input, options.drop_invalid)
-        # Both are drawn alike; a compressed scene knows how its original was.
-        options = resolve_drawing(options, scene if scene.settings else reference, companions)
-        views = find_views(options, companions, reference.source)
-        if views is None:
-            raise InputError(WITHOUT_VIEWS)
-        indices = views.held_out or views.train
-        if reporter is not None:
-            reporter.see_cameras(views, reference)
+    # Both are drawn alike; a compressed scene knows how its original was.
+    run = open_run(against, options, progress, reporter, drawn_as=input)
+    views, scene, clock, budget = run.seen, run.made or run.scene, run.clock, run.budget
+    indices = views.held_out or views.train
+    if reporter is not None:
+        with clock.stage("open"):
+            reporter.see_cameras(views, run.scene)
     with ExitStack() as stack:
-        workspace = stack.enter_context(Workspace(options, budget, clock))
+        bench = stack.enter_context(open_bench(run))
         if reporter is not None:
             reporter.reserve(budget, views, indices)
-        renderer = workspace.renderer
+        renderer = bench.renderer
         distance: Lpips | None = None
         if lpips:  # before any drawing: packages or weights may be missing
             with clock.stage("lpips"):
                 distance = Lpips(budget, max(camera.width * camera.height for camera in views.of(indices)))
             stack.callback(distance.close)
-        judge = Judge(renderer, reference.source, views, indices, budget, True, base_psnr)
+        judge = Judge(bench, run.source, views, indices, base_psnr=base_psnr)
         stack.callback(judge.close)
-        with clock.stage("references"), renderer.load(reference.source) as original:
+        with clock.stage("references"), renderer.load(run.source) as original:
             judge.prepare(original, progress)
         with clock.stage("measure"), renderer.load(scene.source) as compressed:
             quality = judge.compare(compressed, with_ssim=True, progress=progress, lpips=distance)
@@ -93,11 +84,11 @@ def evaluate(
                 reporter.look(judge, compressed, quality, clock, progress)
         result = EvaluateResult(
             scene=scene_info(scene),
-            reference=scene_info(reference),
+            reference=scene_info(run.scene),
             views=views_info(views),
             quality=quality,
             quality_views="held-out" if views.held_out else "training",
-            run=workspace.run_info(),
+            run=bench_info(run, bench),
         )
     if reporter is not None:
         reporter.read_contents(input)

@@ -15,15 +15,13 @@ import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
-from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import RenderResult
-from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.companions import companions_of
-from flexgs_edge.run.inputs import load_scene, resolve_drawing, scene_info
-from flexgs_edge.run.open_bench import Workspace
+from flexgs_edge.run.inputs import scene_info
+from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import ViewOptions
-from flexgs_edge.run.view_set import WITHOUT_VIEWS, find_views, views_info
+from flexgs_edge.run.run import open_run
+from flexgs_edge.run.view_set import views_info
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -55,22 +53,16 @@ def render_views(
         Single options by the names of `ViewOptions`.
     """
     options = replace(options or ViewOptions(), **words)
-    clock = Stopwatch()
-    budget = MemoryBudget.from_limit(options.memory_limit)
+    run = open_run(input, options, progress, photos=False)
+    found, clock = run.seen, run.clock
     with clock.stage("open"):
-        companions = companions_of(input)
-        scene = load_scene(input, options.drop_invalid)
-        options = resolve_drawing(options, scene, companions)
-        found = find_views(options, companions, scene.source, with_photos=False)
-        if found is None:
-            raise InputError(WITHOUT_VIEWS)
         chosen = _choose(views, len(found.cameras))
         places = _places(Path(output), [found.cameras[i].name for i in chosen], force)
     seconds = []
-    with Workspace(options, budget, clock) as workspace:
-        renderer = workspace.renderer
+    with open_bench(run) as bench:
+        renderer = bench.renderer
         with clock.stage("load"):
-            device_scene = renderer.load(scene.source)
+            device_scene = renderer.load(run.source)
         with device_scene:
             started = time.perf_counter()
             with clock.stage("warm up"):
@@ -86,12 +78,12 @@ def render_views(
                     write_png(place, image, force)
         LOG.info("wrote %d PNG files to %s", len(places), output)
         return RenderResult(
-            scene=scene_info(scene),
+            scene=scene_info(run.scene),
             views=views_info(found),
             files=tuple(os.fspath(place) for place in places),
             view_seconds=tuple(seconds),
             warm_up_seconds=warm_up,
-            run=workspace.run_info(),
+            run=bench_info(run, bench),
         )
 
 

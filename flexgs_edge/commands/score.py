@@ -11,17 +11,15 @@ import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_writable
-from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.score_files import save_scores
 from flexgs_edge.methods.paper.scores import SCORES, score_scene
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import ScoreResult
-from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.companions import companions_of
-from flexgs_edge.run.inputs import load_scene, resolve_drawing, scene_info
-from flexgs_edge.run.open_bench import Workspace
+from flexgs_edge.run.inputs import scene_info
+from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import ViewOptions
-from flexgs_edge.run.view_set import WITHOUT_VIEWS, find_views, views_info
+from flexgs_edge.run.run import open_run
+from flexgs_edge.run.view_set import views_info
 
 
 def score_gaussians(
@@ -56,31 +54,24 @@ def score_gaussians(
     if Path(output).suffix.lower() != ".npy":
         raise InputError(f"-o {output}: expected a name that ends in .npy")
     check_writable(output, force)
-    clock = Stopwatch()
-    budget = MemoryBudget.from_limit(options.memory_limit)
-    with clock.stage("open"):
-        companions = companions_of(input)
-        scene = load_scene(input, options.drop_invalid)
-        options = resolve_drawing(options, scene, companions)
-        # Photos decide at which size poses are drawn, and with it the hits: the same scores as in `compress`.
-        views = find_views(options, companions, scene.source)
-        if views is None:
-            raise InputError(WITHOUT_VIEWS)
-        if not views.train:
-            raise InputError(f"{views.cameras_from}: every view is held out: give more views, or --holdout 0")
-    with Workspace(options, budget, clock) as workspace:
-        renderer = workspace.renderer
+    # Photos decide at which size poses are drawn, and with it the hits: the same scores as in `compress`.
+    run = open_run(input, options, progress)
+    views, clock = run.seen, run.clock
+    if not views.train:
+        raise InputError(f"{views.cameras_from}: every view is held out: give more views, or --holdout 0")
+    with open_bench(run) as bench:
+        renderer = bench.renderer
         with clock.stage("load"):
-            device_scene = renderer.load(scene.source)
+            device_scene = renderer.load(run.source)
         with device_scene, clock.stage("score"):
-            scores = score_scene(renderer, device_scene, scene.source, views.of(views.train), score, progress)
+            scores = score_scene(renderer, device_scene, run.source, views.of(views.train), score, progress)
         save_scores(output, scores, force)
         return ScoreResult(
-            scene=scene_info(scene),
+            scene=scene_info(run.scene),
             views=views_info(views),
             output=os.fspath(output),
             score=score,
             scored_views=len(views.train),
             unseen=int(np.isneginf(scores).sum()),
-            run=workspace.run_info(),
+            run=bench_info(run, bench),
         )

@@ -12,16 +12,13 @@ from flexgs_edge.commands.info import info
 from flexgs_edge.commands.reduced import DROPPED, ONE_LESS, reduced_scenes
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
-from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.companions import companions_of
-from flexgs_edge.run.inputs import load_scene, resolve_drawing
 from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.open_bench import Workspace
+from flexgs_edge.run.open_bench import open_bench
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.plan import Plan
-from flexgs_edge.run.view_set import WITHOUT_VIEWS, find_views, views_info
+from flexgs_edge.run.run import open_run
+from flexgs_edge.run.view_set import views_info
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.units import format_size
 
@@ -59,23 +56,19 @@ def worth(
     found = info(place)
     if not found["count"]:
         raise InputError(f"{path}: --errors: the file holds no Gaussians, so there is nothing to draw")
-    clock, budget = Stopwatch(), MemoryBudget.from_limit(options.memory_limit)
-    companions = companions_of(place)
-    scene = load_scene(place)
-    options = resolve_drawing(options, scene, companions)
-    views = find_views(options, companions, scene.source, with_photos=False)
-    if views is None:
-        raise InputError(WITHOUT_VIEWS)
+    run = open_run(place, options, progress, photos=False)
+    views = run.seen
     chosen = views.held_out or views.train
     stored = found["settings"].get("base_psnr")
     base = stored if isinstance(stored, (int, float)) and 0.0 < stored < 200.0 else DEFAULT_BASE_PSNR
     changes = []
     with ExitStack() as stack:
-        renderer = stack.enter_context(Workspace(options, budget, clock)).renderer
-        budget.take("the codes", COPIES * found["count"] * sum(4 * f.width(found["sh_degree"]) for f in FIELDS))
-        judge = Judge(renderer, scene.source, views, chosen, budget, with_photos=False, base_psnr=base)
+        bench = stack.enter_context(open_bench(run))
+        renderer = bench.renderer
+        run.budget.take("the codes", COPIES * found["count"] * sum(4 * f.width(found["sh_degree"]) for f in FIELDS))
+        judge = Judge(bench, run.source, views, chosen, with_photos=False, base_psnr=base)
         stack.callback(judge.close)
-        with renderer.load(scene.source) as original:
+        with renderer.load(run.source) as original:
             judge.prepare(original, progress)
         lessers = reduced_scenes(open_fgs(place))
         for item in progress.track(lessers, "taking channels away", len(lessers)):

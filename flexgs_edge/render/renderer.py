@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,10 +34,6 @@ from flexgs_edge.render.fit import (
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
 from flexgs_edge.scene.source import SceneSource
-
-if TYPE_CHECKING:
-    from flexgs_edge.views.cluster import Cluster
-
 
 SUM_ROWS = 1 << 18
 """Rows of sums that are on the host at a time."""
@@ -82,8 +78,6 @@ class Renderer:
         Where sums over views go when memory cannot hold them beside a view.
     largest : Camera or None
         The largest view that is to come, where that is known: whether views have room for all rows is decided for it.
-    cluster : Cluster or None
-        Draws the views of `ViewSums.draw` and `images` in this one's stead.
     """
 
     def __init__(
@@ -107,7 +101,6 @@ class Renderer:
         self.fit = fit or fit_module.DEFAULT
         self.storage: Storage = IN_MEMORY
         self.largest: Camera | None = None
-        self.cluster: Cluster | None = None
         self.splats_shown = 0
         self.view_rows: np.ndarray | None = None
         """[m] u32, rows of the scene that the sums of the view drawn last belong to; None: all of them."""
@@ -137,11 +130,6 @@ class Renderer:
         assert self._buffers is not None
         return self._buffers.records
 
-    @property
-    def ready_cluster(self) -> Cluster | None:
-        """The cluster, once it has workers."""
-        return self.cluster if self.cluster is not None and self.cluster.ready else None
-
     def load(
         self, source: SceneSource, sum_bytes: int = SUM_BYTES, targets: bool = False, view_sums: int = MOST_SUMS
     ) -> DeviceScene:
@@ -169,16 +157,6 @@ class Renderer:
             [H, W, 3] f32, linear in the model's own colour space, not clamped.
         """
         return self.render_planes(scene, camera)[:, : camera.height, : camera.width].transpose(1, 2, 0)
-
-    def images(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
-        """`render` of each view, in their order: here, or on the cluster."""
-        cluster = self.ready_cluster
-        if cluster is None or scene.source is None:
-            for camera in self.in_turn(scene, cameras):
-                yield self.render(scene, camera)
-            return
-        for camera, planes in zip(cameras, cluster.planes(scene.source, cameras), strict=True):
-            yield planes[:, : camera.height, : camera.width].transpose(1, 2, 0)
 
     def in_turn(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[Camera]:
         """The cameras, each when its view is to be drawn: what is known of those that come next saves reading the scene again."""

@@ -9,15 +9,14 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.goals.target import Measurement
-from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.psnr import mse
 from flexgs_edge.quality.ssim import ssim_bytes, ssims
 from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view
 from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.views.bench import Bench
 
 SHARE = 4
 """Reference images may take this part of the free budget (one in four): the rest is for the scene and its views."""
@@ -34,16 +33,14 @@ class Judge:
 
     Parameters
     ----------
-    renderer : Renderer
-        Draws both.
+    bench : Bench
+        Draws both; kept images are taken from its budget, at most a quarter of what is free.
     source : SceneSource
         The original; drawn again whenever a reference was not kept.
     views : ViewSet
         All views.
     indices : sequence of int
         The views that judge.
-    budget : MemoryBudget
-        Kept images are taken from it, at most a quarter of what is free.
     with_photos : bool
         Compare with photos as well, where there are any.
     base_psnr : float
@@ -55,16 +52,16 @@ class Judge:
 
     def __init__(
         self,
-        renderer: Renderer,
+        bench: Bench,
         source: SceneSource,
         views: ViewSet,
         indices: Sequence[int],
-        budget: MemoryBudget,
         with_photos: bool = True,
         base_psnr: float = DEFAULT_BASE_PSNR,
         reports: bool = False,
     ) -> None:
-        self.renderer = renderer
+        self.bench, self.renderer = bench, bench.renderer
+        budget = bench.renderer.budget
         self.source = source
         self.cameras = views.of(indices)
         self.photos = views.photos if with_photos else None
@@ -91,7 +88,7 @@ class Judge:
     def prepare(self, scene: DeviceScene, progress: Progress = SILENT) -> None:
         """Draw the references from `scene` (the original, loaded), and measure them against the photos."""
         self._original_error, self._coarse_error, self._known = [], {}, {}
-        images = self.renderer.images(scene, self.cameras)
+        images = self.bench.images(scene, self.cameras)
         for i, drawn in enumerate(progress.track(images, "drawing the original", len(self.cameras))):
             # Clamped once, and contiguous by channel as renders are: comparing is then four times as fast.
             image = _planes(drawn)
@@ -136,12 +133,12 @@ class Judge:
 
         One that reports draws nothing twice: a scene that is the same to the bit has the same quality.
         """
-        whole, elsewhere = self.reports and with_ssim and lpips is None, self.renderer.ready_cluster is not None
+        whole, elsewhere = self.reports and with_ssim and lpips is None, self.bench.ready_cluster is not None
         drawn = scene.fingerprint(elsewhere) if whole else None
         if drawn in self._known:
             return self._known[drawn]
         found: list[ViewQuality] = []
-        images = self.renderer.images(scene, self.cameras)
+        images = self.bench.images(scene, self.cameras)
         for i, image in enumerate(progress.track(images, "comparing views", len(self.cameras))):
             error = self._original_error[i] if self.photos is not None else None
             references = self.original(i), self._photo(i)

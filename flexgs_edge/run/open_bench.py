@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from types import TracebackType
+from typing import Any
 
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.open_backend import open_backend
@@ -13,6 +13,8 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.run_info import RunInfo
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.run import Run
+from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.cluster import Cluster
 from flexgs_edge.views.worker import Drawing
 
@@ -20,51 +22,24 @@ BUILD_BYTES = 24 * 2**20
 """What building our kernels adds to the loaded compiler (measured with PoCL, nothing cached: 19 MiB)."""
 
 
-class Workspace:
-    """Budget, backend and renderer of one job; a context manager that closes the backend.
+def open_bench(run: Run[Any], cluster: str | None = None) -> Bench:
+    """What draws the views of a run; close it when done.
 
     Parameters
     ----------
-    options : ViewOptions
-        With near plane, background, extent and antialiasing filled in.
-    budget : MemoryBudget
-        Everything is taken from it.
-    clock : Stopwatch
-        Gets the stage `device`.
     cluster : str, optional
         Address of workers that draw for it (stage `cluster`), each with the run's memory limit for itself.
     """
-
-    def __init__(
-        self, options: ViewOptions, budget: MemoryBudget, clock: Stopwatch, cluster: str | None = None
-    ) -> None:
-        assert options.near is not None and options.background is not None
-        assert options.extent is not None and options.antialiased is not None
-        self.budget = budget
-        self.clock = clock
-        self.backend = counted_backend(options.device, budget, clock)
-        self.renderer = Renderer(
-            self.backend, budget, options.near, options.background, options.extent, options.antialiased
-        )
-        if cluster is not None:
-            words = options.near, options.background, options.extent, options.antialiased
-            with clock.stage("cluster"):
-                self.renderer.cluster = Cluster(cluster, Drawing(options.device, options.memory_limit, *words))
-
-    def __enter__(self) -> Workspace:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self.renderer.cluster is not None:
-            self.renderer.cluster.close()
-        self.renderer.release()
-        self.backend.close()
-
-    def run_info(self) -> RunInfo:
-        """What this run took and ran on (never stored in files)."""
-        return run_info(self.budget, self.clock, self.backend)
+    options: ViewOptions = run.options
+    assert options.near is not None and options.background is not None
+    assert options.extent is not None and options.antialiased is not None
+    drawing = options.near, options.background, options.extent, options.antialiased
+    backend = counted_backend(options.device, run.budget, run.clock)
+    bench = Bench(Renderer(backend, run.budget, *drawing))
+    if cluster is not None:
+        with run.clock.stage("cluster"):
+            bench.cluster = Cluster(cluster, Drawing(options.device, options.memory_limit, *drawing))
+    return bench
 
 
 def counted_backend(device: str | None, budget: MemoryBudget, clock: Stopwatch) -> Backend:
@@ -78,10 +53,17 @@ def counted_backend(device: str | None, budget: MemoryBudget, clock: Stopwatch) 
     return backend
 
 
+def bench_info(run: Run[Any], bench: Bench | None) -> RunInfo:
+    """Seconds, memory and device of a run that draws (never stored in files)."""
+    if bench is None:
+        return run_info(run.budget, run.clock)
+    return run_info(run.budget, run.clock, bench.renderer.backend, bench.renderer.storage)
+
+
 def run_info(
     budget: MemoryBudget, clock: Stopwatch, backend: Backend | None = None, storage: Storage = IN_MEMORY
 ) -> RunInfo:
-    """Seconds, memory and device of a run."""
+    """The same of what draws nothing."""
     return RunInfo(
         seconds=clock.total,
         stages=dict(clock.stages),

@@ -46,6 +46,11 @@ def foreign_format(output: str | Path | None, options: CompressOptions) -> Forma
         )
     if options.layers > 1:
         raise InputError(f"--layers {options.layers}: {format.suffix} has no layers; leave it out, or write a .fgs")
+    if options.resume or options.scratch is not None:
+        raise InputError(
+            f"--{'resume' if options.resume else 'scratch'} works on .fgs files alone: the search for a "
+            f"{format.suffix} is in memory and in one go; leave it out"
+        )
     assert output is not None
     check_converter(output)
     return format

@@ -10,7 +10,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flexgs_edge.commands.info import info
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.goals.target import Target
@@ -23,6 +22,7 @@ from flexgs_edge.report.material import Material, Rig, Shot
 from flexgs_edge.report.pages import compress_page, evaluate_page
 from flexgs_edge.report.results import CompressResult, EvaluateResult
 from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.run.contents import contents
 from flexgs_edge.run.inputs import Scene
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.pictures import draw_shots, rig_of, shots_bytes
@@ -93,7 +93,7 @@ class Reporter:
     def read_contents(self, path: str | Path) -> None:
         """What the channels of a finished `.fgs` take (other formats have none that `info` knows)."""
         if Path(path).suffix.lower() == ".fgs":
-            self._contents = info(path)
+            self._contents = contents(Path(path))
 
     def read_contents_of(self, write: Callable[[Path], object]) -> None:
         """The same in a dry run: `write` makes the file, which is gone afterwards."""

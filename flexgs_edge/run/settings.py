@@ -8,23 +8,17 @@ from flexgs_edge._version import __version__
 from flexgs_edge.goals.steps import SearchResult
 from flexgs_edge.goals.target import Measurement
 from flexgs_edge.packed.bitspec import BitSpec
-from flexgs_edge.run.inputs import Scene
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.run.plan import Plan
-from flexgs_edge.run.view_set import ViewSet
+from flexgs_edge.run.run import Run
 
 
 def make_settings(
-    options: CompressOptions,
-    plan: Plan,
-    scene: Scene,
-    views: ViewSet | None,
-    search: SearchResult | None,
-    bits: BitSpec | None,
+    run: Run[CompressOptions], search: SearchResult | None, bits: BitSpec | None = None
 ) -> dict[str, Any]:
     """What the file says about its making: the same for every run and machine, so no times, paths or devices."""
+    options, plan, scene, views = run.options, run.plan, run.scene, run.views
     choice = search.chosen.choice if search else options.fixed
-    assert choice is not None and options.background is not None
+    assert plan is not None and choice is not None and options.background is not None
     found = search.chosen.measurement if search else None
     return {
         "program": f"flexgs-edge {__version__}",

@@ -13,7 +13,6 @@ import numpy as np
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.steps import SearchResult, Step
 from flexgs_edge.goals.target import Measurement, Target
-from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.evaluator import SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.methods.paper.scores import score_scene
@@ -21,15 +20,14 @@ from flexgs_edge.methods.paper.search import adapt
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.progress import Progress
 from flexgs_edge.quality.psnr import error_for_drop
-from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.companions import companions_of
-from flexgs_edge.run.inputs import Scene, load_scene, resolve_drawing
 from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.open_bench import Workspace
+from flexgs_edge.run.open_bench import open_bench
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.plan import EVERYTHING, Plan
-from flexgs_edge.run.view_set import ViewSet, find_views
+from flexgs_edge.run.run import Run, open_planned
+from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.studies.result_tables import Cell
+from flexgs_edge.views.bench import Bench
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -63,44 +61,47 @@ class StudyScene:
     ----------
     name : str
         Of the scene, for tables and folders.
-    scene, views, plan, options
-        As `compress` has them; the plan's views and figure decide here too.
-    workspace : Workspace
-        Renderer, budget and stopwatch.
+    run : Run
+        As `compress` has it; the plan's views and figure decide here too.
+    bench : Bench
+        Draws.
     judge : Judge
         With the original's renders.
     orders : dict
         Rows from the least important, [N] i64, by score.
     has_sh : np.ndarray
         [N] bool.
-    progress : Progress
-        Bars over settings.
     """
 
     def __init__(
         self,
         name: str,
-        scene: Scene,
-        views: ViewSet,
-        plan: Plan,
-        options: CompressOptions,
-        workspace: Workspace,
+        run: Run[CompressOptions],
+        bench: Bench,
         judge: Judge,
         orders: dict[str, np.ndarray],
         has_sh: np.ndarray,
-        progress: Progress,
     ) -> None:
-        self.name, self.scene, self.views, self.plan, self.options = name, scene, views, plan, options
-        self.workspace, self.judge, self.orders, self.has_sh, self.progress = workspace, judge, orders, has_sh, progress
+        self.name, self.run, self.bench, self.judge, self.orders, self.has_sh = name, run, bench, judge, orders, has_sh
         self._evaluators: dict[str, SceneEvaluator] = {}
         self._points: dict[Setting, Point] = {}
         self._search: SearchResult | None = None
 
     @property
+    def plan(self) -> Plan:
+        """What decides."""
+        assert self.run.plan is not None
+        return self.run.plan
+
+    @property
+    def views(self) -> ViewSet:
+        """All views."""
+        return self.run.seen
+
+    @property
     def target(self) -> Target:
         """What the search of this study aims at."""
-        assert self.plan.target is not None
-        return self.plan.target
+        return self.run.target
 
     @property
     def figure(self) -> str:
@@ -114,23 +115,22 @@ class StudyScene:
         if self.plan.figure == "drop":
             return f"drop in PSNR against the photos, mean over {views}"
         return (
-            f"modelled drop (no photos: error against the original's renders, from a base of {self.options.base_psnr:g} dB), "
+            f"modelled drop (no photos: error against the original's renders, from a base of {self.run.options.base_psnr:g} dB), "
             f"over {views}"
         )
 
     def evaluator(self, setting: Setting) -> SceneEvaluator:
         """The pipeline's evaluator, set to the bits, groups and score of `setting`, until it is asked for again."""
         if setting.score not in self._evaluators:
-            workspace = self.workspace
             self._evaluators[setting.score] = SceneEvaluator(
-                self.scene.source,
+                self.run.scene.source,
                 self.orders[setting.score],
                 self.has_sh,
                 setting.bits,
                 setting.groups,
-                workspace.renderer,
+                self.bench.renderer,
                 self.judge,
-                workspace.budget,
+                self.run.budget,
             )
         evaluator = self._evaluators[setting.score]
         evaluator.bits, evaluator.groups = setting.bits, setting.groups
@@ -149,11 +149,11 @@ class StudyScene:
 
     def points(self, settings: Sequence[Setting], label: str) -> list[Point]:
         """Measure several settings, under a progress bar."""
-        return [self.point(setting) for setting in self.progress.track(settings, label, len(settings))]
+        return [self.point(setting) for setting in self.run.progress.track(settings, label, len(settings))]
 
     def adapt(self, target: Target, on_step: Callable[[Step], None] | None = None) -> SearchResult:
         """The paper's search for `target` over this bench's points; the closest point where it cannot be met."""
-        return adapt(_Remembering(self), target, self.options.effort, best_effort=True, on_step=on_step)
+        return adapt(_Remembering(self), target, self.run.options.effort, best_effort=True, on_step=on_step)
 
     @property
     def search(self) -> SearchResult:
@@ -166,7 +166,7 @@ class StudyScene:
         """Cells of `FIGURES`: bytes and quality."""
         return {
             "size": size,
-            "ratio": round(self.scene.ply_bytes / size, 3),
+            "ratio": round(self.run.scene.ply_bytes / size, 3),
             "drop": _decibel(found.drop),
             "fidelity": _decibel(found.fidelity),
             "modelled_drop": _decibel(found.modelled_drop),
@@ -178,7 +178,7 @@ class StudyScene:
 
     def error(self, point: Point) -> float:
         """Mean squared error against the original's renders, mean over the views."""
-        return error_for_drop(point.measurement.modelled_drop, self.options.base_psnr)
+        return error_for_drop(point.measurement.modelled_drop, self.run.options.base_psnr)
 
 
 FIGURES = {
@@ -218,27 +218,20 @@ def open_study_scene(
     FlexGSError
         As `compress`.
     """
-    clock = Stopwatch()
-    budget = MemoryBudget.from_limit(options.memory_limit)
+    # The plan refuses scenes without cameras and splits without training poses, in the words of `compress`.
+    run = open_planned(path, options, progress)
+    source, views, plan, clock = run.source, run.seen, run.plan, run.clock
+    assert plan is not None
     with clock.stage("open"):
-        companions = companions_of(path)
-        scene = load_scene(path, options.drop_invalid)
-        options = resolve_drawing(options, scene, companions)
-        views = find_views(options, companions, scene.source)
-        # The plan refuses scenes without cameras and splits without training poses, in the words of `compress`.
-        plan = Plan.make(options, scene, views)
-        has_sh = nonzero_sh(scene.source)
-    assert views is not None
+        has_sh = nonzero_sh(source)
     with ExitStack() as stack:
-        workspace = stack.enter_context(Workspace(options, budget, clock))
-        renderer = workspace.renderer
-        budget.take("ranks", RANK_BYTES * scene.source.count * len(scores))
-        judge = Judge(
-            renderer, scene.source, views, plan.decide, budget, plan.figure == "drop", base_psnr=options.base_psnr
-        )
+        bench = stack.enter_context(open_bench(run))
+        renderer = bench.renderer
+        run.budget.take("ranks", RANK_BYTES * source.count * len(scores))
+        judge = Judge(bench, source, views, plan.decide, plan.figure == "drop", base_psnr=options.base_psnr)
         stack.callback(judge.close)
         with clock.stage("load"):
-            original = renderer.load(scene.source)
+            original = renderer.load(source)
         orders = {}
         with original:
             with clock.stage("references"):
@@ -247,10 +240,10 @@ def open_study_scene(
             for score in scores:
                 LOG.info("%s: %s scores over %d training poses", name, score, len(cameras))
                 with clock.stage(f"score {score}"):
-                    found = score_scene(renderer, original, scene.source, cameras, score, progress)
+                    found = score_scene(renderer, original, source, cameras, score, progress)
                     orders[score] = order_from_scores(found)
         renderer.release()
-        yield StudyScene(name, scene, views, plan, options, workspace, judge, orders, has_sh, progress)
+        yield StudyScene(name, run, bench, judge, orders, has_sh)
 
 
 def scene_names(paths: Sequence[str | Path]) -> list[str]:

@@ -12,6 +12,7 @@ from flexgs_edge.report.plots import picture
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
 from flexgs_edge.report.summary import device_words
 from flexgs_edge.run.inputs import scene_info
+from flexgs_edge.run.open_bench import bench_info
 from flexgs_edge.run.view_set import views_info
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.page import Section
@@ -35,11 +36,11 @@ class SceneStudy:
         """The experiments made on a bench."""
         return cls(
             studied.name,
-            scene_info(studied.scene),
+            scene_info(studied.run.scene),
             views_info(studied.views),
             studied.decided_by,
             tuple(experiments),
-            studied.workspace.run_info(),
+            bench_info(studied.run, studied.bench),
         )
 
     def to_json(self) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import padded
-from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.one_view import Drawn, Part, view_parts, view_sums
 from flexgs_edge.views.spool import _Dense, _Spool
 
@@ -40,13 +40,15 @@ class ViewSums:
 
     Parameters
     ----------
-    renderer, scene : Renderer, DeviceScene
+    bench : Bench
+        Draws.
+    scene : DeviceScene
     makers : sequence of callable
         Each makes one kind of sums for a chunk.
     """
 
-    def __init__(self, renderer: Renderer, scene: DeviceScene, makers: Sequence[Maker]) -> None:
-        self._renderer, self._scene, self._makers = renderer, scene, makers
+    def __init__(self, bench: Bench, scene: DeviceScene, makers: Sequence[Maker]) -> None:
+        self._bench, self._renderer, self._scene, self._makers = bench, bench.renderer, scene, makers
         self._held: dict[int, tuple[int, list[ChunkSums]]] = {}
         self._spool: _Spool | None = None
         self._dense: _Dense | None = None
@@ -58,7 +60,7 @@ class ViewSums:
         targets: Callable[[int], np.ndarray] | None = None,
         pictures: bool = False,
     ) -> Iterator[Callable[[], np.ndarray]]:
-        """Draw views and add them, one for each step of the iterator, in their order: here, or on the renderer's cluster.
+        """Draw views and add them, one for each step of the iterator, in their order: here, or on the cluster.
 
         Parameters
         ----------
@@ -74,7 +76,7 @@ class ViewSums:
         callable
             Gives the view for `References.add`; valid until the next step.
         """
-        renderer, scene, cluster = self._renderer, self._scene, self._renderer.ready_cluster
+        renderer, scene, cluster = self._renderer, self._scene, self._bench.ready_cluster
         if cluster is None or scene.source is None:
             for view, camera in enumerate(renderer.in_turn(scene, cameras)):
                 self.add_view(view_sums(renderer, scene, kind, camera, targets and targets(view)), camera)

@@ -341,7 +341,7 @@ def test_an_interrupted_run_leaves_nothing(project: Path, tmp_path: Path, monkey
         raise KeyboardInterrupt
 
     (tmp_path / "a.fgs").write_text("earlier")
-    monkeypatch.setattr("flexgs_edge.commands.compress.FgsSource", stop)  # after the file has been written
+    monkeypatch.setattr("flexgs_edge.methods.paper.method.FgsSource", stop)  # after the file has been written
     with pytest.raises(KeyboardInterrupt):
         compress(project / "point_cloud.ply", tmp_path / "a.fgs", prune_rate=0.1, sh_rate=0.1, force=True, **FAST)
     assert [path.name for path in tmp_path.iterdir()] == ["a.fgs"]

@@ -51,17 +51,23 @@ def copy(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("contract", "module", "statement"),
     [
         ("layers", "errors.py", "import flexgs_edge.cli"),
-        ("layers", "scene/fields.py", "from flexgs_edge.cameras import Camera"),
-        ("layers", "kernels/source.py", "from flexgs_edge import render"),
+        ("layers", "scene/fields.py", "from flexgs_edge.cameras.camera import Camera"),
+        ("layers", "kernels/cl_sources.py", "from flexgs_edge.render import renderer"),
         ("layers", "attic.py", "A_MODULE = 'that nobody gave a floor'"),
-        ("adapt", "adapt/__init__.py", "import flexgs_edge.codec"),
-        ("choice", "quantize.py", "import flexgs_edge.device"),
-        ("codec", "codec/__init__.py", "import flexgs_edge.render"),
-        ("charts", "study/tables.py", "import matplotlib"),
-        ("kernels", "kernels/source.py", "from flexgs_edge.scene import fields"),
+        ("methods", "methods/best/keep.py", "import flexgs_edge.methods.paper.scores"),
+        ("codec", "codec/v1/header.py", "import flexgs_edge.codec.v2.header"),
+        ("codec_v2", "codec/v2/octree.py", "import flexgs_edge.codec.v2.walk"),
+        ("views", "views/one_view.py", "import flexgs_edge.views.sums"),
+        ("render", "render/fit.py", "import flexgs_edge.render.chunks"),
+        ("bytes", "io/ply.py", "import flexgs_edge.quality.psnr"),
+        ("goals", "goals/choice.py", "import numpy"),
+        ("fit", "render/fit.py", "import flexgs_edge.memory.budget"),
+        ("studies", "cli/app.py", "import flexgs_edge.studies.page"),
         ("opencl", "kernels/twins/sort.py", "import pyopencl"),
         ("opencl", "scene/source.py", "import flexgs_edge.kernels.session"),  # through a third module
-        ("plyfile", "cameras/__init__.py", "def late() -> None:\n    import plyfile"),
+        ("plyfile", "cameras/read.py", "def late() -> None:\n    import plyfile"),
+        ("plots", "studies/result_tables.py", "import matplotlib"),
+        ("distributed", "views/worker.py", "import distributed"),
     ],
 )
 def test_a_planted_violation_is_seen(copy: Path, contract: str, module: str, statement: str) -> None:
@@ -90,10 +96,10 @@ def modules_after(statement: str, repository: Path) -> set[str]:
     ("statement", "absent"),
     [
         ("import flexgs_edge", HEAVY),
-        ("from flexgs_edge.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass", HEAVY),
+        ("from flexgs_edge.cli.app import main\ntry: main(['--help'])\nexcept SystemExit: pass", HEAVY),
         (
-            "import flexgs_edge.kernels.twins, flexgs_edge.codec, flexgs_edge.methods.paper.prune, flexgs_edge.packed.quantize\n"
-            "import flexgs_edge.scene, flexgs_edge.cameras, flexgs_edge.goals, flexgs_edge.render, flexgs_edge.score",
+            "import flexgs_edge.kernels.twins, flexgs_edge.codec.open_fgs, flexgs_edge.methods.best.method\n"
+            "import flexgs_edge.methods.paper.method, flexgs_edge.methods.foreign.method, flexgs_edge.commands.compress",
             ("pyopencl", "skimage", "matplotlib", "plyfile"),
         ),
     ],
@@ -122,7 +128,7 @@ def test_info_loads_nothing_heavy(repository: Path) -> None:
     """Of either version: no device, no charts, no cameras and none of what searches."""
     for version in ("v1", "v2"):
         file = repository / "tests" / "golden" / version / "tiny.fgs"
-        command = f"from flexgs_edge.cli import main\ntry: main(['info', {str(file)!r}])\nexcept SystemExit: pass"
+        command = f"from flexgs_edge.cli.app import main\ntry: main(['info', {str(file)!r}])\nexcept SystemExit: pass"
         script = f"import sys\n{command}\nprint(*sys.modules, file=sys.stderr)"
         result = subprocess.run(
             [sys.executable, "-c", script], cwd=repository, capture_output=True, text=True, check=False
@@ -130,7 +136,7 @@ def test_info_loads_nothing_heavy(repository: Path) -> None:
         assert result.returncode == 0 and "settings:" in result.stdout, result.stderr[-2000:]
         loaded = set(result.stderr.split())
         assert {name.partition(".")[0] for name in loaded}.isdisjoint(HEAVY)
-        rooms = ("cameras", "render", "kernels", "device", "adapt", "study", "formats")
+        rooms = ("cameras", "render", "kernels", "goals", "methods", "studies", "io.exchange")
         assert loaded.isdisjoint(f"flexgs_edge.{storage}" for storage in rooms)
 
 

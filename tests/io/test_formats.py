@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from flexgs_edge.errors import BudgetError, FormatError, InputError
-from flexgs_edge.io import exchange
 from flexgs_edge.io.exchange import OPACITY_LIMIT, read_foreign, write_foreign
 from flexgs_edge.io.formats import FORMATS, format_of
 from flexgs_edge.io.ply import PlySource
@@ -253,7 +252,7 @@ def test_nothing_is_printed(tmp_path: Path) -> None:
 
 
 def test_without_the_converter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exchange, "CONVERTER", "gaussforge_that_nobody_has")
+    monkeypatch.setattr("flexgs_edge.io.converter.CONVERTER", "gaussforge_that_nobody_has")
     for job in (lambda: read_foreign(tmp_path / "a.spz"), lambda: write_foreign(tmp_path / "a.spz", scene(3))):
         with pytest.raises(InputError, match=r"pip install 'flexgs-edge\[formats\]'"):
             job()
@@ -272,7 +271,7 @@ def test_without_the_converter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_a_converter_that_breaks_down(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, error: type[Exception], words: str
 ) -> None:
-    monkeypatch.setattr(exchange, "_CHILD", code)
+    monkeypatch.setattr("flexgs_edge.io.converter._CHILD", code)
     with pytest.raises(error, match=words):
         write_foreign(tmp_path / "a.spz", scene(3))
     assert [p.name for p in tmp_path.iterdir()] == ["tmp"] and list((tmp_path / "tmp").iterdir()) == []

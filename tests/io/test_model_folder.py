@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from flexgs_edge.errors import FormatError, InputError
-from flexgs_edge.io import model_folder as model_module
 from flexgs_edge.io.model_folder import find_companions
 from flexgs_edge.io.ply import PlySource
-from flexgs_edge.run.open_scene import open_scene, register_reader
-from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.run.open_scene import READERS, open_scene
 from scene_files import random_rows, write_rows
 
 
@@ -54,19 +53,19 @@ def test_a_folder_that_is_no_model(tmp_path: Path) -> None:
         open_scene(tmp_path)
 
 
-def test_a_registered_reader_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(model_module, "_READERS", dict(open_scene._READERS))
-    marker = object()
-
-    def opener(path: Path) -> SceneSource:
-        assert path == tmp_path / "a.xyz"
-        return marker  # type: ignore[return-value]
-
-    (tmp_path / "a.xyz").touch()
-    register_reader(".XYZ", opener)
-    assert open_scene(tmp_path / "a.xyz") is marker
+def test_readers_are_looked_up_by_suffix(tmp_path: Path) -> None:
+    readers = {**READERS, ".xyz": "pathlib:Path"}
+    (tmp_path / "a.XYZ").touch()
+    assert open_scene(tmp_path / "a.XYZ", readers) == tmp_path / "a.XYZ"
+    (tmp_path / "b.none").touch()
     with pytest.raises(InputError, match=r"\.ply.*\.xyz"):
-        open_scene(tmp_path / "b.none")
+        open_scene(tmp_path / "b.none", readers)
+
+
+def test_every_reader_is_there() -> None:
+    for name in READERS.values():
+        module, _, reader = name.partition(":")
+        assert callable(getattr(import_module(module), reader))
 
 
 def test_companions_beside_a_ply(tmp_path: Path) -> None:

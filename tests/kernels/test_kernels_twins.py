@@ -17,6 +17,7 @@ from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.bench import Bench
 from kernel_fixtures import (
     FORMS,
     PairedBackend,
@@ -194,11 +195,11 @@ def test_moments_of_sh(form: str, degree: int, rows: int, monkeypatch: pytest.Mo
     source = random_scene(rows, 20, degree, size=-1.5)
     renderer = Renderer(paired, large_budget())
     with renderer.load(source) as scene:
-        costs = measure_costs(renderer, scene, views)
+        costs = measure_costs(Bench(renderer), scene, views)
     assert costs.sh.shape == (degree, rows) and costs.sh.any()
     planes = source.read(slice(0, rows), list(FIELD))
     targets = [padded_target(camera, degree) for camera in views]
-    refit_colours(renderer, planes, np.full(rows, degree), np.zeros(3), views, targets, rounds=1)  # type: ignore[arg-type]
+    refit_colours(Bench(renderer), planes, np.full(rows, degree), np.zeros(3), views, targets, rounds=1)  # type: ignore[arg-type]
     renderer.release()
     assert paired.launched["sh_costs"] and paired.launched["sh_residual"]
 

@@ -35,6 +35,7 @@ from flexgs_edge.render.fit import Fit
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.views.bench import Bench
 from grid_scenes import STEPS, make_grid
 from kernel_fixtures import default_device, large_budget, same_bits
 from quantized_scenes import quantize_all
@@ -100,14 +101,14 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
     """
     source = random_scene(64, 4, 4, size=-2)
     with drawer.load(source) as scene:
-        costs = measure_costs(drawer, scene, [camera])
+        costs = measure_costs(Bench(drawer), scene, [camera])
         yield costs.removal
         yield costs.sh
         targets: Any = [drawer.render_planes(scene, camera).astype(np.float16) + np.float16(0.1)]
         sums = drawer.residual_and_removal_sums(scene, camera, targets[0])
         yield drawer.read_sums(sums, 6, source.count)
     planes = source.read(slice(0, source.count), list(FIELD))
-    planes = refit_colours(drawer, planes, np.full(source.count, 4), source.origin, [camera], targets, rounds=1)
+    planes = refit_colours(Bench(drawer), planes, np.full(source.count, 4), source.origin, [camera], targets, rounds=1)
     yield planes["sh_dc"]
     yield planes["sh_rest"]
     with Descent(drawer, planes, np.full(source.count, 4), source.origin, camera) as descent:

@@ -16,8 +16,9 @@ from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.companions import companions_of
 from flexgs_edge.run.inputs import load_scene, resolve_drawing
 from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.open_bench import Workspace
+from flexgs_edge.run.open_bench import open_bench
 from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.run import Run
 from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
@@ -40,13 +41,13 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> MakeJudge:
     @contextmanager
     def open_judge(**words: bool) -> Iterator[Judged]:
         budget = MemoryBudget(2**28)
-        with Workspace(options, budget, Stopwatch()) as workspace:
+        with open_bench(Run(options, scene, views, None, budget, Stopwatch())) as bench:
             before = budget.used
-            judge = Judge(workspace.renderer, scene.source, views, VIEWS, budget, **words)
-            with workspace.renderer.load(scene.source) as loaded:
+            judge = Judge(bench, scene.source, views, VIEWS, **words)
+            with bench.renderer.load(scene.source) as loaded:
                 judge.prepare(loaded)
-            yield judge, scene.source, workspace.renderer, budget
-            workspace.renderer.release()
+            yield judge, scene.source, bench.renderer, budget
+            bench.renderer.release()
             judge.close()
             assert budget.used == before
 
@@ -127,7 +128,7 @@ def test_scenes_that_are_not_on_the_backend_are_known_again(
         use_fit(monkeypatch, whole_views=False)
     with judged(reports=True) as (judge, source, renderer, _):
         if elsewhere:
-            renderer.cluster = Workers(renderer)  # type: ignore[assignment]
+            judge.bench.cluster = Workers(renderer)  # type: ignore[assignment]
         drawn, planes = count_images(monkeypatch), half_of(source)
 
         def compare(planes: dict[str, np.ndarray]) -> object:

@@ -44,7 +44,7 @@ from flexgs_edge.scene.source import MemorySource, SceneSource
 from flexgs_edge.studies.paper import pruning, quantization, whole
 from flexgs_edge.studies.paper.study import EXPERIMENTS, PaperStudy, study_paper
 from flexgs_edge.studies.result_tables import Table, columns
-from flexgs_edge.studies.study_scene import StudyScene, Setting, open_study_scene, scene_names
+from flexgs_edge.studies.study_scene import Setting, StudyScene, open_study_scene, scene_names
 from tiny_project import COUNT, make_project
 
 # On the OpenCL device: hundreds of points are measured here, each seven times as fast as on the twins.
@@ -81,7 +81,7 @@ def drop_of(studied: StudyScene, project: Path, scene: SceneSource) -> float:
     for camera in cameras:
         photo = np.asarray(Image.open(project / "images" / f"{camera.name}.png"), np.float64) / 255
         errors = []
-        for source in (studied.scene.source, scene):
+        for source in (studied.run.source, scene):
             with renderer.load(source) as loaded:
                 image = np.clip(renderer.render(loaded, camera).astype(np.float64), 0, 1)
             errors.append(np.mean((image - photo) ** 2))
@@ -92,9 +92,9 @@ def drop_of(studied: StudyScene, project: Path, scene: SceneSource) -> float:
 def decoded(studied: StudyScene, setting: Setting) -> SceneSource:
     """The scene of a setting, dequantized into memory."""
     rows = select_rows(ranks_from_order(studied.orders[setting.score]), setting.choice, studied.has_sh)
-    quantized = quantize_scene(studied.scene.source, *rows, setting.bits, setting.groups)
+    quantized = quantize_scene(studied.run.source, *rows, setting.bits, setting.groups)
     arrays = {field.name: dequantize(quantized.arrays[field.name], slice(None)) for field in FIELDS}
-    degree = studied.scene.source.sh_degree
+    degree = studied.run.source.sh_degree
     rest = np.zeros((9, quantized.count), np.float32)
     if quantized.sh_count:
         rest[:, : quantized.sh_count] = arrays["sh_rest"]
@@ -207,16 +207,16 @@ def test_parts_have_the_bytes_of_what_is_left(studied: StudyScene, project: Path
     assert plain["size"] == 4 * FLOATS_AT_DEGREE_1 * COUNT and plain["drop"] == 0.0
     assert pruned["size"] == 4 * (14 * kept + 9 * with_sh)
     rows = select_rows(ranks_from_order(studied.orders["gs"]), choice, studied.has_sh)
-    arrays = studied.scene.source.select(np.concatenate(rows)).read(slice(None), [field.name for field in FIELDS])
+    arrays = studied.run.source.select(np.concatenate(rows)).read(slice(None), [field.name for field in FIELDS])
     arrays["sh_rest"][:, with_sh:] = 0
-    alone = MemorySource(arrays, 1, studied.scene.source.origin)
+    alone = MemorySource(arrays, 1, studied.run.source.origin)
     assert pruned["drop"] == pytest.approx(drop_of(studied, project, alone), abs=1e-3)
     assert quantized["size"] == studied.size(Setting()) and both["size"] == studied.size(Setting(choice))
 
 
 def test_a_pruned_source_reads_the_same_in_any_way(studied: StudyScene) -> None:
     rows = select_rows(ranks_from_order(studied.orders["gs"]), Choice(250, 500), studied.has_sh)
-    source = whole.Unquantized(studied.scene.source, *rows)
+    source = whole.Unquantized(studied.run.source, *rows)
     everything = source.read(slice(None), ["sh_rest", "means"])
     assert not everything["sh_rest"][:, len(rows[0]) :].any() and everything["sh_rest"][:, : len(rows[0])].any(0).all()
     some = np.arange(0, source.count, 7)
@@ -246,7 +246,7 @@ def test_scores_rank_the_same_rows_alike(studied: StudyScene) -> None:
 def test_rates_keep_to_their_sizes_and_say_where_they_end(studied: StudyScene) -> None:
     experiment = whole.rates(studied)
     rows = experiment.table.rows
-    ply = studied.scene.ply_bytes
+    ply = studied.run.scene.ply_bytes
     assert (rows[0]["kind"], rows[0]["size"]) == ("least", studied.size(Setting()))
     assert (rows[-1]["kind"], rows[-1]["size"]) == ("most", studied.size(Setting(whole.STRONGEST)))
     for row in rows[1:-1]:

@@ -100,10 +100,10 @@ def test_points_are_those_of_compress(study: tuple[RateStudy, Path], project: Pa
 
 def test_paper_searches_every_ratio_that_its_bits_alone_miss(studied: StudyScene) -> None:
     least, *others = paper_points(studied, [2.0, 5.0, 6.0]).points
-    assert (least.variant, least.kept) == ("nothing pruned", COUNT) and studied.scene.ply_bytes / least.size > 2
+    assert (least.variant, least.kept) == ("nothing pruned", COUNT) and studied.run.scene.ply_bytes / least.size > 2
     assert [point.wanted for point in others] == [5.0, 6.0]
-    assert all(studied.scene.ply_bytes / point.size >= (point.wanted or 0) for point in others)
-    assert others[0].size == studied.adapt(min_ratio(5.0, studied.scene.ply_bytes, "drop")).chosen.size
+    assert all(studied.run.scene.ply_bytes / point.size >= (point.wanted or 0) for point in others)
+    assert others[0].size == studied.adapt(min_ratio(5.0, studied.run.scene.ply_bytes, "drop")).chosen.size
 
 
 def test_every_variant_is_there_and_keeps_to_the_ratio(study: tuple[RateStudy, Path], studied: StudyScene) -> None:
@@ -145,8 +145,8 @@ def test_another_format_holds_the_whole_scene(
     (row,) = (row for row in rows_of(study, "rate") if row["method"] == "spz")
     assert row["kept"] == COUNT
     # Rows in another order than the study's: other bytes, the same values.
-    write_foreign(tmp_path / "a.spz", studied.scene.source)
-    with studied.workspace.renderer.load(read_foreign(tmp_path / "a.spz")) as scene:
+    write_foreign(tmp_path / "a.spz", studied.run.source)
+    with studied.bench.renderer.load(read_foreign(tmp_path / "a.spz")) as scene:
         found = studied.judge.compare(scene)
     assert row["fidelity"] == pytest.approx(found.fidelity, abs=0.2)
 
@@ -203,10 +203,8 @@ def test_ranks_decide_who_goes_and_costs_how_many(studied: StudyScene) -> None:
 
     def walk(make: object) -> PruneRounds:
         cameras = studied.views.of(studied.views.train)
-        workspace = studied.workspace
-        with open_rounds(
-            workspace.renderer, studied.scene.source, cameras, OPTIONS, workspace.budget, workspace.clock, make=make
-        ) as path:  # type: ignore[arg-type]
+        run = replace(studied.run, options=OPTIONS)
+        with open_rounds(run, studied.bench, cameras, make=make) as path:  # type: ignore[arg-type]
             path.descend(0.8)
         return path
 

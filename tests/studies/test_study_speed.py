@@ -91,7 +91,7 @@ def test_less_exact_views_are_worse_and_dead_splats_never_show(study: tuple[Spee
 
 
 def test_psnr_of_fewer_sh_is_that_of_a_scene_without_them(study: tuple[SpeedStudy, Path], studied: StudyScene) -> None:
-    source, judge, renderer = studied.scene.source, studied.judge, studied.workspace.renderer
+    source, judge, renderer = studied.run.source, studied.judge, studied.bench.renderer
     planes = source.read(slice(0, COUNT), list(FIELD))
     planes["sh_rest"] = np.zeros((0, COUNT), np.float32)
     with renderer.load(MemorySource(planes, origin=source.origin)) as scene:
@@ -129,7 +129,9 @@ def test_all_views_are_the_reference_of_a_few(study: tuple[SpeedStudy, Path], st
     assert whole["drop"] == pytest.approx(found.measurement.drop, abs=1e-4)
 
 
-def test_estimates_of_everything_are_exact_and_shares_are_kept(study: tuple[SpeedStudy, Path], studied: StudyScene) -> None:
+def test_estimates_of_everything_are_exact_and_shares_are_kept(
+    study: tuple[SpeedStudy, Path], studied: StudyScene
+) -> None:
     rows = rows_of(study, "sampling")
     for row in rows:
         assert row["trials"] == 5

@@ -38,7 +38,7 @@ from flexgs_edge.studies.stability.breaks import BREAK, LOST, Outcome, curve, of
 from flexgs_edge.studies.stability.moved_scene import NO_TURN, Similarity
 from flexgs_edge.studies.stability.ours import Whole
 from flexgs_edge.studies.stability.study import StabilityStudy, study_stability
-from flexgs_edge.studies.study_scene import StudyScene, Setting, open_study_scene
+from flexgs_edge.studies.study_scene import Setting, StudyScene, open_study_scene
 from flexgs_edge.views.depths import visible_depths
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, make_splats, random_scene
@@ -199,7 +199,7 @@ def test_a_bit_is_worth_the_same_in_each_pixel_of_fewer(studied: StudyScene) -> 
         patch.setattr(moves, "whole_at", whole_at)
         for width in (40, 20):
             place = moves.Place(
-                studied, moves.MOVES[moves.AS_IT_IS][0], studied.scene.source, replace(AMOUNTS, few_width=width)
+                studied, moves.MOVES[moves.AS_IT_IS][0], studied.run.source, replace(AMOUNTS, few_width=width)
             )
             with place.judge() as judge:
                 place.best(judge, 1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 from collections.abc import Iterable, Sequence
@@ -15,12 +16,13 @@ from flexgs_edge.files import DISK_FULL
 from flexgs_edge.memory.rows import blocks, read_rows
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
-from flexgs_edge.methods.best.spill import LOG
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.fingerprint import fingerprint
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.scene.source import SceneSource
+
+LOG = logging.getLogger("flexgs_edge")
 
 DONE = "done"
 """File of a round that is there last: without it the round was cut short."""
@@ -107,14 +109,15 @@ class Checkpoint:
 
 
 def open_checkpoint(
-    renderer: Renderer, source: SceneSource, scored: Sequence[Camera], options: CompressOptions, folder: Path
+    run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera], folder: Path
 ) -> Checkpoint:
     """Where the path of a search keeps its rounds: a folder named by all that they depend on."""
+    options = run.options
     # A path that leads to a descent keeps views from between the poses as well.
     distils = distil_steps(options, len(scored)) > 0
     words = f"path {EFFORTS[options.effort].keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r} {distils}"
     assert options.near is not None and options.extent is not None
-    key = fingerprint(source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
+    key = fingerprint(run.source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
     checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")
     if checkpoint.rounds:
         LOG.info(

@@ -21,6 +21,7 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.sums import Maker, ViewSums
 
 MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
@@ -144,7 +145,7 @@ def put_costs(parts: CostParts, rows: slice, sums: Any) -> None:
 
 
 def measure_costs(
-    renderer: Renderer,
+    bench: Bench,
     scene: DeviceScene,
     cameras: Sequence[Camera],
     sh_costs: bool = True,
@@ -154,21 +155,22 @@ def measure_costs(
 
     Parameters
     ----------
-    renderer, scene : Renderer, DeviceScene
+    bench : Bench
+    scene : DeviceScene
     cameras : sequence of Camera
         The scored poses.
     sh_costs : bool
         Measure the costs of dropping SH degrees as well (empty arrays otherwise).
     """
     degree = scene.sh_degree if sh_costs else 0
-    costs = ViewSums(renderer, scene, [cost_sums(renderer, degree)])
+    costs = ViewSums(bench, scene, [cost_sums(bench.renderer, degree)])
     try:
         for _ in progress.track(costs.draw("removal_sums", cameras), "measuring costs", len(cameras)):
             pass
-        found = cost_parts(degree, scene.count, renderer.storage)
+        found = cost_parts(degree, scene.count, bench.renderer.storage)
         for rows, (sums,) in costs.parts():
             put_costs(found, rows, sums)
-        return RemovalCosts.of([found], renderer.storage)
+        return RemovalCosts.of([found], bench.renderer.storage)
     finally:
         costs.release()
 

@@ -204,7 +204,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         if not self.refit:
             return grid
         moved = refit_colours(
-            path.renderer,
+            path.bench,
             values_of(grid),
             kept.degrees[order],
             path.origin,
@@ -229,7 +229,7 @@ class GridSearch(MultiplierSearch[GridScene]):
             shared = (path.origin, path.cameras, path.targets)
             if self.effort.refit_rounds:
                 moved = refit_colours(
-                    path.renderer,
+                    path.bench,
                     moved,
                     degrees,
                     *shared,
@@ -241,7 +241,7 @@ class GridSearch(MultiplierSearch[GridScene]):
             grid = replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree]))
             coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], storage), storage)
             moved = refit_colours(
-                path.renderer,
+                path.bench,
                 coarse,
                 degrees,
                 *shared,

@@ -15,8 +15,8 @@ from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.rounds import take_rows
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.fit import sum_bytes
-from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.bench import Bench
 
 HALF = 0.485
 """Share of the bits that stays from layer to layer: a file cut to half its bytes shall hold a whole layer, header included."""
@@ -28,7 +28,7 @@ def assign_layers(
     grid: GridScene,
     layers: int,
     bits: BitModel,
-    renderer: Renderer,
+    bench: Bench,
     cameras: Sequence[Camera],
     progress: Progress = SILENT,
 ) -> GridScene:
@@ -49,13 +49,14 @@ def assign_layers(
     spent = np.array([bits.of_degree(degree) for degree in range(grid.sh_degree + 1)])[grid.sh_degrees]
     layer = np.zeros(grid.count, np.uint8)
     left = np.arange(grid.count)
+    renderer = bench.renderer
     planes, storage = values_of(grid, renderer.storage), renderer.storage
     for level in range(layers - 1, 0, -1):
         end = HALF * spent[left].sum()
         while len(left) and spent[left].sum() > end:
             kept = take_rows(planes, left, storage)
             with renderer.load(MemorySource(kept, origin=grid.origin), sum_bytes(2)) as scene:
-                costs = measure_costs(renderer, scene, cameras, sh_costs=False, progress=progress)
+                costs = measure_costs(bench, scene, cameras, sh_costs=False, progress=progress)
             worth = np.where(costs.weight2 > 0, costs.removal / spent[left], -1.0)
             order = np.argsort(worth, kind="stable")
             gone = np.cumsum(spent[left][order])

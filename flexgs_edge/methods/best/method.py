@@ -1,46 +1,143 @@
-"""`--method best`: measured costs along a path of prune and rescore, one multiplier, grids of equal slope, the real coder."""
+"""`--method best`: measured costs in rounds of pruning, one multiplier, grids of equal slope, the real coder."""
 
 from __future__ import annotations
 
 import logging
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.cameras.made import poses_between
+from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.constants import ALPHA_MIN
+from flexgs_edge.errors import TargetError
+from flexgs_edge.files import temporary_name
 from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import Scored, SearchResult, Step
-from flexgs_edge.goals.target import Measurement, Target
+from flexgs_edge.goals.steps import Scored, SearchResult, Step, step_words
+from flexgs_edge.goals.target import Measurement
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.grid.values import values_of
 from flexgs_edge.methods.best.candidates import Candidate, Product, RateResult
-from flexgs_edge.methods.best.checkpoint import Checkpoint
+from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
 from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.grid_search import GridSearch
-from flexgs_edge.methods.best.keep import LAYERS_COST
+from flexgs_edge.methods.best.keep import LAYERS_COST, kept_as_it_is
 from flexgs_edge.methods.best.layers import assign_layers
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
-from flexgs_edge.methods.best.poses import ScoredPoses
+from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
 from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, least_spilled, needed_bytes
-from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, choose_storage, least_spilled, needed_bytes
+from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.judge import Judge, measurement_of
+from flexgs_edge.run.judges import Judges
+from flexgs_edge.run.made import Made
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.run import Run
+from flexgs_edge.run.settings import make_settings
 from flexgs_edge.scene.curve import near_rows
-from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
+from flexgs_edge.scene.source import MemorySource, read_all
+from flexgs_edge.units import format_size
+from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.references import References
 
 LOG = logging.getLogger("flexgs_edge")
+
 Report = Callable[[Candidate], None]
 SearchMaker = Callable[[PruneRounds, Measure, Report], MultiplierSearch[Product]]
+
+
+def compress(run: Run[CompressOptions], bench: Bench, output: Path | None) -> Made:
+    """Compress a scene into a `.fgs` of version 2.
+
+    Parameters
+    ----------
+    run : Run
+        Planned, with views and a target.
+    bench : Bench
+        Draws; gets the storage that the search needs.
+    output : Path or None
+        `None` in a dry run.
+
+    Raises
+    ------
+    TargetError
+        When nothing holds and `best_effort` is not set.
+    BudgetError
+        When the scene does not fit.
+    """
+    with Judges(run, bench) as judges:
+        poses = scored_poses(run.seen.of(run.seen.train), run.options, bench.renderer, run.source)
+        folder = Path(run.options.scratch or (tempfile.gettempdir() if output is None else output.parent))
+        storage = bench.renderer.storage = choose_storage(run, bench.renderer, poses.cameras, folder)
+        judges.prepare()
+        kept = None
+        if run.options.resume:
+            with run.clock.stage("fingerprint"):
+                kept = open_checkpoint(run, bench.renderer, poses.cameras, folder)
+        LOG.info("searching for %s", run.target.describe())
+        coder = GridCoder(bench.renderer)
+        with run.clock.stage("search"):
+            found = kept_as_it_is(run, bench, coder, judges.decide)
+        grid, search = found or search_best(
+            grid_search(run.options, coder), run, bench, poses, judges.decide, checkpoint=kept
+        )
+        judges.decided()
+        if run.options.layers > 1:
+            with run.clock.stage("layers"):
+                bits = GridCoder(bench.renderer).bits(grid)
+                grid = assign_layers(grid, run.options.layers, bits, bench, poses.cameras, run.progress)
+        size, quality = _write(run, bench, coder, grid, search, judges, output, kept)
+        if kept is not None:
+            kept.remove()
+        storage.close()
+        return Made(
+            size=size,
+            count=grid.count,
+            sh_count=grid.sh_count,
+            sh_degree=grid.sh_degree,
+            choice=search.chosen.choice,
+            search=search,
+            quality=quality,
+            trained=judges.trained,
+            step_sizes=grid.steps,
+        )
+
+
+def _write(
+    run: Run[CompressOptions],
+    bench: Bench,
+    coder: GridCoder,
+    grid: GridScene,
+    search: SearchResult,
+    judges: Judges,
+    output: Path | None,
+    kept: Checkpoint | None,
+) -> tuple[int, Quality]:
+    """Write the file under another name, measure what it decodes to, and only then give it its name."""
+    settings, target = make_settings(run, search), run.target
+    if output is None:
+        if run.reporter is not None:
+            run.reporter.read_contents_of(lambda place: coder.write(place, grid, settings))
+        size = coder.size(grid, settings)
+        return size, judges.measure(MemorySource(values_of(grid, bench.renderer.storage), origin=grid.origin))
+    with temporary_name(output, run.options.force, None if kept is None else kept.key) as place:
+        with run.clock.stage("write"):
+            size = coder.write(place, grid, settings)
+        if search.reached and target.limit_bytes is not None and size > target.limit_bytes:
+            raise TargetError(
+                f"{target.describe()}: {run.options.layers} layers make the file {size} bytes; ask for fewer layers"
+            )
+        quality = judges.measure(decoded(open_fgs(place), bench.renderer))
+    LOG.info("wrote %s, %s", output, format_size(size))
+    return size, quality
 
 
 def grid_search(
@@ -54,25 +151,19 @@ def grid_search(
 
     plan = EFFORTS[options.effort]
 
-    def make(path: PruneRounds, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
-        steps = distil_steps(options, len(path.cameras))
-        return search(path, size_of, measure, plan, options.refit, report, steps)
+    def make(rounds: PruneRounds, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
+        steps = distil_steps(options, len(rounds.cameras))
+        return search(rounds, size_of, measure, plan, options.refit, report, steps)
 
     return make
 
 
 def search_best(
     make: SearchMaker[Product],
-    renderer: Renderer,
-    source: SceneSource,
+    run: Run[CompressOptions],
+    bench: Bench,
     poses: ScoredPoses,
     judge: Judge,
-    target: Target,
-    options: CompressOptions,
-    budget: MemoryBudget,
-    clock: Stopwatch,
-    on_step: Callable[[Step], None] | None = None,
-    progress: Progress = SILENT,
     checkpoint: Checkpoint | None = None,
 ) -> tuple[Product, SearchResult]:
     """What to write, and the steps that led to it.
@@ -80,9 +171,9 @@ def search_best(
     Parameters
     ----------
     make : callable
-        `grid_search` or `file_search`.
-    source : SceneSource
-        A checked scene; held in `renderer.storage` as a whole.
+        `grid_search`, or the search for a file of another format.
+    run : Run
+        Its scene is held in the storage of `bench.renderer` as a whole.
     poses : ScoredPoses
         From `scored_poses`.
     judge : Judge
@@ -95,35 +186,33 @@ def search_best(
     BudgetError
         When the scene does not fit.
     """
-    path_of = open_rounds(renderer, source, poses.cameras, options, budget, clock, progress, checkpoint=checkpoint)
-    with path_of as path, clock.stage("search"):
-        product, search = search_rounds(make, path, renderer, source, judge, target, options, on_step)
-        return product, replace(search, scored=Scored(len(poses.cameras), poses.made, path.unseen))
+    with open_rounds(run, bench, poses.cameras, checkpoint=checkpoint) as rounds, run.clock.stage("search"):
+        product, search = search_rounds(
+            make, rounds, run, judge, on_step=lambda step: LOG.info("%s", step_words(step, run.target))
+        )
+        return product, replace(search, scored=Scored(len(poses.cameras), poses.made, rounds.unseen))
 
 
 @contextmanager
 def open_rounds(
-    renderer: Renderer,
-    source: SceneSource,
+    run: Run[CompressOptions],
+    bench: Bench,
     scored: Sequence[Camera],
-    options: CompressOptions,
-    budget: MemoryBudget,
-    clock: Stopwatch,
-    progress: Progress = SILENT,
     make: Callable[..., PruneRounds] = PruneRounds,
     checkpoint: Checkpoint | None = None,
 ) -> Iterator[PruneRounds]:
-    """The path that searches walk, at its start; several targets may share it, the weakest compression first.
+    """The rounds that searches go through, at their start; several targets may share them, the weakest compression first.
 
     Parameters
     ----------
     scored : sequence of Camera
         From `scored_poses`.
     make : callable, optional
-        Builds the path from the arguments of `PruneRounds`.
+        Builds the rounds from the arguments of `PruneRounds`.
     checkpoint : Checkpoint, optional
-        Where the path keeps its rounds.
+        Where the rounds are kept.
     """
+    renderer, source, options, budget = bench.renderer, run.source, run.options, run.budget
     storage, steps = renderer.storage, distil_steps(options, len(scored))
     if storage.spills:
         size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest_of(scored))
@@ -133,41 +222,39 @@ def open_rounds(
     budget.take("the scene and its path", size)
     try:
         planes = read_all(source, storage)
-        with References(storage.folder) as targets:
-            with clock.stage("search"):
+        with References(storage.folder) as references:
+            with run.clock.stage("search"):
                 rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
-                # Neighbours in space become neighbours in memory: a view of fox takes a seventh less.
+                # Neighbours in space become neighbours in memory: views take less time.
                 rows = storage.take(rows, near_rows(storage.take(planes["means"], rows), storage))
-                path = make(
-                    renderer,
+                rounds = make(
+                    bench,
                     planes,
                     rows,
                     source.origin,
                     scored,
-                    targets,
+                    references,
                     refit=options.refit,
                     unseen=options.unseen_share,
-                    progress=progress,
+                    progress=run.progress,
                     between=poses_between(scored) if steps else (),
                     **({} if checkpoint is None else {"checkpoint": checkpoint}),
                 )
-            del planes  # the path has its own
-            yield path
+            del planes  # the rounds have their own
+            yield rounds
     finally:
         budget.give(size)
 
 
 def search_rounds(
     make: SearchMaker[Product],
-    path: PruneRounds,
-    renderer: Renderer,
-    source: SceneSource,
+    rounds: PruneRounds,
+    run: Run[CompressOptions],
     judge: Judge,
-    target: Target,
-    options: CompressOptions,
     on_step: Callable[[Step], None] | None = None,
 ) -> tuple[Product, SearchResult]:
-    """`search_best` along a path that is there."""
+    """`search_best` through rounds that are there."""
+    renderer, source = rounds.bench.renderer, run.source
 
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=source.origin)) as kept_scene:
@@ -178,8 +265,8 @@ def search_rounds(
         if on_step:
             on_step(as_step(step, source.count))
 
-    search = make(path, measure, report)
-    found = search.run(target, options.best_effort)
+    search = make(rounds, measure, report)
+    found = search.run(run.target, run.options.best_effort)
     if isinstance(found.product, GridScene):
         beyond = len(search.kept(found.chosen.multiplier).rows) - found.product.count
         if beyond:
@@ -189,24 +276,6 @@ def search_rounds(
                 beyond,
             )
     return found.product, _as_search(found, source.count)
-
-
-def layered(
-    grid: GridScene,
-    renderer: Renderer,
-    poses: ScoredPoses,
-    options: CompressOptions,
-    progress: Progress = SILENT,
-) -> GridScene:
-    """The grid in as many layers as asked for."""
-    return assign_layers(
-        grid,
-        options.layers,
-        GridCoder(renderer).bits(grid),
-        renderer,
-        poses.cameras,
-        progress,
-    )
 
 
 def alive(logits: np.ndarray) -> np.ndarray:

@@ -24,9 +24,9 @@ from flexgs_edge.methods.best.refit.colour import normal_bytes, normal_sums, ste
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import sum_bytes
-from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.references import References
 from flexgs_edge.views.sums import ViewSums
 
@@ -82,7 +82,7 @@ class PruneRounds:
 
     Parameters
     ----------
-    renderer : Renderer
+    bench : Bench
     planes : dict
         Stored planes of the whole scene ([width, N] f32 by field).
     rows : np.ndarray
@@ -106,7 +106,7 @@ class PruneRounds:
 
     def __init__(
         self,
-        renderer: Renderer,
+        bench: Bench,
         planes: dict[str, np.ndarray],
         rows: np.ndarray,
         origin: np.ndarray,
@@ -119,9 +119,9 @@ class PruneRounds:
         between: Sequence[Camera] = (),
     ) -> None:
         self.checkpoint = checkpoint
-        self.renderer, self.origin, self.refit = renderer, origin, refit
+        self.bench, self.renderer, self.origin, self.refit = bench, bench.renderer, origin, refit
         self.cameras, self.targets, self.progress = cameras, targets, progress
-        self.storage, self.rows, self.between = renderer.storage, rows, between
+        self.storage, self.rows, self.between = bench.renderer.storage, rows, between
         count = max(min(PARTS, len(cameras) // LEAST_VIEWS), 1)
         self._views = [range(first, len(cameras), count) for first in range(count)]
         self._parts: list[CostParts] = []
@@ -207,7 +207,7 @@ class PruneRounds:
         return True
 
     def _measure(self, scene: DeviceScene, views: Sequence[int], keep: bool = False) -> CostParts:
-        costs = ViewSums(self.renderer, scene, [cost_sums(self.renderer, scene.sh_degree)])
+        costs = ViewSums(self.bench, scene, [cost_sums(self.renderer, scene.sh_degree)])
         try:
             keep = keep and self.refit
             drawn = costs.draw("removal_sums", [self.cameras[view] for view in views], pictures=keep)
@@ -223,7 +223,7 @@ class PruneRounds:
 
     def _measure_and_mend(self, scene: DeviceScene, planes: dict[str, np.ndarray], views: Sequence[int]) -> CostParts:
         makers = [cost_sums(self.renderer, scene.sh_degree, first=4), normal_sums(self.renderer)]
-        both = ViewSums(self.renderer, scene, makers)
+        both = ViewSums(self.bench, scene, makers)
         # Nothing has lost its SH on the path yet.
         degrees = np.full(scene.count, 4, np.uint8)
         try:

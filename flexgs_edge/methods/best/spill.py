@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flexgs_edge.cameras.camera import Camera, largest_of
-from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.process import return_freed_memory
 from flexgs_edge.memory.rows import READING_BYTES
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
@@ -29,6 +28,7 @@ from flexgs_edge.render.fit import (
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.view_buffers import view_size
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.units import format_size
@@ -51,21 +51,15 @@ SPOOL_ROW_BYTES = 52
 """Bytes that each row that a view shows takes of the scratch file for its sums (`ViewSums`)."""
 
 
-def prepare_memory(source: SceneSource, options: CompressOptions, budget: MemoryBudget) -> None:
+def prepare_memory(run: Run[CompressOptions]) -> None:
     """Have freed memory returned, where the path of a search is not going to fit: to be called before the device is opened."""
+    source, options, budget = run.source, run.options, run.budget
     rows = source.count
     if options.method == "best" and rows * row_bytes(source.sh_degree, EFFORTS[options.effort].keep) > budget.free:
         return_freed_memory()
 
 
-def choose_storage(
-    renderer: Renderer,
-    source: SceneSource,
-    scored: Sequence[Camera],
-    options: CompressOptions,
-    budget: MemoryBudget,
-    folder: Path,
-) -> Storage:
+def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera], folder: Path) -> Storage:
     """Memory, where the scene and the path of its search fit, else scratch files; says which, and how much they may take.
 
     Parameters
@@ -78,6 +72,7 @@ def choose_storage(
     BudgetError
         When not even the views fit, or the disk is too small.
     """
+    source, options, budget = run.source, run.options, run.budget
     largest = largest_of(scored)
     rows, keep = source.count, EFFORTS[options.effort].keep
     whole = rows * row_bytes(source.sh_degree, keep)

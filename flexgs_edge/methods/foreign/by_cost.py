@@ -81,7 +81,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         geometry = found.read(slice(0, found.count), list(FIELD))
         colours = {name: np.ascontiguousarray(planes[name][:, rows]) for name in ("sh_dc", "sh_rest")}
         moved = refit_colours(
-            path.renderer,
+            path.bench,
             {**geometry, **colours},
             *shared,
             rounds=self.effort.refit_rounds,
@@ -94,7 +94,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
             decoded = coded.read(slice(0, coded.count), list(FIELD))
             place.unlink()
             mended = refit_colours(
-                path.renderer,
+                path.bench,
                 {**decoded, "sh_dc": moved["sh_dc"]},
                 *shared,
                 rounds=1,

@@ -22,7 +22,11 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.judge import Judge, measurement_of
+from flexgs_edge.run.judges import Judges
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.run import Run
 from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.views.bench import Bench
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -54,16 +58,16 @@ class WrittenFile:
 @contextmanager
 def open_files(
     format: Format,
+    run: Run[CompressOptions],
     output: Path | None,
-    force: bool,
-    budget: MemoryBudget,
-    renderer: Renderer | None,
-    judge: Judge | None,
+    bench: Bench | None = None,
+    judges: Judges | None = None,
 ) -> Iterator[FileMaker]:
     """A folder for files beside `output` (in a dry run: where TMPDIR says), gone when the block ends."""
-    beside = None if output is None else check_writable(output, force).parent
+    beside = None if output is None else check_writable(output, run.options.force).parent
+    renderer, judge = None if bench is None else bench.renderer, None if judges is None else judges.decide
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=beside) as folder:
-        yield FileMaker(format, Path(folder), budget, renderer, judge)
+        yield FileMaker(format, Path(folder), run.budget, renderer, judge)
 
 
 class FileMaker:

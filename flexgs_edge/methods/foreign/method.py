@@ -2,46 +2,98 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 
-from flexgs_edge.goals.steps import SearchResult, Step
+from flexgs_edge.goals.steps import Step, step_words
 from flexgs_edge.goals.target import Target
-from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.io.exchange import read_foreign
+from flexgs_edge.io.formats import Format
 from flexgs_edge.methods.best.method import search_best
-from flexgs_edge.methods.best.poses import ScoredPoses
+from flexgs_edge.methods.best.poses import scored_poses
 from flexgs_edge.methods.foreign.by_cost import file_search
 from flexgs_edge.methods.foreign.by_rank import search_pruned_files
-from flexgs_edge.methods.foreign.file_maker import FileMaker, WrittenFile
-from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.judge import Judge
+from flexgs_edge.methods.foreign.file_maker import open_files, publish
+from flexgs_edge.methods.paper.method import rank
+from flexgs_edge.run.judges import Judges
+from flexgs_edge.run.made import Made
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.run.run import Run
+from flexgs_edge.units import format_size
+from flexgs_edge.views.bench import Bench
+
+LOG = logging.getLogger("flexgs_edge")
 
 
-def search_files(
-    files: FileMaker,
-    order: np.ndarray | None,
-    renderer: Renderer | None,
-    source: SceneSource,
-    poses: ScoredPoses | None,
-    judge: Judge | None,
-    target: Target | None,
-    options: CompressOptions,
-    budget: MemoryBudget,
-    clock: Stopwatch,
-    on_step: Callable[[Step], None] | None = None,
-    progress: Progress = SILENT,
-) -> tuple[WrittenFile, SearchResult]:
-    """A file of another program's format: in rank order ([N] i64, least important row first), or by measured costs (None)."""
-    if order is not None:
-        with clock.stage("search"):
-            return search_pruned_files(files, source, order, target, options, on_step)
-    assert renderer is not None and judge is not None and target is not None and poses is not None
-    make = file_search(options, files)
-    return search_best(
-        make, renderer, source, poses, judge, target, options, budget, clock, on_step=on_step, progress=progress
-    )
+def compress(
+    run: Run[CompressOptions],
+    bench: Bench | None,
+    output: Path | None,
+    format: Format,
+    scores: np.ndarray | None = None,
+) -> Made:
+    """Compress a scene into a file of another program's format.
+
+    Parameters
+    ----------
+    run : Run
+        Planned; its method says whether files are searched by measured costs (`best`) or in rank order (`paper`).
+    bench : Bench or None
+        Draws; `None` for runs without views, whose rates are fixed.
+    output : Path or None
+        `None` in a dry run.
+    scores : np.ndarray or None
+        [N] f64 from a file, for `paper`.
+    """
+    options, plan = run.options, run.plan
+    assert plan is not None
+    with nullcontext() if bench is None else Judges(run, bench) as judges:
+        order: np.ndarray | None = None
+        reused = False
+        if options.method == "paper":
+            ranking = rank(run, judges, bench, scores)
+            order, reused = ranking.order, ranking.reused
+        elif judges is not None:
+            judges.prepare()
+        if options.antialiased:
+            LOG.warning("%s does not say that the model is antialiased: viewers must be told", format.suffix)
+        poses = None
+        if order is None and bench is not None:
+            poses = scored_poses(run.seen.of(run.seen.train), options, bench.renderer, run.source)
+        with open_files(format, run, output, bench, judges) as files:
+            if plan.target is not None:
+                LOG.info("searching for %s", plan.target.describe())
+            if order is not None:
+                with run.clock.stage("search"):
+                    file, search = search_pruned_files(
+                        files, run.source, order, plan.target, options, _said(plan.target)
+                    )
+            else:
+                assert bench is not None and judges is not None and poses is not None
+                file, search = search_best(file_search(options, files), run, bench, poses, judges.decide)
+            if judges is not None:
+                judges.decided()
+            quality = None if judges is None else judges.measure(read_foreign(file.path))
+            if output is not None:
+                publish(file, output, options.force)
+                LOG.info("wrote %s, %s", output, format_size(file.size))
+        return Made(
+            size=file.size,
+            count=file.count,
+            sh_count=file.sh_count,
+            sh_degree=file.sh_degree,
+            choice=search.chosen.choice,
+            search=search,
+            quality=quality,
+            trained=None if judges is None else judges.trained,
+            scores_reused=reused,
+        )
+
+
+def _said(target: Target | None) -> Callable[[Step], None]:
+    """Says each step of a search."""
+    return lambda step: LOG.info("%s", step_words(step, target))

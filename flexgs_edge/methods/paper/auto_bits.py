@@ -7,11 +7,12 @@ import logging
 from flexgs_edge.methods.paper.evaluator import SceneEvaluator
 from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.packed.sensitivity import ALLOWED_DROP, Sensitivity, search_bits
-from flexgs_edge.progress import Progress
 from flexgs_edge.quality.psnr import error_for_drop
 from flexgs_edge.run.judge import Judge
+from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.plan import EVERYTHING
-from flexgs_edge.run.view_set import ViewSet
+from flexgs_edge.run.run import Run
+from flexgs_edge.views.bench import Bench
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -20,16 +21,15 @@ SENSITIVITY_VIEWS = 8
 
 
 def bits_by_sensitivity(
-    evaluator: SceneEvaluator, views: ViewSet | None, base_psnr: float, progress: Progress
+    evaluator: SceneEvaluator, run: Run[CompressOptions], bench: Bench
 ) -> tuple[BitSpec, list[Sensitivity]]:
     """The bits, and what was measured, with nothing pruned."""
-    renderer, source = evaluator.renderer, evaluator.source
-    assert renderer is not None and views is not None
+    renderer, source, views, base_psnr = bench.renderer, evaluator.source, run.seen, run.options.base_psnr
     count = min(SENSITIVITY_VIEWS, len(views.train))
     indices = [views.train[i * len(views.train) // count] for i in range(count)]
-    judge = Judge(renderer, source, views, indices, evaluator.budget, False, base_psnr)
+    judge = Judge(bench, source, views, indices, with_photos=False, base_psnr=base_psnr)
     with renderer.load(source) as original:
-        judge.prepare(original, progress)
+        judge.prepare(original, run.progress)
 
     def error(bits: BitSpec) -> float:
         with evaluator.quantized(EVERYTHING, bits) as quantized, renderer.load_quantized(quantized) as scene:

@@ -11,7 +11,7 @@ from flexgs_edge.methods.paper.search import CANDIDATES
 from flexgs_edge.report.plots import LineChart, PlaneChart, Series
 from flexgs_edge.studies.experiment import Beside, Experiment
 from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
-from flexgs_edge.studies.study_scene import FIGURES, StudyScene, Point, Setting
+from flexgs_edge.studies.study_scene import FIGURES, Point, Setting, StudyScene
 
 DIAGONAL = tuple(range(50, 501, 50))
 """Rates p = s of the ADP curve, thousandths: a split that nothing was tuned for."""
@@ -148,7 +148,7 @@ def plane(studied: StudyScene) -> Experiment:
     for p, s in frontier:
         choice = Choice(round(1000 * p), min(round(1000 * s), 1000 - round(1000 * p)))
         size = studied.size(Setting(choice))
-        ratio = round(studied.scene.ply_bytes / size, 3)
+        ratio = round(studied.run.scene.ply_bytes / size, 3)
         rows.append(
             {"kind": "frontier", "step": None, "prune_rate": p, "sh_rate": s, **empty, "size": size, "ratio": ratio}
         )
@@ -161,7 +161,8 @@ def plane(studied: StudyScene) -> Experiment:
         "plane",
         "The plane of the two rates, and the search on it",
         f"Every cell is a measured file at the paper's bits. The line is where the {words}, interpolated between cells; dots "
-        f"are the paper's candidates; the path is the search for {studied.target.describe()} (effort {studied.options.effort}).",
+        f"are the paper's candidates; the path is the search for {studied.target.describe()} "
+        f"(effort {studied.run.options.effort}).",
         table,
         PlaneChart(
             "Loss over the two rates, and the path of the search",
@@ -188,7 +189,7 @@ def plane(studied: StudyScene) -> Experiment:
             Beside("ratio at the search's answer", f"{answer['ratio']:.1f}x", "19.5x to 28x"),
             Beside(
                 "smaller by, and loss there",
-                f"{100 * (1 - chosen.size / studied.scene.ply_bytes):.1f} %, {answer[figure]:.2f} dB",
+                f"{100 * (1 - chosen.size / studied.run.scene.ply_bytes):.1f} %, {answer[figure]:.2f} dB",
                 "94.9 / 96.1 / 96.4 %, 0.87 / 0.86 / 0.85 dB (Mip-NeRF360 / Tanks&Temples / Deep Blending)",
             ),
         ),
@@ -253,8 +254,8 @@ def scores(studied: StudyScene) -> Experiment:
     figure = studied.figure
     gs, meson = (table.values(figure, score=score) for score in kinds)
     gaps = [b - a for a, b in zip(gs, meson)]
-    half = studied.scene.source.count // 2
-    low = np.zeros(studied.scene.source.count, bool)
+    half = studied.run.source.count // 2
+    low = np.zeros(studied.run.source.count, bool)
     low[studied.orders["gs"][:half]] = True
     same = low[studied.orders["meson"][:half]].sum() / max(half, 1)
     return Experiment(

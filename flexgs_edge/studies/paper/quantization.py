@@ -10,7 +10,7 @@ from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Table, columns
-from flexgs_edge.studies.study_scene import FIGURES, StudyScene, Setting
+from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 
 RTN_BITS = tuple(range(2, 9))
 FINE = BitSpec.rtn(16)
@@ -61,7 +61,7 @@ def rtn(studied: StudyScene) -> Experiment:
 
 def attributes(studied: StudyScene) -> Experiment:
     """Each attribute alone at 4 and at 8 bits, all others at 16."""
-    names = [field.bits for field in FIELDS if field.width(studied.scene.source.sh_degree)]
+    names = [field.bits for field in FIELDS if field.width(studied.run.source.sh_degree)]
     alone = [(name, bits) for name in names for bits in ALONE_BITS]
     settings = [Setting(bits=replace(FINE, **{name: bits})) for name, bits in alone]
     floor, *found = studied.points([Setting(bits=FINE), *settings], "attributes")

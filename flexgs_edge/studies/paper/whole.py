@@ -19,7 +19,7 @@ from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
 from flexgs_edge.studies.experiment import Beside, Experiment
 from flexgs_edge.studies.paper.pruning import RATES
 from flexgs_edge.studies.result_tables import Cell, Table, columns
-from flexgs_edge.studies.study_scene import FIGURES, StudyScene, Setting
+from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 
 RATIOS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 STRONGEST = Choice(MAX_PRUNE, 1000 - MAX_PRUNE)
@@ -63,11 +63,11 @@ def parts(studied: StudyScene) -> Experiment:
     """ADP only, MPQ only, and both, at the choice of the search."""
     choice = studied.search.chosen.choice
     pruned = _pruned(studied, choice)
-    with studied.workspace.renderer.load(pruned) as scene:
+    with studied.bench.renderer.load(pruned) as scene:
         alone = measurement_of(studied.judge.compare(scene))
     quantized, both = studied.points([Setting(), Setting(choice)], "parts")
     none = Measurement(0.0 if studied.plan.figure == "drop" else None, None, 0.0)
-    source = studied.scene.source
+    source = studied.run.source
     whole = (
         4
         * source.count
@@ -104,14 +104,14 @@ def parts(studied: StudyScene) -> Experiment:
 
 
 def _pruned(studied: StudyScene, choice: Choice) -> Unquantized:
-    return Unquantized(studied.scene.source, *select_rows(ranks_from_order(studied.orders["gs"]), choice, studied.has_sh))
+    return Unquantized(studied.run.source, *select_rows(ranks_from_order(studied.orders["gs"]), choice, studied.has_sh))
 
 
 def rates(studied: StudyScene) -> Experiment:
     """The best that the method finds at sizes from 8 to 256 times below the PLY's, and where it ends."""
     rows: list[dict[str, Cell]] = [_rate_row(studied, "least", None, EVERYTHING)]
-    ply = studied.scene.ply_bytes
-    for ratio in studied.progress.track(RATIOS, "rates", len(RATIOS)):
+    ply = studied.run.scene.ply_bytes
+    for ratio in studied.run.progress.track(RATIOS, "rates", len(RATIOS)):
         if studied.size(Setting(EVERYTHING)) <= ply / ratio:
             continue  # the bits alone are past it: the row "least" says so
         found = studied.adapt(min_ratio(float(ratio), ply, studied.plan.figure))
@@ -168,7 +168,7 @@ def _rate_row(studied: StudyScene, kind: str, ratio: int | None, choice: Choice)
 def times(studied: StudyScene) -> Experiment:
     """Seconds of every stage and of every part of a search step, and the memory of the run."""
     steps = studied.search.steps
-    stages = dict(studied.workspace.clock.stages)
+    stages = dict(studied.run.clock.stages)
     # meson is this study's question, not the method's.
     meson = stages.pop("score meson", 0.0)
     stages["search"] = sum(step.seconds for step in steps)
@@ -183,14 +183,15 @@ def times(studied: StudyScene) -> Experiment:
     rows += [_time(f"search step {number}", taken.seconds) for number, taken in enumerate(steps, 1)]
     rows.append({"part": "peak memory", "value": memory, "unit": "bytes", "paper": None})
     table = Table(columns(part="part", value="here", unit="unit", paper="paper, RTX 3090"), tuple(rows))
-    source, views = studied.scene.source, studied.views
+    source, views = studied.run.source, studied.views
     return Experiment(
         "times",
         "Time and memory",
-        f"Wall seconds of this run: {source.count} Gaussians, {len(views.train)} training and {len(studied.plan.decide)} deciding "
-        f"views. The parts of a step are medians of {REPEATS} at the search's answer; rendering includes comparing with the "
-        "references. The paper's seconds are for its own, larger scenes and 32 views on an RTX 3090: they compare shares, not "
-        "machines. Memory is the largest that the process has held, earlier scenes included.",
+        f"Wall seconds of this run: {source.count} Gaussians, {len(views.train)} training and "
+        f"{len(studied.plan.decide)} deciding views. The parts of a step are medians of {REPEATS} at the search's answer; "
+        "rendering includes comparing with the references. The paper's seconds are for its own, larger scenes and 32 views on "
+        "an RTX 3090: they compare shares, not machines. Memory is the largest that the process has held, "
+        "earlier scenes included.",
         table,
         BarChart(
             "A step of the search",
@@ -227,7 +228,11 @@ def _step_parts(studied: StudyScene, choice: Choice) -> dict[str, float]:
     """Median seconds of a step's parts, as `SceneEvaluator.measure` does them."""
     ranks = ranks_from_order(studied.orders["gs"])
     found: list[list[float]] = []
-    evaluator, renderer, first = studied.evaluator(Setting(choice)), studied.workspace.renderer, studied.judge.cameras[0]
+    evaluator, renderer, first = (
+        studied.evaluator(Setting(choice)),
+        studied.bench.renderer,
+        studied.judge.cameras[0],
+    )
     for _ in range(REPEATS):
         marks = [time.perf_counter()]
         select_rows(ranks, choice, studied.has_sh)

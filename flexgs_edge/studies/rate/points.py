@@ -30,7 +30,7 @@ from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.studies.rate.ablations import WHOLE, Variant
 from flexgs_edge.studies.rate.coders import coder_sizes
 from flexgs_edge.studies.result_tables import Cell, Column, columns
-from flexgs_edge.studies.study_scene import FIGURES, StudyScene, Setting
+from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 from flexgs_edge.units import format_size
 
 LOG = logging.getLogger("flexgs_edge")
@@ -150,11 +150,11 @@ def paper_points(studied: StudyScene, ratios: Sequence[float]) -> Found:
 
 def _paper_point(studied: StudyScene, ratio: float | None, choice: Choice, seconds: float) -> RatePoint:
     evaluator = studied.evaluator(Setting(choice))
-    with evaluator.quantized(choice) as quantized, studied.workspace.renderer.load_quantized(quantized) as scene:
+    with evaluator.quantized(choice) as quantized, studied.bench.renderer.load_quantized(quantized) as scene:
         quality = _judged(studied, scene)
     kept, _ = evaluator.counts(choice)
     variant = WHOLE.name if ratio is not None else "nothing pruned"
-    effort = None if ratio is None else studied.options.effort
+    effort = None if ratio is None else studied.run.options.effort
     return _said(RatePoint("paper", variant, effort, ratio, evaluator.size(choice), kept, quality, seconds))
 
 
@@ -168,35 +168,26 @@ def best_points(
     recode : sequence of float
         Ratios whose grids are also sized in other coders.
     """
-    workspace, source = studied.workspace, studied.scene.source
-    options = replace(studied.options, effort=effort, refit=variant.refit, best_effort=True)
+    run, source = studied.run, studied.run.source
+    options = replace(studied.run.options, effort=effort, refit=variant.refit, best_effort=True)
     # All sizes share one path, and so its poses: those of the largest.
     largest = replace(
         options, max_drop=None, min_fidelity=None, max_size=None, min_ratio=min(ratios), max_worst_drop=None
     )
-    poses = scored_poses(studied.views.of(studied.views.train), largest, workspace.renderer, source)
+    poses = scored_poses(studied.views.of(studied.views.train), largest, studied.bench.renderer, source)
     found = NOTHING
     started = time.perf_counter()
-    with open_rounds(
-        workspace.renderer,
-        source,
-        poses.cameras,
-        options,
-        workspace.budget,
-        workspace.clock,
-        studied.progress,
-        variant.path,
-    ) as path:
-        coder = GridCoder(workspace.renderer)
+    run = replace(run, options=options)
+    with open_rounds(run, studied.bench, poses.cameras, variant.path) as rounds:
+        coder = GridCoder(studied.bench.renderer)
         for ratio in sorted(ratios):
-            target = _target(studied, ratio)
+            aimed = run.aimed_at(_target(studied, ratio))
             make = grid_search(options, coder, variant.search)
-            with workspace.clock.stage("search"):
-                grid, search = search_rounds(make, path, workspace.renderer, source, studied.judge, target, options)
+            with run.clock.stage("search"):
+                grid, search = search_rounds(make, rounds, aimed, studied.judge)
             seconds = time.perf_counter() - started
             if search.reached:
-                plan = replace(studied.plan, target=target)
-                size = coder.size(grid, make_settings(options, plan, studied.scene, studied.views, search, None))
+                size = coder.size(grid, make_settings(aimed, search))
                 quality = _judged_source(studied, grid)
                 point = RatePoint("best", variant.name, effort, ratio, size, grid.count, quality, seconds)
                 found += Found((_said(point),))
@@ -235,30 +226,30 @@ def peer_points(studied: StudyScene, folder: Path) -> Found:
 
 
 def _peer_point(studied: StudyScene, name: str, format: Format, place: Path) -> RatePoint:
-    source = studied.scene.source
+    source = studied.run.source
     with ExitStack() as stack:
-        files = stack.enter_context(open_files(format, place, False, studied.workspace.budget, None, None))
+        files = stack.enter_context(open_files(format, studied.run, place))
         started = time.perf_counter()
         # In the order that `compress` writes rows in: bytes repeat along a curve.
         path, decoded = files.write(source.select(near_order(source)))
         seconds = time.perf_counter() - started
-        with studied.workspace.renderer.load(decoded) as scene:
+        with studied.bench.renderer.load(decoded) as scene:
             quality = _judged(studied, scene)
         return RatePoint(name, WHOLE.name, None, None, path.stat().st_size, decoded.count, quality, seconds)
 
 
 def _target(studied: StudyScene, ratio: float) -> MaxSize:
-    return min_ratio(ratio, studied.scene.ply_bytes, studied.plan.figure)
+    return min_ratio(ratio, studied.run.scene.ply_bytes, studied.plan.figure)
 
 
 def _judged_source(studied: StudyScene, grid: GridScene) -> Quality:
-    with studied.workspace.renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
+    with studied.bench.renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
         return _judged(studied, scene)
 
 
 def _judged(studied: StudyScene, scene: DeviceScene) -> Quality:
-    with studied.workspace.clock.stage("measure"):
-        return studied.judge.compare(scene, with_ssim=True, progress=studied.progress)
+    with studied.run.clock.stage("measure"):
+        return studied.judge.compare(scene, with_ssim=True, progress=studied.run.progress)
 
 
 def _said(point: RatePoint) -> RatePoint:

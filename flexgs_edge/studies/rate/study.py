@@ -123,7 +123,7 @@ def _experiments(
     ablation_effort: str,
     distilled: Sequence[float],
 ) -> list[Experiment]:
-    effort = studied.options.effort
+    effort = studied.run.options.effort
     recode = ablations if ablation_effort == effort else ()
     found = best_points(studied, WHOLE, effort, ratios, recode) + paper_points(studied, ratios)
     if distilled:
@@ -133,7 +133,7 @@ def _experiments(
             found += Found((), (f"best ({MAX}: {error})",))
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder) as place:
         found += peer_points(studied, Path(place))
-    variants = parts_of(studied.orders["gs"], studied.scene.source.sh_degree) if ablations else ()
+    variants = parts_of(studied.orders["gs"], studied.run.source.sh_degree) if ablations else ()
     if ablations and ablation_effort != effort:
         found += best_points(studied, WHOLE, ablation_effort, ratios, ablations)
     for variant in variants:

@@ -47,7 +47,9 @@ def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str
 def fidelity(studied: StudyScene, points: Sequence[RatePoint], effort: str) -> Experiment:
     """The same against the original's renders, where the photos decide: how far the picture moved at all."""
     names = ("method", "wanted_ratio", "variant", "effort", "size", "ratio", "fidelity")
-    rows = [point_row(studied, point) for point in points if _on_curve(point.method, point.variant, point.effort, effort)]
+    rows = [
+        point_row(studied, point) for point in points if _on_curve(point.method, point.variant, point.effort, effort)
+    ]
     heads = {column.name: column for column in point_columns()}
     table = Table(tuple(heads[name] for name in names), tuple({name: row[name] for name in names} for row in rows))
     return Experiment(
@@ -124,7 +126,7 @@ def _comparisons(studied: StudyScene, points: Sequence[RatePoint], effort: str) 
             than = (
                 f"best needs {share:.0%} of its bytes there" if share is not None else "beyond the ends of best's curve"
             )
-            yield f"{point.method}: {studied.scene.ply_bytes / point.size:.1f}x at {loss:.3f} dB of {figure}; {than}."
+            yield f"{point.method}: {studied.run.scene.ply_bytes / point.size:.1f}x at {loss:.3f} dB of {figure}; {than}."
     others = sorted({p.effort for p in points if p.effort not in (None, effort) and p.variant == WHOLE.name} - {None})
     whole = _modelled(best)
     for other in others:

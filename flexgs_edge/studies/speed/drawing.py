@@ -115,18 +115,24 @@ def ways(source: SceneSource, extent: str) -> Iterator[Way]:
 
 def drawing(studied: StudyScene, repeats: int = REPEATS) -> Experiment:
     """Time of a view against its PSNR to the exact one."""
-    options, judge, workspace = studied.options, studied.judge, studied.workspace
+    options, judge = studied.run.options, studied.judge
     assert options.near is not None and options.background is not None and options.extent is not None
-    every = list(ways(studied.scene.source, options.extent))
+    backend = studied.bench.renderer.backend
+    every = list(ways(studied.run.source, options.extent))
     seconds: list[list[float]] = [[] for _ in every]
     errors: list[list[float]] = [[] for _ in every]
-    renderers = {options.extent: workspace.renderer}
+    renderers = {options.extent: studied.bench.renderer}
     for extent in EXTENTS:
         if extent not in renderers:
             renderers[extent] = Renderer(
-                workspace.backend, workspace.budget, options.near, options.background, extent, bool(options.antialiased)
+                backend,
+                studied.run.budget,
+                options.near,
+                options.background,
+                extent,
+                bool(options.antialiased),
             )
-    for turn in studied.progress.track(range(repeats), "drawing", repeats):
+    for turn in studied.run.progress.track(range(repeats), "drawing", repeats):
         for place, way in enumerate(every):
             renderer, cameras = renderers[way.extent], way.cameras(judge.cameras)
             with renderer.load(way.source) as scene:

@@ -16,7 +16,7 @@ from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
 from flexgs_edge.studies.speed.tile_sampling import Estimate, TileSampler, tile_errors, tile_values
 from flexgs_edge.studies.speed.timing import draw_seconds, stage_seconds
-from flexgs_edge.studies.study_scene import StudyScene, Setting
+from flexgs_edge.studies.study_scene import Setting, StudyScene
 
 SHARES = (0.05, 0.1, 0.2, 0.5, 1.0)
 TRIALS = 200
@@ -101,7 +101,7 @@ def _earlier(studied: StudyScene, chosen: Choice) -> dict[str, Choice]:
 
 def _maps(studied: StudyScene, choice: Choice, timed: bool = False) -> tuple[list[np.ndarray], Costs | None]:
     """Squared errors by tile of each deciding view; with `timed` also what measuring takes."""
-    judge, renderer = studied.judge, studied.workspace.renderer
+    judge, renderer = studied.judge, studied.bench.renderer
     evaluator = studied.evaluator(Setting(choice))
     with evaluator.quantized(choice) as quantized, renderer.load_quantized(quantized) as scene:
         maps, compare = [], 0.0

@@ -38,7 +38,7 @@ class Load:
 
 def scaling(studied: StudyScene, repeats: int = REPEATS) -> Experiment:
     """Times of loads that grow in one respect at a time."""
-    source, cameras = studied.scene.source, studied.judge.cameras
+    source, cameras = studied.run.source, studied.judge.cameras
     loads = [Load("Gaussians", len(rows), source.select(rows), cameras) for rows in _subsets(source.count)]
     for side in SIDES:
         views = [c.scaled(max(round(side * c.width), 1), max(round(side * c.height), 1)) for c in cameras]
@@ -46,8 +46,8 @@ def scaling(studied: StudyScene, repeats: int = REPEATS) -> Experiment:
         loads.append(Load("pixels", pixels, source, views))
     times: list[list[float]] = [[] for _ in loads]
     stages: list[list[dict[str, float]]] = [[] for _ in loads]
-    renderer = studied.workspace.renderer
-    for _ in studied.progress.track(range(repeats), "scaling", repeats):
+    renderer = studied.bench.renderer
+    for _ in studied.run.progress.track(range(repeats), "scaling", repeats):
         for place, load in enumerate(loads):
             with renderer.load(load.source) as scene:
                 times[place].append(draw_seconds(renderer, scene, load.cameras) / len(load.cameras))
@@ -76,11 +76,11 @@ def _columns(by_stage: dict[str, float]) -> dict[str, Cell]:
 
 def _by_views(studied: StudyScene, repeats: int) -> list[dict[str, Cell]]:
     """Hits and weights of every Gaussian over ever more training poses."""
-    renderer, cameras = studied.workspace.renderer, studied.views.of(studied.views.train)
+    renderer, cameras = studied.bench.renderer, studied.views.of(studied.views.train)
     counts = view_counts(len(cameras))
     spread = {count: [cameras[i * len(cameras) // count] for i in range(count)] for count in counts}
     times: dict[int, list[float]] = {count: [] for count in counts}
-    with renderer.load(studied.scene.source) as scene:
+    with renderer.load(studied.run.source) as scene:
         gather_statistics(renderer, scene, cameras[:1])
         for _ in range(repeats):
             for count, poses in spread.items():

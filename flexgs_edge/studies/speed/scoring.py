@@ -88,8 +88,8 @@ def score_rows(studied: StudyScene, fewest: int = FEWEST, orders: Sequence[str] 
     """
     cameras = studied.views.of(studied.views.train)
     counts = view_counts(len(cameras), fewest)
-    positions = some_positions(studied.scene.source)
-    covering = covering_order(cameras, positions, studied.workspace.renderer.near, len(cameras))
+    positions = some_positions(studied.run.source)
+    covering = covering_order(cameras, positions, studied.bench.renderer.near, len(cameras))
     spread = farthest_order(cameras)
     places: dict[str, Callable[[int], list[int]]] = {
         "covering": lambda count: sorted(covering[:count]),
@@ -101,8 +101,8 @@ def score_rows(studied: StudyScene, fewest: int = FEWEST, orders: Sequence[str] 
     sets += [(name, n, [cameras[i] for i in places[name](n)]) for n in counts[:-1] for name in orders]
     choice = studied.search.chosen.choice  # before the scene is loaded below: it draws others
     rows: list[dict[str, Cell]] = []
-    budget = studied.workspace.budget
-    size = (8 * len(sets) + RANK_BYTES) * studied.scene.source.count
+    budget = studied.run.budget
+    size = (8 * len(sets) + RANK_BYTES) * studied.run.source.count
     budget.take("scores of several sets of poses", size)
     try:
         for score in SCORES:
@@ -126,16 +126,18 @@ def score_rows(studied: StudyScene, fewest: int = FEWEST, orders: Sequence[str] 
     return rows
 
 
-def _scores(studied: StudyScene, score: str, sets: Sequence[tuple[str, int, list[Camera]]]) -> list[tuple[np.ndarray, float]]:
+def _scores(
+    studied: StudyScene, score: str, sets: Sequence[tuple[str, int, list[Camera]]]
+) -> list[tuple[np.ndarray, float]]:
     """Scores ([N] f64) and seconds of each set of poses."""
-    source, renderer = studied.scene.source, studied.workspace.renderer
+    source, renderer = studied.run.source, studied.bench.renderer
     storage = sum_bytes(2) + moment_bytes(source.sh_degree)
     found = []
     with renderer.load(source, storage) as scene:
         make: dict[str, Callable[[list[Camera]], np.ndarray]] = {
-            "gs": lambda poses: score_scene(renderer, scene, source, poses, "gs", studied.progress),
+            "gs": lambda poses: score_scene(renderer, scene, source, poses, "gs", studied.run.progress),
             # With the costs of SH, as a search by measured costs asks for them: they come from the same pass.
-            "removal": lambda poses: measure_costs(renderer, scene, poses, progress=studied.progress).removal,
+            "removal": lambda poses: measure_costs(studied.bench, scene, poses, progress=studied.run.progress).removal,
         }
         make[score](sets[0][2][:1])
         for _, _, poses in sets:
@@ -148,11 +150,17 @@ def _scores(studied: StudyScene, score: str, sets: Sequence[tuple[str, int, list
 
 def _evaluator(studied: StudyScene, order: np.ndarray) -> SceneEvaluator:
     """As `studied.evaluator`, with rows in another order."""
-    bits, groups = studied.options.bit_spec()
+    bits, groups = studied.run.options.bit_spec()
     assert bits is not None
-    workspace = studied.workspace
     return SceneEvaluator(
-        studied.scene.source, order, studied.has_sh, bits, groups, workspace.renderer, studied.judge, workspace.budget
+        studied.run.source,
+        order,
+        studied.has_sh,
+        bits,
+        groups,
+        studied.bench.renderer,
+        studied.judge,
+        studied.run.budget,
     )
 
 

@@ -46,8 +46,8 @@ def half_positions(source: SceneSource) -> MemorySource:
 
 def add_plain_orders(studied: StudyScene, removal: np.ndarray) -> None:
     """Put the orders by chance, opacity, volume and measured costs of removal ([N] f64) beside those that the bench has."""
-    source = studied.scene.source
-    studied.workspace.budget.take("ranks by four more scores", 4 * RANK_BYTES * source.count)
+    source = studied.run.source
+    studied.run.budget.take("ranks by four more scores", 4 * RANK_BYTES * source.count)
     planes = source.read(slice(0, source.count), ["opacity_logits", "log_scales"])
     studied.orders["random"] = np.random.default_rng(0).permutation(source.count)
     studied.orders["opacity"] = order_from_scores(planes["opacity_logits"][0])

@@ -32,7 +32,7 @@ from flexgs_edge.studies.stability.breaks import (
     where_it_breaks,
 )
 from flexgs_edge.studies.stability.ours import Whole
-from flexgs_edge.studies.study_scene import StudyScene, Setting
+from flexgs_edge.studies.study_scene import Setting, StudyScene
 
 TENSOR, CHANNEL, GROUPS, MPQ, BEST = "RTN, per tensor", "RTN, per channel", "RTN, sub-groups", "paper (MPQ)", "best"
 ORDERS = ("file", "shuffled", "curve")
@@ -45,8 +45,8 @@ def rounding(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
     def add(method: str, bits: int | None, coarser: float | None, found: Outcome) -> None:
         rows.append({"method": method, "bits": bits, "coarser": coarser, **found.cells(studied)})
 
-    source = studied.scene.source
-    for bits in studied.progress.track(amounts.bits, "bits", len(amounts.bits)):
+    source = studied.run.source
+    for bits in studied.run.progress.track(amounts.bits, "bits", len(amounts.bits)):
         spec = BitSpec.rtn(bits)
         add(TENSOR, bits, None, of_source(studied, lambda: tensor_rounded(source, bits)))  # noqa: B023
         add(CHANNEL, bits, None, of_setting(studied, Setting(bits=spec, groups=1)))
@@ -104,7 +104,7 @@ def _of_grid(grid: GridScene) -> tuple[int, MemorySource]:
 
 def groups(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
     """Rows that share a range, from few to all, in three orders of the rows."""
-    source = studied.scene.source
+    source = studied.run.source
     count = source.count
     orders = {
         "file": np.arange(count),
@@ -112,7 +112,7 @@ def groups(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
         "curve": near_order(source),
     }
     rows: list[dict[str, Cell]] = []
-    for name in studied.progress.track(ORDERS, "groups", len(ORDERS)):
+    for name in studied.run.progress.track(ORDERS, "groups", len(ORDERS)):
         turned = source.select(orders[name]) if name != "file" else source
         evaluator = _evaluator(studied, turned, studied.has_sh[orders[name]])
         for ranges in dict.fromkeys(max(count // (share or count), 1) for share in amounts.group_rows):
@@ -160,6 +160,5 @@ def _reordered(grid: GridScene, order: np.ndarray) -> GridScene:
 
 
 def _evaluator(studied: StudyScene, source: SceneSource, has_sh: np.ndarray, bits: BitSpec = PAPER) -> SceneEvaluator:
-    workspace = studied.workspace
     order = np.arange(source.count)
-    return SceneEvaluator(source, order, has_sh, bits, None, workspace.renderer, studied.judge, workspace.budget)
+    return SceneEvaluator(source, order, has_sh, bits, None, studied.bench.renderer, studied.judge, studied.run.budget)

@@ -17,7 +17,7 @@ from flexgs_edge.report.plots import Series
 from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.studies.result_tables import Cell, Row
-from flexgs_edge.studies.study_scene import StudyScene, Setting
+from flexgs_edge.studies.study_scene import Setting, StudyScene
 
 BREAK = 3.0
 """dB lost from which a method is said to have broken: twice the squared error."""
@@ -51,7 +51,7 @@ class Outcome:
         fidelity = quality.fidelity
         return {
             "size": self.size,
-            "ratio": round(studied.scene.ply_bytes / self.size, 3),
+            "ratio": round(studied.run.scene.ply_bytes / self.size, 3),
             "loss": round(loss, 4),
             "worst": round(max(view_loss(studied, view) for view in quality.views), 4),
             "fidelity": None if fidelity is None else round(fidelity, 4),
@@ -63,14 +63,14 @@ def view_loss(studied: StudyScene, view: ViewQuality) -> float:
     """What decides, for one view: its drop against the photo, else its modelled drop; dB."""
     if studied.plan.figure == "drop" and view.drop is not None:
         return view.drop
-    return modelled_drop(view.error, studied.options.base_psnr)
+    return modelled_drop(view.error, studied.run.options.base_psnr)
 
 
 def mean_loss(studied: StudyScene, views: Sequence[ViewQuality]) -> float:
     """The figure that decides, over some views, dB."""
     if studied.plan.figure == "drop":
         return math.fsum(view_loss(studied, view) for view in views) / len(views)
-    return Quality(tuple(views), studied.options.base_psnr).modelled_drop
+    return Quality(tuple(views), studied.run.options.base_psnr).modelled_drop
 
 
 def outcome(studied: StudyScene, make: Callable[[], tuple[int, AbstractContextManager[DeviceScene]]]) -> Outcome:
@@ -88,7 +88,7 @@ def of_source(studied: StudyScene, make: Callable[[], tuple[int, SceneSource]]) 
 
     def load() -> tuple[int, AbstractContextManager[DeviceScene]]:
         size, source = make()
-        return size, studied.workspace.renderer.load(source)
+        return size, studied.bench.renderer.load(source)
 
     return outcome(studied, load)
 
@@ -111,7 +111,7 @@ def of_choice(studied: StudyScene, make: Callable[[], SceneEvaluator], choice: C
 @contextmanager
 def drawn(studied: StudyScene, evaluator: SceneEvaluator, choice: Choice) -> Iterator[DeviceScene]:
     """A choice of an evaluator, quantized and loaded."""
-    with evaluator.quantized(choice) as quantized, studied.workspace.renderer.load_quantized(quantized) as scene:
+    with evaluator.quantized(choice) as quantized, studied.bench.renderer.load_quantized(quantized) as scene:
         yield scene
 
 

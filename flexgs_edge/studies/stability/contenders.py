@@ -11,7 +11,7 @@ from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.studies.paper.pruning import nearest
 from flexgs_edge.studies.stability.breaks import drawn
 from flexgs_edge.studies.stability.ours import Whole
-from flexgs_edge.studies.study_scene import StudyScene, Setting
+from flexgs_edge.studies.study_scene import Setting, StudyScene
 
 BEST, PAPER, RTN, ROWS, SH = "best", "paper", "RTN, 8 bits", "rows only", "SH only"
 MARGIN = "best, --views-margin"
@@ -52,7 +52,7 @@ class Contenders:
     def loaded(self, name: str) -> Iterator[DeviceScene]:
         """What its file decodes to, to draw."""
         if name in self.wholes:
-            with self.studied.workspace.renderer.load(self.wholes[name].source) as scene:
+            with self.studied.bench.renderer.load(self.wholes[name].source) as scene:
                 yield scene
         else:
             setting = self.settings[name]

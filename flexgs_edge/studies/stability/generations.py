@@ -29,7 +29,7 @@ from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
 from flexgs_edge.studies.stability.amounts import Amounts
 from flexgs_edge.studies.stability.breaks import BREAK, LOSSES, Outcome, curve, number, of_choice, of_source
 from flexgs_edge.studies.stability.ours import Whole, search, walked
-from flexgs_edge.studies.study_scene import StudyScene, Setting
+from flexgs_edge.studies.study_scene import Setting, StudyScene
 
 BEST, PAPER, RTN = "best", "paper", "RTN, 8 bits"
 IN_A_ROW, DIRECT = "two targets", "one target"
@@ -81,7 +81,7 @@ def generations(studied: StudyScene, path: PruneRounds, ours: Whole, amounts: Am
         rows.append({"method": method, "generation": generation, "kept": count, **found.cells(studied)})
 
     whole = ours
-    for generation in studied.progress.track(range(1, amounts.generations + 1), "generations", amounts.generations):
+    for generation in studied.run.progress.track(range(1, amounts.generations + 1), "generations", amounts.generations):
         if generation > 1:
             whole = _again(studied, copies.of_grid(whole), ours.size)
         add(BEST, generation, whole.grid.count, of_source(studied, lambda: (whole.size, whole.source)))  # noqa: B023
@@ -131,12 +131,10 @@ def generations(studied: StudyScene, path: PruneRounds, ours: Whole, amounts: Am
 
 def _again(studied: StudyScene, source: SceneSource, size: int) -> Whole:
     """The measured method on a scene, to so many bytes, as `compress` does it."""
-    workspace, target = studied.workspace, MaxSize(size + SETTINGS_MOST, studied.plan.figure)
-    renderer, budget = workspace.renderer, workspace.budget
+    target = MaxSize(size + SETTINGS_MOST, studied.plan.figure)
+    run, coder = studied.run.of_source(source).aimed_at(target), GridCoder(studied.bench.renderer)
     # The limit has room for settings, as every search counts them.
-    found = kept_as_it_is(
-        GridCoder(renderer), renderer, source, studied.judge, target, studied.options, budget, lambda result: None
-    )
+    found = kept_as_it_is(run, studied.bench, coder, studied.judge, settings_known=False)
     if found is not None:
         grid, _ = found
         return Whole(grid, coded_size(grid, {}), 0.0, np.arange(grid.count), 0, True)
@@ -145,16 +143,15 @@ def _again(studied: StudyScene, source: SceneSource, size: int) -> Whole:
 
 
 def _evaluator(studied: StudyScene, source: SceneSource, order: np.ndarray, setting: Setting) -> SceneEvaluator:
-    workspace = studied.workspace
     return SceneEvaluator(
         source,
         order,
         nonzero_sh(source),
         setting.bits,
         setting.groups,
-        workspace.renderer,
+        studied.bench.renderer,
         studied.judge,
-        workspace.budget,
+        studied.run.budget,
     )
 
 
@@ -163,12 +160,14 @@ def _paper_in_a_row(studied: StudyScene, copies: Copies) -> tuple[int, Outcome]:
     size = studied.size(last)
     first = studied.adapt(MaxSize(int(FIRST_TIMES * size), studied.plan.figure)).chosen.choice
     source = copies.of_choice(studied.evaluator(Setting(first)), first)
-    renderer = studied.workspace.renderer
+    renderer = studied.bench.renderer
     with renderer.load(source) as scene:
         order = order_from_scores(score_scene(renderer, scene, source, studied.views.of(studied.views.train)))
     renderer.release()
     evaluator = _evaluator(studied, source, order, last)
-    found = adapt(evaluator, MaxSize(size, studied.plan.figure), studied.options.effort, best_effort=True).chosen.choice
+    found = adapt(
+        evaluator, MaxSize(size, studied.plan.figure), studied.run.options.effort, best_effort=True
+    ).chosen.choice
     return evaluator.counts(found)[0], of_choice(studied, lambda: evaluator, found)
 
 

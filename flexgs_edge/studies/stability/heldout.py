@@ -53,8 +53,8 @@ def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amo
             whole[HELD] = search(studied, path, WorstToo(studied.target, limit, studied.target.figure))
     rows = []
     train = evenly(studied.views.of(studied.views.train), len(cameras))
-    renderer = studied.workspace.renderer
-    with renderer.load(studied.scene.source) as scene:
+    renderer = studied.bench.renderer
+    with renderer.load(studied.run.source) as scene:
         originals = [renderer.render(scene, camera) for camera in train]
     for name in (*contenders.names, *whole):
         loaded = renderer.load(whole[name].source) if name in whole else contenders.loaded(name)
@@ -95,19 +95,18 @@ def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amo
 
 
 def _decided_on_even(studied: StudyScene, path: PruneRounds) -> Whole:
-    workspace, source = studied.workspace, studied.scene.source
+    source = studied.run.source
     judge = Judge(
-        workspace.renderer,
+        studied.bench,
         source,
         studied.views,
         studied.judge.indices[::2],
-        workspace.budget,
         studied.plan.figure == "drop",
-        studied.options.base_psnr,
+        studied.run.options.base_psnr,
     )
     try:
-        with workspace.renderer.load(source) as original:
-            judge.prepare(original, studied.progress)
+        with studied.bench.renderer.load(source) as original:
+            judge.prepare(original, studied.run.progress)
         return search(studied, path, studied.target, judge)
     finally:
         judge.close()

@@ -34,6 +34,7 @@ from flexgs_edge.studies.stability.moved_scene import NO_TURN, Similarity
 from flexgs_edge.studies.stability.ours import Whole, scored_pixels, walked, whole_at
 from flexgs_edge.studies.stability.unseen_poses import evenly
 from flexgs_edge.studies.study_scene import StudyScene
+from flexgs_edge.views.bench import Bench
 
 AWAY = np.array([0.6, -0.64, 0.48])
 """Direction of the moves: along no axis."""
@@ -97,21 +98,22 @@ class Place:
         cameras = [move.camera(camera) for camera in (*train, *judges)]
         places = list(range(len(cameras)))
         self.views = ViewSet(cameras, None, places[: len(train)], places[len(train) :], "moved", None)
-        options, workspace = studied.options, studied.workspace
+        options = studied.run.options
         assert options.near is not None and options.background is not None and options.extent is not None
         self.renderer = Renderer(
-            workspace.backend,
-            workspace.budget,
+            studied.bench.renderer.backend,
+            studied.run.budget,
             options.near * move.factor,
             options.background,
             options.extent,
             bool(options.antialiased),
         )
+        self.bench = Bench(self.renderer)
 
     @contextmanager
     def judge(self) -> Iterator[Judge]:
         """The judge of this place, with the renders of the moved original."""
-        judge = Judge(self.renderer, self.source, self.views, self.views.held_out, self.studied.workspace.budget)
+        judge = Judge(self.bench, self.source, self.views, self.views.held_out)
         try:
             with self.renderer.load(self.source) as original:
                 judge.prepare(original)
@@ -123,7 +125,7 @@ class Place:
     def best(self, judge: Judge, price: float) -> Found:
         """The measured method where a bit is worth so much squared error of each pixel that is scored."""
         train = self.views.of(self.views.train)
-        with walked(self.studied, self.source, train, self.renderer) as path:
+        with walked(self.studied, self.source, train, self.bench) as path:
             whole = whole_at(self.studied, path, judge, price * scored_pixels(path))
         return Found(whole.rows, whole.size, self._fidelity(judge, whole.source))
 
@@ -133,10 +135,10 @@ class Place:
         with self.renderer.load(self.source) as scene:
             order = order_from_scores(score_scene(self.renderer, scene, self.source, train))
         has_sh = nonzero_sh(self.source)
-        bits, groups = self.studied.options.bit_spec()
+        bits, groups = self.studied.run.options.bit_spec()
         assert bits is not None
         evaluator = SceneEvaluator(
-            self.source, order, has_sh, bits, groups, self.renderer, judge, self.studied.workspace.budget
+            self.source, order, has_sh, bits, groups, self.renderer, judge, self.studied.run.budget
         )
         rows = np.sort(np.concatenate(select_rows(ranks_from_order(order), choice, has_sh)))
         return Found(rows, evaluator.size(choice), evaluator.measure(choice).fidelity)
@@ -165,10 +167,10 @@ def moves(studied: StudyScene, ours: Whole, amounts: Amounts, folder: Path) -> E
     names = (AS_IT_IS, *amounts.moves)
     still: dict[str, Found] = {}
     pictures: list[np.ndarray] = []
-    for name in studied.progress.track(names, "moves", len(names)):
+    for name in studied.run.progress.track(names, "moves", len(names)):
         move, wide = MOVES[name]
         path = folder / "moved.ply"
-        place = Place(studied, move, moved_file(studied.scene.source, move, wide, path), amounts)
+        place = Place(studied, move, moved_file(studied.run.source, move, wide, path), amounts)
         with place.judge() as judge:
             seen = [judge.original(i).copy() for i in range(len(judge.cameras))]
             pictures = pictures or seen

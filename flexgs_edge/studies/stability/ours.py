@@ -22,6 +22,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import MemorySource, SceneSource
 from flexgs_edge.studies.study_scene import StudyScene
+from flexgs_edge.views.bench import Bench
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,22 +70,14 @@ def walked(
     studied: StudyScene,
     source: SceneSource,
     cameras: Sequence[Camera],
-    renderer: Renderer | None = None,
+    bench: Bench | None = None,
     margin: bool = False,
 ) -> Iterator[PruneRounds]:
     """The path of prune and rescore over some poses (`margin`: and made ones), for as many searches as wanted."""
-    workspace, options = studied.workspace, replace(studied.options, views_margin=margin)
-    renderer = renderer or workspace.renderer
-    with open_rounds(
-        renderer,
-        source,
-        scored_poses(cameras, options, renderer, source).cameras,
-        options,
-        workspace.budget,
-        workspace.clock,
-        studied.progress,
-    ) as path:
-        yield path
+    options, bench = replace(studied.run.options, views_margin=margin), bench or studied.bench
+    run = replace(studied.run.of_source(source), options=options)
+    with open_rounds(run, bench, scored_poses(cameras, options, bench.renderer, source).cameras) as rounds:
+        yield rounds
 
 
 def scored_pixels(path: PruneRounds) -> int:
@@ -96,7 +89,7 @@ def search(studied: StudyScene, path: PruneRounds, target: Target, judge: Judge 
     """The search for a target along a path; the closest result where it cannot be met."""
     judge = judge or studied.judge
     made = _search(studied, path, judge, path.renderer)
-    with studied.workspace.clock.stage("search"):
+    with studied.run.clock.stage("search"):
         found = made.run(target, best_effort=True)
     multiplier = found.chosen.multiplier
     return _whole(made, found.product, multiplier, found.reached)
@@ -105,7 +98,7 @@ def search(studied: StudyScene, path: PruneRounds, target: Target, judge: Judge 
 def whole_at(studied: StudyScene, path: PruneRounds, judge: Judge, multiplier: float) -> Whole:
     """The whole result at a multiplier, without a search."""
     made = _search(studied, path, judge, path.renderer)
-    with studied.workspace.clock.stage("search"):
+    with studied.run.clock.stage("search"):
         grid = made.at(multiplier)
     return _whole(made, grid, multiplier, True)
 
@@ -115,7 +108,7 @@ def _search(studied: StudyScene, path: PruneRounds, judge: Judge, renderer: Rend
         with renderer.load(MemorySource(planes, origin=path.origin)) as scene:
             return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))
 
-    options = replace(studied.options, refit=True)
+    options = replace(studied.run.options, refit=True)
     made = grid_search(options, GridCoder(renderer), FixedSearch)(path, measure, lambda step: None)
     assert isinstance(made, FixedSearch)
     return made

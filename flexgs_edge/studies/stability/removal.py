@@ -40,7 +40,7 @@ from flexgs_edge.studies.stability.breaks import (
     where_it_breaks,
 )
 from flexgs_edge.studies.stability.ours import Whole, search, walked
-from flexgs_edge.studies.study_scene import StudyScene, Setting
+from flexgs_edge.studies.study_scene import Setting, StudyScene
 
 SCORES = ("random", "opacity", "volume", "gs", "meson", "dSE")
 SH_ONLY, BEST = "SH only", "best's path"
@@ -50,11 +50,11 @@ HEADS = {"scores": "scored", "same": "loss on the same half (dB)", "other": "los
 def pruning(studied: StudyScene, path: PruneRounds, amounts: Amounts) -> Experiment:
     """Shares of the Gaussians removed by each score, and shares that lose their SH; 16 bits stand for untouched values."""
     costs = path.snapshots[0]
-    removal = np.full(studied.scene.source.count, -np.inf)
+    removal = np.full(studied.run.source.count, -np.inf)
     removal[path.rows[costs.rows]] = costs.costs.removal
     add_plain_orders(studied, removal)
     rows: list[dict[str, Cell]] = []
-    for score in studied.progress.track(SCORES, "pruning", len(SCORES)):
+    for score in studied.run.progress.track(SCORES, "pruning", len(SCORES)):
         for share in amounts.pruned:
             found = of_setting(studied, Setting(Choice(share, 0), FINE, score=score))
             rows.append({"method": score, "share": share / 1000, **found.cells(studied)})
@@ -91,8 +91,8 @@ def pruning(studied: StudyScene, path: PruneRounds, amounts: Amounts) -> Experim
 
 def _path_rows(studied: StudyScene, path: PruneRounds, most: int) -> list[dict[str, Cell]]:
     """The snapshots of the path, until so many thousandths are gone."""
-    keep = EFFORTS[studied.options.effort].keep
-    count = studied.scene.source.count
+    keep = EFFORTS[studied.run.options.effort].keep
+    count = studied.run.source.count
     while path.snapshots[-1].count > (1 - most / 1000) * count and path.snapshots[-1].count > 16:
         path.descend(keep)
     rows: list[dict[str, Cell]] = []
@@ -207,7 +207,7 @@ def halves(studied: StudyScene, ours: Whole) -> Experiment | None:
             found = of_choice(studied, lambda: evaluator, choice)  # noqa: B023
             assert found.quality is not None
             add(f"paper, {score}", scored, found.quality.views)
-    with walked(studied, studied.scene.source, some) as path:
+    with walked(studied, studied.run.source, some) as path:
         half = search(studied, path, MaxSize(ours.size + SETTINGS_MOST, studied.plan.figure))
     for scored, whole in (("all", ours), ("one half", half)):
         found = of_source(studied, lambda: (whole.size, whole.source))  # noqa: B023
@@ -249,20 +249,26 @@ def _one_side(rows: Sequence[Row], method: str) -> str:
 
 
 def _score(studied: StudyScene, score: str, cameras: Sequence[Camera]) -> np.ndarray:
-    renderer, source = studied.workspace.renderer, studied.scene.source
+    renderer, source = studied.bench.renderer, studied.run.source
     with renderer.load(source) as scene:
         if score == "gs":
-            values = score_scene(renderer, scene, source, cameras, "gs", studied.progress)
+            values = score_scene(renderer, scene, source, cameras, "gs", studied.run.progress)
         else:
-            values = measure_costs(renderer, scene, cameras, sh_costs=False, progress=studied.progress).removal
+            values = measure_costs(studied.bench, scene, cameras, sh_costs=False, progress=studied.run.progress).removal
     renderer.release()
     return order_from_scores(values)
 
 
 def _ranked(studied: StudyScene, order: np.ndarray) -> SceneEvaluator:
-    bits, groups = studied.options.bit_spec()
+    bits, groups = studied.run.options.bit_spec()
     assert isinstance(bits, BitSpec)
-    workspace = studied.workspace
     return SceneEvaluator(
-        studied.scene.source, order, studied.has_sh, bits, groups, workspace.renderer, studied.judge, workspace.budget
+        studied.run.source,
+        order,
+        studied.has_sh,
+        bits,
+        groups,
+        studied.bench.renderer,
+        studied.judge,
+        studied.run.budget,
     )

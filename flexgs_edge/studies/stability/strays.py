@@ -81,7 +81,7 @@ def strays_of(planes: dict[str, np.ndarray], size: float, direction: np.ndarray)
 
 def strays(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
     """Quantizers with and without strays; the strays are part of what is coded, and in no view."""
-    source = studied.scene.source
+    source = studied.run.source
     planes = source.read(slice(0, source.count), list(FIELD))
     cameras = [camera.moved(source.origin) for camera in studied.views.cameras]
     rows: list[dict[str, Cell]] = []
@@ -125,15 +125,16 @@ def strays(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
 def _coded(
     studied: StudyScene, ours: Whole, planes: dict[str, np.ndarray], added: dict[str, np.ndarray] | None
 ) -> list[tuple[str, Outcome]]:
-    origin = studied.scene.source.origin
+    origin = studied.run.source.origin
     whole = planes if added is None else _joined(planes, added)
-    source = MemorySource(whole, studied.scene.source.sh_degree, origin)
+    source = MemorySource(whole, studied.run.source.sh_degree, origin)
     has_sh = np.concatenate([studied.has_sh, np.ones(source.count - len(studied.has_sh), bool)])
-    workspace = studied.workspace
 
     def evaluator(bits: BitSpec, groups: int | None) -> SceneEvaluator:
         order = np.arange(source.count)
-        return SceneEvaluator(source, order, has_sh, bits, groups, workspace.renderer, studied.judge, workspace.budget)
+        return SceneEvaluator(
+            source, order, has_sh, bits, groups, studied.bench.renderer, studied.judge, studied.run.budget
+        )
 
     rtn = BitSpec.rtn(BITS)
     return [

@@ -112,8 +112,8 @@ _INTRO = (
 
 
 def _experiments(studied: StudyScene, amounts: Amounts, folder: Path) -> list[Experiment]:
-    source, train = studied.scene.source, studied.views.of(studied.views.train)
-    studied.workspace.budget.require(
+    source, train = studied.run.source, studied.views.of(studied.views.train)
+    studied.run.budget.require(
         "copies of the scene", COPIES * source.count * sum(4 * source.width(name) for name in FIELD)
     )
     temporary = tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder)
@@ -125,20 +125,26 @@ def _experiments(studied: StudyScene, amounts: Amounts, folder: Path) -> list[Ex
             return _along_the_path(studied, path, guarded, amounts, Path(place))
 
 
-def _along_the_path(studied: StudyScene, path: PruneRounds, guarded: Whole, amounts: Amounts, place: Path) -> list[Experiment]:
+def _along_the_path(
+    studied: StudyScene, path: PruneRounds, guarded: Whole, amounts: Amounts, place: Path
+) -> list[Experiment]:
     made: list[Experiment] = []
 
     @contextmanager
     def part(name: str) -> Iterator[None]:
         LOG.info("%s: %s", studied.name, name)
-        with studied.workspace.clock.stage(name):
+        with studied.run.clock.stage(name):
             yield
 
     with part("results at the target"):
         ours = search(studied, path, studied.target)
         contenders = Contenders(studied, ours, guarded)
     with part("bits"):
-        made += [bits.rounding(studied, ours, amounts), bits.groups(studied, ours, amounts), strays(studied, ours, amounts)]
+        made += [
+            bits.rounding(studied, ours, amounts),
+            bits.groups(studied, ours, amounts),
+            strays(studied, ours, amounts),
+        ]
     with part("views"):
         made.append(removal.views(studied, amounts))
         if amounts.halves and (sides := removal.halves(studied, ours)) is not None:

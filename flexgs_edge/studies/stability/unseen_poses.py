@@ -68,7 +68,7 @@ def make_poses(studied: StudyScene, amounts: Amounts) -> list[Poses]:
     """All sets, the training poses first."""
     train = studied.views.of(studied.views.train)
     base = evenly(studied.judge.cameras, amounts.poses)
-    depths = visible_depths(studied.workspace.renderer, studied.scene.source, base)
+    depths = visible_depths(studied.bench.renderer, studied.run.source, base)
     near = [min(train, key=lambda other: float(np.linalg.norm(other.center - camera.center))) for camera in base]
     made = [Poses(TRAINING, None, evenly(train, amounts.poses)), Poses(HELD_OUT, None, base)]
     made += [
@@ -113,8 +113,8 @@ class Seen:
 
 def look(studied: StudyScene, contenders: Contenders, cameras: Sequence[Camera]) -> dict[str, Seen]:
     """Every contender against the original over some views."""
-    renderer = studied.workspace.renderer
-    with renderer.load(studied.scene.source) as scene:
+    renderer = studied.bench.renderer
+    with renderer.load(studied.run.source) as scene:
         originals = [renderer.render(scene, camera) for camera in cameras]
     found = {}
     for name in contenders.names:
@@ -134,7 +134,7 @@ def poses(studied: StudyScene, contenders: Contenders, amounts: Amounts) -> list
     rows: list[dict[str, Cell]] = []
     base: dict[str, float] = {}
     every = make_poses(studied, amounts)
-    for made in studied.progress.track(every, "poses", len(every)):
+    for made in studied.run.progress.track(every, "poses", len(every)):
         for name, seen in look(studied, contenders, made.cameras).items():
             cells = seen.cells()
             # Identical pictures have no fidelity: nothing is below it, and it is below nothing.

@@ -34,8 +34,8 @@ GOLDEN = Path(__file__).parents[2] / "golden"
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> int:
     """Chunks of 64 rows, so that many chunks cost little (the format's constant is checked by the golden file)."""
-    for module in ("layout", "container", "source"):
-        monkeypatch.setattr(f"flexgs_edge.codec.{module}.CHUNK_ROWS", 64)
+    for module in ("header", "container", "packed_source"):
+        monkeypatch.setattr(f"flexgs_edge.codec.v1.{module}.CHUNK_ROWS", 64)
     return 64
 
 

@@ -29,8 +29,8 @@ def grid() -> GridScene:
 
 
 def use_threads(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
-    for module in ("coder", "grid_source"):
-        monkeypatch.setattr(f"flexgs_edge.codec.{module}.thread_count", lambda chunks: min(threads, chunks))
+    for module in ("encode", "grid_source"):
+        monkeypatch.setattr(f"flexgs_edge.codec.v2.{module}.thread_count", lambda chunks: min(threads, chunks))
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

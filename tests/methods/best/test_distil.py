@@ -25,6 +25,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.references import References
 from kernel_fixtures import large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
@@ -42,7 +43,7 @@ def view(seed: int, width: int = 45, height: int = 37) -> Camera:
     return make_camera(width, height, rotation=rotation, translation=translation, name=f"v{seed}")
 
 
-class Bench:
+class Workshop:
     """A scene, the largest of its Gaussians, and poses to learn from."""
 
     def __init__(self, form: str = "w16") -> None:
@@ -84,40 +85,42 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    made = Bench()
+def workshop() -> Iterator[Workshop]:
+    made = Workshop()
     yield made
     made.close()
 
 
-def test_a_descent_gets_closer_than_a_refit_of_colours(bench: Bench) -> None:
-    shared = (bench.degrees, np.zeros(3), bench.cameras, bench.targets)
-    refitted = refit_colours(bench.renderer, bench.kept, *shared, rounds=4, subsets=2)
-    before, refit, short, long = map(bench.fidelity, (bench.kept, refitted, bench.distil(12), bench.distil(360)))
+def test_a_descent_gets_closer_than_a_refit_of_colours(workshop: Workshop) -> None:
+    shared = (workshop.degrees, np.zeros(3), workshop.cameras, workshop.targets)
+    refitted = refit_colours(Bench(workshop.renderer), workshop.kept, *shared, rounds=4, subsets=2)
+    before, refit, short, long = map(
+        workshop.fidelity, (workshop.kept, refitted, workshop.distil(12), workshop.distil(360))
+    )
     assert long > refit + 2 > before + 4 and long > short > before, (before, refit, short, long)
 
 
-def test_rows_keep_their_places_and_degrees(bench: Bench) -> None:
-    moved = bench.distil(2)
-    assert same_bits(moved["sh_rest"], bench._without_higher(moved["sh_rest"]))
+def test_rows_keep_their_places_and_degrees(workshop: Workshop) -> None:
+    moved = workshop.distil(2)
+    assert same_bits(moved["sh_rest"], workshop._without_higher(moved["sh_rest"]))
     for name in ("means", "log_scales", "opacity_logits", "sh_dc"):
         # Nobody sees it; and two steps take no value far from where it was.
-        assert name == "log_scales" or same_bits(moved[name][:, :1], bench.kept[name][:, :1])
-        distance = abs(np.sort(moved[name], axis=0) - np.sort(bench.kept[name], axis=0)).max()
+        assert name == "log_scales" or same_bits(moved[name][:, :1], workshop.kept[name][:, :1])
+        distance = abs(np.sort(moved[name], axis=0) - np.sort(workshop.kept[name], axis=0)).max()
         assert 0 < distance < 3 * RATES[name], name
     norms = np.square(moved["quats"]).sum(axis=0)
     assert abs(norms - 1).max() < 0.01
 
 
-def test_steps_on_the_grid_repair_it(bench: Bench) -> None:
-    blind, aware = bench.distil(120), bench.distil(180, STEPS)  # 120 of them before the grid
-    assert bench.fidelity(bench.rounded(aware)) > bench.fidelity(bench.rounded(blind)) + 0.2
+def test_steps_on_the_grid_repair_it(workshop: Workshop) -> None:
+    blind, aware = workshop.distil(120), workshop.distil(180, STEPS)  # 120 of them before the grid
+    assert workshop.fidelity(workshop.rounded(aware)) > workshop.fidelity(workshop.rounded(blind)) + 0.2
 
 
-def test_every_run_and_width_gives_the_same_bits(bench: Bench) -> None:
-    first = bench.distil(5, STEPS)
+def test_every_run_and_width_gives_the_same_bits(workshop: Workshop) -> None:
+    first = workshop.distil(5, STEPS)
     for form in ("w16", "w4", "numpy"):
-        other = Bench(form)
+        other = Workshop(form)
         again = other.distil(5, STEPS)
         other.close()
         assert all(same_bits(first[name], again[name]) for name in first), form
@@ -131,24 +134,29 @@ def test_each_view_comes_once_in_each_round() -> None:
     assert not same_bits(order[:7], order[7:14])
 
 
-def test_parts_of_a_descent(bench: Bench) -> None:
+def test_parts_of_a_descent(workshop: Workshop) -> None:
     assert [len(part) for part in Schedule(8).parts(True)] == [4, 2, 2]
     assert [len(part) for part in Schedule(8).parts(False)] == [8, 0, 0]
-    moving, held = bench.distil(9, STEPS, on_grid=0.0, holding=1 / 3), bench.distil(3, STEPS, on_grid=0.0, holding=1.0)
+    moving, held = (
+        workshop.distil(9, STEPS, on_grid=0.0, holding=1 / 3),
+        workshop.distil(3, STEPS, on_grid=0.0, holding=1.0),
+    )
     for name in moving:
         assert same_bits(moving[name], held[name]) == (name in HELD), name
 
 
-def test_too_little_memory_is_said_and_leaves_nothing_taken(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_is_said_and_leaves_nothing_taken(
+    workshop: Workshop, monkeypatch: pytest.MonkeyPatch
+) -> None:
     use_fit(monkeypatch, pairs=1 << 10)
     use_fit(monkeypatch, least_rows=16)
-    shared = (bench.degrees, np.zeros(3), bench.cameras, bench.targets)
+    shared = (workshop.degrees, np.zeros(3), workshop.cameras, workshop.targets)
     refused = []
     for limit in range(200_000, 4_000_000, 50_000):
         budget = MemoryBudget(limit)
         renderer = Renderer(TwinBackend(budget), budget)
         try:
-            distil(renderer, bench.kept, *shared, Schedule(1))
+            distil(renderer, workshop.kept, *shared, Schedule(1))
         except BudgetError as error:
             refused.append(str(error))
         else:

@@ -299,7 +299,7 @@ def test_nothing_is_left_behind(project: Path, tmp_path: Path, monkeypatch: pyte
     def stop(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flexgs_edge.commands.compress.open_fgs", stop)  # after the file has been written
+    monkeypatch.setattr("flexgs_edge.methods.best.method.open_fgs", stop)  # after the file has been written
     with pytest.raises(KeyboardInterrupt):
         compress(project / "point_cloud.ply", tmp_path / "a.fgs", force=True, min_fidelity=30.0, **TINY)
     assert [path.name for path in tmp_path.iterdir()] == ["a.fgs"]

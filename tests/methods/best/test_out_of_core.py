@@ -16,13 +16,13 @@ import pytest
 
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.commands import compress as compress_module
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.constants import CULLED
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.storage import ScratchStorage
+from flexgs_edge.methods.best import method as best_method
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.rounds import sum_row_bytes
@@ -35,6 +35,7 @@ from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.references import References
 from kernel_fixtures import FORMS, large_budget, open_form
 from synthetic import joined, look_from, make_camera, random_scene
@@ -68,14 +69,14 @@ def found_by(form: str, storage: ScratchStorage | None) -> dict[str, np.ndarray]
         assert (scene.shown is not None) == (storage is not None)
     found |= {"hits": statistics.hits, "weights": statistics.weights}
     with drawer.load(SCENE, 100) as scene, References() as targets:
-        costs = measure_costs(drawer, scene, cameras())
+        costs = measure_costs(Bench(drawer), scene, cameras())
         found |= {name: getattr(costs, name) for name in ("removal", "weight2", "sh", "sh_mean")}
         planes = SCENE.read(slice(0, SCENE.count), list(FIELD))
         for view, camera in enumerate(cameras()):
             targets.add(view, drawer.render_planes(scene, camera))
         planes["sh_dc"] = planes["sh_dc"] + np.float32(0.1)
         degrees = np.arange(SCENE.count) % 3
-        moved = refit_colours(drawer, planes, degrees, SCENE.origin, cameras(), targets, 2, subsets=2)
+        moved = refit_colours(Bench(drawer), planes, degrees, SCENE.origin, cameras(), targets, 2, subsets=2)
     drawer.release()
     return {**found, "moved": moved["sh_dc"], "rest": moved["sh_rest"]}
 
@@ -120,8 +121,8 @@ def test_sums_of_a_chunk_take_the_place_of_a_view(
             budget.limit = held + limit
             try:
                 with drawer.load(SCENE, sum_row_bytes(SCENE.sh_degree), view_sums=2) as scene:
-                    measure_costs(drawer, scene, views)
-                refit_colours(drawer, planes, degrees, SCENE.origin, views, targets, 1)
+                    measure_costs(Bench(drawer), scene, views)
+                refit_colours(Bench(drawer), planes, degrees, SCENE.origin, views, targets, 1)
                 drawn.append(limit)
             except BudgetError as error:
                 assert not drawn and "a view" in str(error)
@@ -264,11 +265,11 @@ def spilled(compact: None, monkeypatch: pytest.MonkeyPatch) -> list[ScratchStora
     """Every scene goes to scratch files, however small."""
     rooms: list[ScratchStorage] = []
 
-    def choose(renderer: Any, source: Any, cameras: Any, options: Any, budget: Any, folder: Path) -> ScratchStorage:
+    def choose(run: Any, renderer: Any, cameras: Any, folder: Path) -> ScratchStorage:
         rooms.append(ScratchStorage(folder))
         return rooms[-1]
 
-    monkeypatch.setattr(compress_module, "choose_room", choose)
+    monkeypatch.setattr(best_method, "choose_storage", choose)
     monkeypatch.setattr("flexgs_edge.memory.storage._SMALL", 1)
     return rooms
 

@@ -17,6 +17,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.references import References
 from kernel_fixtures import large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
@@ -58,7 +59,7 @@ def perturbed(planes: Planes, seed: int = 52) -> Planes:
     }
 
 
-class Bench:
+class Workshop:
     """A renderer, poses and the original's renders."""
 
     def __init__(self, planes: Planes, views: int = 6, form: str = "w16") -> None:
@@ -85,51 +86,51 @@ class Bench:
         count = planes["means"].shape[1]
         degrees = np.broadcast_to(np.asarray(degrees, np.uint8), count)
         return refit_colours(
-            self.renderer, planes, degrees, np.zeros(3), self.cameras, self.targets, rounds, bands, subsets
+            Bench(self.renderer), planes, degrees, np.zeros(3), self.cameras, self.targets, rounds, bands, subsets
         )
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_every_round_gets_closer(degree: int) -> None:
     planes = bright_planes(degree)
-    bench = Bench(planes)
+    workshop = Workshop(planes)
     wrong = perturbed(planes)
-    fidelity = [bench.fidelity(bench.refit(wrong, degree, rounds)) for rounds in range(5)]
+    fidelity = [workshop.fidelity(workshop.refit(wrong, degree, rounds)) for rounds in range(5)]
     assert (np.diff(fidelity) > 0.1).all(), fidelity
     assert fidelity[-1] > fidelity[0] + (5 if degree == 0 else 3), fidelity
 
 
 def test_steps_after_parts_of_the_poses_get_closer_than_one_after_all() -> None:
     planes = bright_planes(1)
-    bench = Bench(planes)
+    workshop = Workshop(planes)
     wrong = perturbed(planes)
-    one, three = bench.refit(wrong, 1, 1), bench.refit(wrong, 1, 1, subsets=3)
-    assert bench.fidelity(three) > bench.fidelity(one) + 0.5
-    most = bench.refit(wrong, 1, 1, subsets=len(bench.cameras))
-    assert same_bits(bench.refit(wrong, 1, 1, subsets=99)["sh_dc"], most["sh_dc"])
+    one, three = workshop.refit(wrong, 1, 1), workshop.refit(wrong, 1, 1, subsets=3)
+    assert workshop.fidelity(three) > workshop.fidelity(one) + 0.5
+    most = workshop.refit(wrong, 1, 1, subsets=len(workshop.cameras))
+    assert same_bits(workshop.refit(wrong, 1, 1, subsets=99)["sh_dc"], most["sh_dc"])
 
 
 def test_the_constant_alone_gets_closer_too() -> None:
     planes = bright_planes(2)
-    bench = Bench(planes)
+    workshop = Workshop(planes)
     wrong = perturbed(planes)
-    once, twice = (bench.refit(wrong, 2, rounds, bands=False) for rounds in (1, 2))
+    once, twice = (workshop.refit(wrong, 2, rounds, bands=False) for rounds in (1, 2))
     assert same_bits(once["sh_rest"], wrong["sh_rest"]) and not same_bits(once["sh_dc"], wrong["sh_dc"])
-    assert bench.fidelity(twice) > bench.fidelity(once) + 0.1 > bench.fidelity(wrong) + 1
+    assert workshop.fidelity(twice) > workshop.fidelity(once) + 0.1 > workshop.fidelity(wrong) + 1
 
 
 def test_a_lone_splat_comes_back_by_the_same_share_each_round() -> None:
     """SIRT of one unknown: the error shrinks by 1 - sum(w^2) / sum(w), known from the weights."""
     planes = bright_planes(0, 1)
-    bench = Bench(planes)
+    workshop = Workshop(planes)
     wrong = {**planes, "sh_dc": planes["sh_dc"] + np.array([[0.3], [-0.2], [0.1]], np.float32)}
-    left = [bench.refit(wrong, 0, rounds)["sh_dc"] - planes["sh_dc"] for rounds in range(4)]
+    left = [workshop.refit(wrong, 0, rounds)["sh_dc"] - planes["sh_dc"] for rounds in range(4)]
     weight = weight2 = 0.0
-    with bench.renderer.load(MemorySource(planes)) as scene:
+    with workshop.renderer.load(MemorySource(planes)) as scene:
         statistics = Statistics.zeros(1)
-        for camera in bench.cameras:
-            bench.renderer.add_statistics(scene, camera, statistics)
-            sums = bench.renderer.read_sums(bench.renderer.removal_sums(scene, camera), 2, 1)
+        for camera in workshop.cameras:
+            workshop.renderer.add_statistics(scene, camera, statistics)
+            sums = workshop.renderer.read_sums(workshop.renderer.removal_sums(scene, camera), 2, 1)
             weight2 += sums[1, 0] / FIXED_ERROR
         weight = statistics.weight_sums[0]
     for before, after in zip(left, left[1:]):
@@ -139,22 +140,22 @@ def test_a_lone_splat_comes_back_by_the_same_share_each_round() -> None:
 @pytest.mark.parametrize("degree", [0, 2])
 def test_nothing_moves_at_the_optimum(degree: int) -> None:
     planes = bright_planes(degree)
-    bench = Bench(planes)
-    again = bench.refit(planes, degree, 3)
+    workshop = Workshop(planes)
+    again = workshop.refit(planes, degree, 3)
     # The targets are in half precision: 2^-11 of a colour near 1.
     assert np.abs(again["sh_dc"] - planes["sh_dc"]).max() < 5e-3
     assert np.abs(again["sh_rest"] - planes["sh_rest"]).max(initial=0) < 5e-3
-    assert bench.fidelity(again) > 65
+    assert workshop.fidelity(again) > 65
 
 
 def test_what_is_given_is_not_changed() -> None:
     planes = perturbed(bright_planes(1))
     copies = {name: values.copy() for name, values in planes.items()}
-    bench = Bench(bright_planes(1))
-    found = bench.refit(planes, 1, 2)
+    workshop = Workshop(bright_planes(1))
+    found = workshop.refit(planes, 1, 2)
     assert all(same_bits(planes[name], copies[name]) for name in planes)
     assert all(found[name] is planes[name] for name in ("means", "log_scales", "quats", "opacity_logits"))
-    nothing = bench.refit(planes, 1, 0)
+    nothing = workshop.refit(planes, 1, 0)
     assert same_bits(nothing["sh_dc"], planes["sh_dc"]) and same_bits(nothing["sh_rest"], planes["sh_rest"])
 
 
@@ -162,9 +163,9 @@ def test_unseen_rows_are_left_alone() -> None:
     planes = bright_planes(1)
     unseen = [3, 50, COUNT - 1]
     planes["means"][:, unseen] = [[900.0], [0.0], [-50.0]]
-    bench = Bench(planes)
+    workshop = Workshop(planes)
     wrong = perturbed(planes)
-    found = bench.refit(wrong, 1, 3)
+    found = workshop.refit(wrong, 1, 3)
     for name in ("sh_dc", "sh_rest"):
         assert same_bits(found[name][:, unseen], wrong[name][:, unseen])
         assert (found[name] != wrong[name]).any(axis=0).sum() > COUNT // 2
@@ -173,27 +174,27 @@ def test_unseen_rows_are_left_alone() -> None:
 
 def test_each_row_keeps_its_degree() -> None:
     planes = bright_planes(3)
-    bench = Bench(planes)
+    workshop = Workshop(planes)
     degrees = np.random.default_rng(53).integers(0, 4, COUNT).astype(np.uint8)
     bare = {**planes, "sh_rest": planes["sh_rest"].reshape(3, 15, COUNT).copy()}
     bands = np.array([1] * 3 + [2] * 5 + [3] * 7)
     bare["sh_rest"] *= degrees >= bands[:, None]
     bare["sh_rest"] = bare["sh_rest"].reshape(45, COUNT)
-    found = bench.refit(bare, degrees, 3)
+    found = workshop.refit(bare, degrees, 3)
     rest = found["sh_rest"].reshape(3, 15, COUNT)
     assert (rest[:, degrees < bands[:, None]] == 0).all()
     moved = (found["sh_rest"] != bare["sh_rest"]).reshape(3, 15, COUNT).any(axis=0)
     for degree in (1, 2, 3):
         band = moved[sh_rest_count(degree - 1) : sh_rest_count(degree)]
         assert band[:, degrees >= degree].mean() > 0.5 and not band[:, degrees < degree].any()
-    assert bench.fidelity(found) > bench.fidelity(bare) + 0.5
+    assert workshop.fidelity(found) > workshop.fidelity(bare) + 0.5
 
 
 def test_the_same_bits_every_time_on_every_form(monkeypatch: pytest.MonkeyPatch) -> None:
     use_fit(monkeypatch, pairs=1 << 14)
     planes, found = bright_planes(2, 60), []
     for form in ("w16", "w16", "w4", "gpu", "numpy"):
-        found.append(Bench(planes, 2, form).refit(perturbed(planes), 2, 2))
+        found.append(Workshop(planes, 2, form).refit(perturbed(planes), 2, 2))
     for other in found[1:]:
         assert same_bits(other["sh_dc"], found[0]["sh_dc"]) and same_bits(other["sh_rest"], found[0]["sh_rest"])
 
@@ -201,26 +202,26 @@ def test_the_same_bits_every_time_on_every_form(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize("rows", [7, 64])
 def test_chunks_and_batches_change_nothing(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     planes = bright_planes(1, 128)
-    expected = Bench(planes, 2).refit(perturbed(planes), 1, 2)
+    expected = Workshop(planes, 2).refit(perturbed(planes), 1, 2)
     use_fit(monkeypatch, chunk_rows=rows)
     use_fit(monkeypatch, pairs=1)
-    found = Bench(planes, 2).refit(perturbed(planes), 1, 2)
+    found = Workshop(planes, 2).refit(perturbed(planes), 1, 2)
     assert same_bits(found["sh_dc"], expected["sh_dc"]) and same_bits(found["sh_rest"], expected["sh_rest"])
 
 
 def test_a_scene_that_is_streamed_is_refitted_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     planes = bright_planes(1, 300)
-    expected = Bench(planes, 2).refit(perturbed(planes), 1, 2)
+    expected = Workshop(planes, 2).refit(perturbed(planes), 1, 2)
     use_fit(monkeypatch, resident=False, chunk_rows=128, least_rows=128)
-    found = Bench(planes, 2).refit(perturbed(planes), 1, 2)
+    found = Workshop(planes, 2).refit(perturbed(planes), 1, 2)
     assert same_bits(found["sh_dc"], expected["sh_dc"]) and same_bits(found["sh_rest"], expected["sh_rest"])
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_rows(count: int) -> None:
     planes = bright_planes(1, count)
-    bench = Bench(planes, 2)
-    found = bench.refit(planes, 1, 2)
+    workshop = Workshop(planes, 2)
+    found = workshop.refit(planes, 1, 2)
     assert found["sh_dc"].shape == (3, count) and found["sh_rest"].shape == (9, count)
 
 

@@ -17,7 +17,6 @@ from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
 from flexgs_edge.errors import BudgetError, InputError, TargetError
-from flexgs_edge.io import exchange
 from flexgs_edge.io.exchange import near_order, read_foreign, write_foreign
 from flexgs_edge.io.formats import FORMATS
 from flexgs_edge.io.geometry import read_geometry
@@ -193,11 +192,11 @@ def test_nothing_is_left_behind(project: Path, tmp_path: Path, monkeypatch: pyte
     def stop(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flexgs_edge.commands.compress.publish", stop)  # after the last file has been measured
+    monkeypatch.setattr("flexgs_edge.methods.foreign.method.publish", stop)  # after the last file has been measured
     with pytest.raises(KeyboardInterrupt):
         compress(project / "point_cloud.ply", tmp_path / "a.spz", force=True, **PAPER)
     assert [path.name for path in tmp_path.iterdir()] == ["a.spz"] and (tmp_path / "a.spz").read_text() == "earlier"
-    monkeypatch.setattr(exchange, "CONVERTER", "gaussforge_that_nobody_has")
+    monkeypatch.setattr("flexgs_edge.io.converter.CONVERTER", "gaussforge_that_nobody_has")
     with pytest.raises(InputError, match=r"pip install 'flexgs-edge\[formats\]'"):
         compress(project / "point_cloud.ply", tmp_path / "b.spz", **PAPER)
 

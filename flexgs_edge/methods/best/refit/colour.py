@@ -17,6 +17,7 @@ from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.references import References
 from flexgs_edge.views.sums import Maker, ViewSums
 
@@ -29,7 +30,7 @@ same bytes."""
 
 
 def refit_colours(
-    renderer: Renderer,
+    bench: Bench,
     planes: dict[str, np.ndarray],
     degrees: np.ndarray,
     origin: np.ndarray,
@@ -67,7 +68,7 @@ def refit_colours(
     dict
         The planes, with new `sh_dc` and `sh_rest`.
     """
-    storage = renderer.storage
+    renderer, storage = bench.renderer, bench.renderer.storage
     planes = {**planes, "sh_dc": storage.copy(planes["sh_dc"]), "sh_rest": storage.copy(planes["sh_rest"])}
     subsets = max(min(subsets, len(cameras)), 1)
     parts = [range(first, len(cameras), subsets) for _ in range(rounds) for first in range(subsets)]
@@ -75,7 +76,7 @@ def refit_colours(
     sum_bytes_a_row = sum_bytes(4) + normal_bytes(source.sh_degree)
     with renderer.load(source, sum_bytes_a_row, targets=True, view_sums=4) as scene:
         for part in progress.track(parts, "refitting colours", len(parts)):
-            normal = ViewSums(renderer, scene, [normal_sums(renderer)])
+            normal = ViewSums(bench, scene, [normal_sums(renderer)])
             try:
                 for camera, view in zip(renderer.in_turn(scene, [cameras[view] for view in part]), part, strict=True):
                     normal.add_view(renderer.residual_sums(scene, camera, targets[view]), camera)

@@ -1,0 +1,181 @@
+"""The method of FlexGaussian: score, rank, search over prune and SH rates, write, and measure what was written."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flexgs_edge.codec.v1.container import write_container
+from flexgs_edge.codec.v1.packed_source import FgsSource
+from flexgs_edge.files import temporary_name
+from flexgs_edge.goals.steps import SearchResult, step_words
+from flexgs_edge.methods.paper.auto_bits import bits_by_sensitivity
+from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
+from flexgs_edge.methods.paper.score_cache import ScoreCache
+from flexgs_edge.methods.paper.score_files import load_scores, save_scores
+from flexgs_edge.methods.paper.scores import score_scene
+from flexgs_edge.methods.paper.search import adapt, measure_fixed
+from flexgs_edge.packed.bitspec import PAPER
+from flexgs_edge.packed.quantize import QuantizedScene
+from flexgs_edge.packed.sensitivity import Sensitivity
+from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.run.fingerprint import fingerprint
+from flexgs_edge.run.judges import Judges
+from flexgs_edge.run.made import Made
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.run import Run
+from flexgs_edge.run.settings import make_settings
+from flexgs_edge.units import format_size
+from flexgs_edge.views.bench import Bench
+
+LOG = logging.getLogger("flexgs_edge")
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The rows of a scene, least important first ([N] i64), and whether their scores came from the cache."""
+
+    order: np.ndarray
+    reused: bool = False
+
+
+def compress(
+    run: Run[CompressOptions], bench: Bench | None, output: Path | None, scores: np.ndarray | None = None
+) -> Made:
+    """Compress a scene into a `.fgs` of version 1.
+
+    Parameters
+    ----------
+    run : Run
+        Planned.
+    bench : Bench or None
+        Draws; `None` for runs without views, whose rates are fixed.
+    output : Path or None
+        `None` in a dry run.
+    scores : np.ndarray or None
+        [N] f64 from a file (see `given_scores`); otherwise they are computed where they are needed.
+    """
+    with nullcontext() if bench is None else Judges(run, bench) as judges:
+        ranking = rank(run, judges, bench, scores)
+        with run.clock.stage("open"):
+            has_sh = nonzero_sh(run.source)
+        bits, groups = run.options.bit_spec()
+        renderer, decide = (None, None) if bench is None or judges is None else (bench.renderer, judges.decide)
+        evaluator = SceneEvaluator(run.source, ranking.order, has_sh, PAPER, groups, renderer, decide, run.budget)
+        sensitivity: list[Sensitivity] = []
+        if bits is None:
+            assert bench is not None
+            with run.clock.stage("sensitivity"):
+                bits, sensitivity = bits_by_sensitivity(evaluator, run, bench)
+        evaluator.bits = bits
+        with run.clock.stage("search"):
+            search = _search(run, evaluator)
+        if judges is not None:
+            judges.decided()
+        choice = search.chosen.choice if search else run.options.fixed
+        assert choice is not None
+        with evaluator.quantized(choice) as quantized:
+            quality = _write(run, output, quantized, search, judges)
+        return Made(
+            size=evaluator.size(choice),
+            count=quantized.count,
+            sh_count=quantized.sh_count,
+            sh_degree=quantized.sh_degree,
+            choice=choice,
+            search=search,
+            quality=quality,
+            trained=None if judges is None else judges.trained,
+            bits=quantized.bits,
+            groups={name: array.groups for name, array in quantized.arrays.items()},
+            sensitivity=tuple(sensitivity),
+            scores_reused=ranking.reused,
+        )
+
+
+def given_scores(run: Run[CompressOptions]) -> np.ndarray | None:
+    """[N] f64 from the file that `--score` names, or `None`: read before any work, as it must fit the scene."""
+    assert run.plan is not None
+    if run.plan.computes_scores or not run.plan.needs_scores:
+        return None
+    return load_scores(run.options.score, run.source.count)
+
+
+def rank(
+    run: Run[CompressOptions], judges: Judges | None, bench: Bench | None, scores: np.ndarray | None = None
+) -> Ranking:
+    """Draw the references, score every Gaussian where nobody did, and keep the scores where that is asked for."""
+    assert run.plan is not None
+    cache = _score_cache(run)
+    reused = False
+    if cache is not None:
+        scores = cache.load(run.source.count)
+        reused = scores is not None
+        LOG.info("scores %s %s", "reused from" if reused else "will be kept in", cache.path)
+    if judges is not None and bench is not None:
+        with judges.original() as original:
+            if run.plan.computes_scores and scores is None:
+                cameras = run.seen.of(run.seen.train)
+                LOG.info("scoring %d Gaussians over %d training poses", run.source.count, len(cameras))
+                with run.clock.stage("score"):
+                    scores = score_scene(bench.renderer, original, run.source, cameras, run.options.score, run.progress)
+    if cache is not None and scores is not None and not reused:
+        cache.save(scores)
+    if run.options.save_scores is not None and scores is not None:
+        save_scores(run.options.save_scores, scores, run.options.force)
+    order = np.arange(run.source.count) if scores is None else order_from_scores(scores)
+    return Ranking(order, reused)
+
+
+def _score_cache(run: Run[CompressOptions]) -> ScoreCache | None:
+    """The file of kept scores, for what is scored in this run."""
+    options = run.options
+    assert run.plan is not None
+    if options.score_cache is None or not run.plan.computes_scores:
+        return None
+    assert options.near is not None and options.extent is not None
+    with run.clock.stage("fingerprint"):
+        cameras = run.seen.of(run.seen.train)
+        key = fingerprint(run.source, cameras, options.score, options.near, options.extent, bool(options.antialiased))
+    return ScoreCache(options.score_cache, key)
+
+
+def _search(run: Run[CompressOptions], evaluator: SceneEvaluator) -> SearchResult | None:
+    if evaluator.judge is None:
+        return None
+    if run.options.fixed is not None:
+        return measure_fixed(evaluator, run.options.fixed)
+    target, options = run.target, run.options
+    LOG.info("searching for %s", target.describe())
+    return adapt(
+        evaluator, target, options.effort, options.best_effort, lambda step: LOG.info("%s", step_words(step, target))
+    )
+
+
+def _write(
+    run: Run[CompressOptions],
+    output: Path | None,
+    quantized: QuantizedScene,
+    search: SearchResult | None,
+    judges: Judges | None,
+) -> Quality | None:
+    """Write the file under another name, measure what it decodes to, and only then give it its name."""
+    settings = make_settings(run, search, quantized.bits)
+    if output is None:
+        if run.reporter is not None:
+            run.reporter.read_contents_of(lambda place: write_container(place, quantized, settings))
+        return None if judges is None else judges.measure_quantized(quantized)
+    with temporary_name(output, run.options.force) as place:
+        with run.clock.stage("write"):
+            size = write_container(place, quantized, settings)
+        quality = None
+        if judges is not None:
+            run.budget.take("the decoded file", size)
+            quality = judges.measure_quantized(FgsSource(place).quantized())
+            run.budget.give(size)
+    LOG.info("wrote %s, %s", output, format_size(size))
+    return quality

@@ -1,0 +1,104 @@
+"""The views that decide and those that report, prepared together and asked for the final figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from flexgs_edge.packed.quantize import QuantizedScene
+from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.run.decoding import ahead, coding_device
+from flexgs_edge.run.doubts import TrainingPoses
+from flexgs_edge.run.judge import Judge
+from flexgs_edge.run.run import Run
+from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.views.bench import Bench
+
+
+class Judges:
+    """The judge that decides and the one that reports, the same object unless training poses decide; close when done.
+
+    Parameters
+    ----------
+    run : Run
+        Planned, with views.
+    bench : Bench
+        Draws.
+    """
+
+    def __init__(self, run: Run[Any], bench: Bench) -> None:
+        assert run.plan is not None
+        self._run, self._bench, self._plan = run, bench, run.plan
+        self.report = self._judge(run.plan.report, reports=True)
+        on_train = run.plan.decide != run.plan.report
+        self.decide = self._judge(run.plan.decide, reports=False) if on_train else self.report
+        self.training: TrainingPoses | None = None
+        self.trained: float | None = None
+        """Fidelity of what was measured last on training poses, dB."""
+
+    def _judge(self, indices: list[int], reports: bool) -> Judge:
+        run = self._run
+        words = {"with_photos": reports, "base_psnr": run.options.base_psnr, "reports": reports}
+        return Judge(self._bench, run.source, run.seen, indices, **words)
+
+    @contextmanager
+    def original(self) -> Iterator[DeviceScene]:
+        """The original, loaded once: its references are drawn at the start, and it is released at the end."""
+        run, renderer = self._run, self._bench.renderer
+        views = run.seen
+        with run.clock.stage("load"):
+            device_scene = renderer.load(run.source)
+        with device_scene:
+            with run.clock.stage("references"):
+                self.report.prepare(device_scene, run.progress)
+                if self.decide is not self.report:
+                    self.decide.prepare(device_scene, run.progress)
+                if views.train and self._plan.report == views.held_out:
+                    self.training = TrainingPoses(renderer, device_scene, views.of(views.train), run.progress)
+            yield device_scene
+        renderer.release()
+
+    def prepare(self) -> None:
+        """Draw the references, where nothing else is asked of the original."""
+        with self.original():
+            pass
+
+    def measure(self, source: SceneSource) -> Quality:
+        """Quality of a decoded file."""
+        renderer, budget = self._bench.renderer, self._run.budget
+        with ahead(source, budget, coding_device(renderer.backend, budget, source.count, source.sh_degree)):
+            return self._compare(lambda: renderer.load(source))
+
+    def measure_quantized(self, quantized: QuantizedScene) -> Quality:
+        """Quality of codes that are dequantized on the device."""
+        return self._compare(lambda: self._bench.renderer.load_quantized(quantized))
+
+    def _compare(self, load: Callable[[], DeviceScene]) -> Quality:
+        """Quality of what `load` brings to the device, over the views that report and (fidelity only) some training poses."""
+        run = self._run
+        with run.clock.stage("measure"), load() as scene:
+            # First, since it brings the scene to the backend: the judge then sees whether it is what the search measured.
+            if self.training is not None:
+                self.trained = self.training.fidelity(scene)
+            quality = self.report.compare(scene, with_ssim=True, progress=run.progress)
+            if run.reporter is not None:
+                run.reporter.look(self.report, scene, quality, run.clock, run.progress)
+        return quality
+
+    def decided(self) -> None:
+        """Give the memory of the judge that decides back, where another one reports."""
+        if self.decide is not self.report:
+            self.decide.close()
+
+    def close(self) -> None:
+        """Remove what the original looked like from training poses."""
+        if self.training is not None:
+            self.training.close()
+
+    def __enter__(self) -> Judges:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
