@@ -82,7 +82,7 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
         result = compress(path, output, method="best", near=near, force=True, progress=progress, **words)
     assert result.search is not None
     chosen = steps[result.search.steps.index(result.search.chosen)]
-    rows = searches[0].path.scene_rows(searches[0].kept(chosen.multiplier).rows)
+    rows = searches[0].rounds.scene_rows(searches[0].kept(chosen.multiplier).rows)
     check(len(rows) == result.count, "the rows of the file")
     return Found(searches[0], chosen.multiplier, np.sort(rows), result.size)
 
@@ -123,7 +123,7 @@ def compare(
     )
     first = compress_and_look(source.path, scratch / "first.fgs", DEFAULT_NEAR, progress, **words)
     second = compress_and_look(moved, scratch / "second.fgs", DEFAULT_NEAR * factor, progress, **words)
-    choice = second.search.path.scene_rows(second.search.kept(first.multiplier).rows)
+    choice = second.search.rounds.scene_rows(second.search.kept(first.multiplier).rows)
     note = f"{len(first.rows)} and {len(second.rows)} Gaussians, {first.size} and {second.size} bytes"
     return Likeness(_same(first.rows, second.rows), second.size / first.size, _same(first.rows, choice)), note
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from flexgs_edge.cli import shared_options, talk
-from flexgs_edge.commands.devices import _device_lines
+from flexgs_edge.commands.devices import device_lines
 from flexgs_edge.errors import DeviceError
 
 
@@ -39,7 +39,7 @@ def command(device: str | None, force: bool, json_path: str | None, quiet: bool)
         index: int | None = chosen.index
     except DeviceError as error:
         failure, reason, index = error, str(error), None
-    lines = [line for info in devices for line in _device_lines(info)]
+    lines = [line for info in devices for line in device_lines(info)]
     if index is not None:
         lines.append(f"chosen: [{index}] ({reason})")
     record = {"devices": [info.to_json() for info in devices], "chosen": index, "reason": reason}

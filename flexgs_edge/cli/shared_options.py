@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import click
 
-from flexgs_edge.cli.talk import _set_debug
+from flexgs_edge.cli.talk import set_debug
 from flexgs_edge.cli.value_types import COLOUR, SIZE
 from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, DEFAULT_NEAR, MAX_VIEW_WIDTH
 
@@ -181,7 +181,7 @@ talk_options = stack(
         is_flag=True,
         is_eager=True,
         expose_value=False,
-        callback=_set_debug,
+        callback=set_debug,
         help="Show tracebacks of errors.",
     ),
 )

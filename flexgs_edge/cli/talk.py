@@ -21,7 +21,8 @@ class State:
     debug: bool = False
 
 
-def _set_debug(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+def set_debug(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    """Note `--debug`, so that `main` prints the traceback of an error."""
     if value and isinstance(ctx.obj, State):
         ctx.obj.debug = True
 

@@ -36,7 +36,7 @@ def canonical_json(value: object) -> bytes:
     return text.encode("ascii")
 
 
-def _parse(block: bytes) -> object:
+def parse_json(block: bytes) -> object:
     """JSON without repeated keys, NaN or infinity."""
     try:
         return json.loads(block.decode("ascii"), object_pairs_hook=_unique, parse_constant=_no_constant)
@@ -61,20 +61,23 @@ def _no_constant(text: str) -> NoReturn:
     raise HeaderError(f"wanted finite numbers, got {text}")
 
 
-def _integer(name: str, value: object, lowest: int, highest: int) -> int:
+def checked_integer(name: str, value: object, lowest: int, highest: int) -> int:
+    """An integer from a header, within bounds; raises `HeaderError`."""
     # bool is a subclass of int: true is not 1 here.
     if type(value) is not int or not lowest <= value <= highest:
-        raise HeaderError(f"{name}: wanted an integer from {lowest} to {highest}, got {_short(value)}")
+        raise HeaderError(f"{name}: wanted an integer from {lowest} to {highest}, got {shown(value)}")
     return value
 
 
-def _origin(value: object) -> tuple[float, float, float]:
+def checked_origin(value: object) -> tuple[float, float, float]:
+    """Three finite numbers from a header; raises `HeaderError`."""
     if isinstance(value, list) and len(value) == 3 and all(type(v) is float and math.isfinite(v) for v in value):
         return (value[0], value[1], value[2])
-    raise HeaderError(f"origin: wanted three finite numbers with a decimal point, got {_short(value)}")
+    raise HeaderError(f"origin: wanted three finite numbers with a decimal point, got {shown(value)}")
 
 
-def _short(value: object) -> str:
+def shown(value: object) -> str:
+    """A value in an error text: short, however long it is."""
     return "an integer of more than 40 digits" if isinstance(value, int) and abs(value) >= 10**40 else brief(value)
 
 

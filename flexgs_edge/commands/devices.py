@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     from flexgs_edge.kernels.choose_device import DeviceInfo
 
 
-def _device_lines(info: DeviceInfo) -> list[str]:
+def device_lines(info: DeviceInfo) -> list[str]:
+    """A device in a few lines."""
     return [
         f"[{info.index}] {info.name}",
         f"    {info.type}, {info.platform}, driver {info.driver}, {info.opencl_c}",

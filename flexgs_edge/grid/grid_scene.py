@@ -65,7 +65,7 @@ class GridScene:
         rows = np.arange(self.count)[rows]
         degrees = self.sh_degrees[rows]
         top = int(degrees.max(initial=0))
-        bands = tuple(storage.take(self.sh[d], _places(self.sh_degrees, rows, d + 1)) for d in range(top))
+        bands = tuple(storage.take(self.sh[d], row_places(self.sh_degrees, rows, d + 1)) for d in range(top))
         return GridScene(
             len(rows),
             top,
@@ -82,7 +82,7 @@ class GridScene:
         )
 
 
-def _places(degrees: np.ndarray, rows: np.ndarray, degree: int) -> np.ndarray:
+def row_places(degrees: np.ndarray, rows: np.ndarray, degree: int) -> np.ndarray:
     """Where the SH of those `rows` that have `degree` lie in the arrays of that degree."""
     places = np.cumsum(degrees >= degree) - 1
     chosen: np.ndarray = places[rows[degrees[rows] >= degree]]

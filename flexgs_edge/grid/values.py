@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexgs_edge.grid.grid_scene import GridScene, _places
+from flexgs_edge.grid.grid_scene import GridScene, row_places
 from flexgs_edge.memory.rows import put_rows, read_ahead, read_rows
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
@@ -89,7 +89,7 @@ def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:
             last = first + int(np.count_nonzero(degrees >= degree))
             bands.append(read_rows(grid.sh[degree - 1], slice(first, last)))
         else:
-            bands.append(grid.sh[degree - 1][:, _places(grid.sh_degrees, np.arange(grid.count)[rows], degree)])
+            bands.append(grid.sh[degree - 1][:, row_places(grid.sh_degrees, np.arange(grid.count)[rows], degree)])
     return _spread_bands(grid, degrees, bands)
 
 

@@ -48,7 +48,7 @@ def check_converter(path: str | os.PathLike[str]) -> None:
         raise InputError(f"{path}: this format needs the package {CONVERTER}: pip install 'flexgs-edge[formats]'")
 
 
-def _convert(path: str | os.PathLike[str], source: Path, source_format: str, target: Path, target_format: str) -> None:
+def convert(path: str | os.PathLike[str], source: Path, source_format: str, target: Path, target_format: str) -> None:
     """Run the converter; `path` is the user's file, for messages."""
     # Absolute: a name that starts with a dash is no option. Output is never ours: the converter prints as it goes.
     command = [sys.executable, "-c", _CHILD, os.path.abspath(source), source_format, str(target), target_format]

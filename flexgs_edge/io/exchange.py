@@ -6,7 +6,6 @@ prints stays out of ours, and a file that crashes it is an error like any other.
 
 from __future__ import annotations
 
-import gzip
 import os
 import tempfile
 import weakref
@@ -18,10 +17,10 @@ import numpy as np
 
 from flexgs_edge.errors import FlexGSError, FormatError, InputError
 from flexgs_edge.files import check_writable
-from flexgs_edge.io.converter import CONVERTER, _convert, check_converter
-from flexgs_edge.io.formats import Format, _required
+from flexgs_edge.io.converter import CONVERTER, check_converter, convert
+from flexgs_edge.io.formats import Format, required_format
 from flexgs_edge.io.ply import PlySource, write_ply
-from flexgs_edge.io.spz import refine_sh
+from flexgs_edge.io.spz import is_antialiased, refine_sh
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.rotations import normalize_quats
@@ -44,14 +43,14 @@ def read_foreign(path: str | os.PathLike[str]) -> SceneSource:
     FormatError
         When the file breaks its format.
     """
-    format = _required(path)
+    format = required_format(path)
     check_converter(path)
     if not Path(path).is_file():
         raise InputError(f"{path}: no such scene file")
     folder = tempfile.TemporaryDirectory(prefix="flexgs-")
     try:
         expanded = Path(folder.name) / "scene.ply"
-        _convert(path, Path(path), format.name, expanded, "ply")
+        convert(path, Path(path), format.name, expanded, "ply")
         return _ForeignSource(path, expanded, folder, format)
     except BaseException:
         folder.cleanup()
@@ -76,7 +75,7 @@ def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: b
     BudgetError
         When the disk is full.
     """
-    format = _required(path)
+    format = required_format(path)
     check_converter(path)
     target = check_writable(path, force)
     if source.count == 0:
@@ -93,7 +92,7 @@ def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: b
         if format.probed and source.sh_degree:
             world.sh_places = _sh_places(format, source.sh_degree)
         write_ply(plain, world.select(near_order(world)) if format.sorted else world)
-        _convert(path, plain, "ply", finished, format.name)
+        convert(path, plain, "ply", finished, format.name)
         if format.finer_sh and source.sh_degree:
             coded = finished.rename(Path(folder) / "coded")
             refine_sh(coded, world, finished)
@@ -142,8 +141,8 @@ def _sh_places(format: Format, degree: int) -> np.ndarray:
     with tempfile.TemporaryDirectory(prefix="flexgs-") as folder:
         plain, coded, back = (Path(folder) / name for name in ("scene.ply", f"scene{format.suffix}", "back.ply"))
         write_ply(plain, MemorySource(planes, degree))
-        _convert(coded, plain, "ply", coded, format.name)
-        _convert(coded, coded, format.name, back, "ply")
+        convert(coded, plain, "ply", coded, format.name)
+        convert(coded, coded, format.name, back, "ply")
         found = PlySource(back).read(slice(0, 1), ["sh_rest"])["sh_rest"][:, 0]
     places = np.rint((found + 2) / 4 * (width - 1)).astype(np.int64)
     if sorted(places.tolist()) != list(range(width)):
@@ -151,16 +150,6 @@ def _sh_places(format: Format, degree: int) -> np.ndarray:
             f"this version of {CONVERTER} does not keep SH in {format.suffix}; update it or write another format"
         )
     return places
-
-
-def _spz_antialiased(path: str | os.PathLike[str]) -> bool:
-    """Bit 0 of byte 14 of the header, which is plain from version 4 on and inside gzip before; the converter drops it."""
-    with open(path, "rb") as file:
-        start = file.read(16)
-    if start[:2] == b"\x1f\x8b":
-        with gzip.open(path) as unpacked:
-            start = unpacked.read(16)
-    return start[:4] == b"NGSP" and len(start) == 16 and bool(start[14] & 1)
 
 
 class _WrappedSource(SceneSource):
@@ -209,7 +198,7 @@ class _ForeignSource(_WrappedSource):
             raise FormatError(f"{path}: not a Gaussian scene as {CONVERTER} reads it: {error}") from error
         super().__init__(parent, os.fspath(path), parent.origin)
         self.format = format
-        self.settings = {"antialiased": True} if format.name == "spz" and _spz_antialiased(path) else {}
+        self.settings = {"antialiased": True} if format.name == "spz" and is_antialiased(path) else {}
         weakref.finalize(self, folder.cleanup)
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:

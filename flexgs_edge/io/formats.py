@@ -82,7 +82,8 @@ def format_of(path: str | os.PathLike[str]) -> Format | None:
     return next((format for suffix, format in FORMATS.items() if name.endswith(suffix)), None)
 
 
-def _required(path: str | os.PathLike[str]) -> Format:
+def required_format(path: str | os.PathLike[str]) -> Format:
+    """The format of a file name; raises `InputError` where it names none."""
     format = format_of(path)
     if format is None:
         raise InputError(f"{path}: expected a file ending in {', '.join(FORMATS)}")

@@ -10,6 +10,7 @@ SH by Gaussian, coefficient, channel; all of it one gzip stream.
 from __future__ import annotations
 
 import gzip
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -28,6 +29,19 @@ _MAGIC = 0x5053474E
 _ROW = {2: 19, 3: 20}
 """Bytes of a Gaussian without SH, by version of the format."""
 _BLOCK = 1 << 20
+
+
+def is_antialiased(path: str | os.PathLike[str]) -> bool:
+    """Whether a file says that its model is antialiased; the converter drops that.
+
+    It is bit 0 of byte 14 of the header, which is plain from version 4 on and inside gzip before.
+    """
+    with open(path, "rb") as file:
+        start = file.read(16)
+    if start[:2] == b"\x1f\x8b":
+        with gzip.open(path) as unpacked:
+            start = unpacked.read(16)
+    return start[:4] == b"NGSP" and len(start) == 16 and bool(start[14] & 1)
 
 
 def refine_sh(coded: Path, source: SceneSource, finished: Path, chunk_rows: int = 16384) -> None:

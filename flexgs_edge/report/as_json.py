@@ -23,9 +23,9 @@ def step_json(step: Step) -> dict[str, Any]:
         "prune_rate": step.choice.prune / 1000,
         "sh_rate": step.choice.sh / 1000,
         "size": step.size,
-        "drop": _rounded(found.drop if found else None),
-        "fidelity": _rounded(found.fidelity if found else None),
-        "modelled_drop": _rounded(found.modelled_drop if found else None),
+        "drop": rounded(found.drop if found else None),
+        "fidelity": rounded(found.fidelity if found else None),
+        "modelled_drop": rounded(found.modelled_drop if found else None),
         "worst": _worst_json(found.worst) if found and found.worst else None,
         "holds": step.holds,
         "estimated": step.estimated,
@@ -35,9 +35,9 @@ def step_json(step: Step) -> dict[str, Any]:
 
 def _worst_json(worst: Measurement) -> dict[str, float | None]:
     return {
-        "drop": _rounded(worst.drop),
-        "fidelity": _rounded(worst.fidelity),
-        "modelled_drop": _rounded(worst.modelled_drop),
+        "drop": rounded(worst.drop),
+        "fidelity": rounded(worst.fidelity),
+        "modelled_drop": rounded(worst.modelled_drop),
     }
 
 
@@ -45,18 +45,18 @@ def quality_json(quality: Quality) -> dict[str, Any]:
     """Means, the worst view, and every view; null where images are identical, there is no photo, or nothing was measured."""
     worst = quality.worst
     return {
-        "drop": _rounded(quality.drop),
-        "fidelity": _rounded(quality.fidelity),
-        "modelled_drop": _rounded(quality.modelled_drop),
+        "drop": rounded(quality.drop),
+        "fidelity": rounded(quality.fidelity),
+        "modelled_drop": rounded(quality.modelled_drop),
         "base_psnr": quality.base_psnr,
-        "psnr": _rounded(quality.psnr),
-        "original_psnr": _rounded(quality.original_psnr),
-        "ssim": _rounded(quality.ssim_photo, 5),
-        "original_ssim": _rounded(quality.original_ssim, 5),
-        "ssim_fidelity": _rounded(quality.ssim_original, 5),
-        "lpips": _rounded(quality.lpips_photo, 5),
-        "original_lpips": _rounded(quality.original_lpips, 5),
-        "lpips_fidelity": _rounded(quality.lpips_original, 5),
+        "psnr": rounded(quality.psnr),
+        "original_psnr": rounded(quality.original_psnr),
+        "ssim": rounded(quality.ssim_photo, 5),
+        "original_ssim": rounded(quality.original_ssim, 5),
+        "ssim_fidelity": rounded(quality.ssim_original, 5),
+        "lpips": rounded(quality.lpips_photo, 5),
+        "original_lpips": rounded(quality.original_lpips, 5),
+        "lpips_fidelity": rounded(quality.lpips_original, 5),
         "identical_views": quality.identical,
         "worst": _view_json(worst) if worst else None,
         "views": [_view_json(view) for view in quality.views],
@@ -66,19 +66,20 @@ def quality_json(quality: Quality) -> dict[str, Any]:
 def _view_json(view: ViewQuality) -> dict[str, Any]:
     return {
         "name": view.name,
-        "drop": _rounded(view.drop),
-        "fidelity": _rounded(view.fidelity),
-        "psnr": _rounded(view.psnr),
-        "original_psnr": _rounded(view.original_psnr),
-        "ssim": _rounded(view.ssim_photo, 5),
-        "original_ssim": _rounded(view.original_ssim, 5),
-        "ssim_fidelity": _rounded(view.ssim_original, 5),
-        "lpips": _rounded(view.lpips_photo, 5),
-        "original_lpips": _rounded(view.original_lpips, 5),
-        "lpips_fidelity": _rounded(view.lpips_original, 5),
+        "drop": rounded(view.drop),
+        "fidelity": rounded(view.fidelity),
+        "psnr": rounded(view.psnr),
+        "original_psnr": rounded(view.original_psnr),
+        "ssim": rounded(view.ssim_photo, 5),
+        "original_ssim": rounded(view.original_ssim, 5),
+        "ssim_fidelity": rounded(view.ssim_original, 5),
+        "lpips": rounded(view.lpips_photo, 5),
+        "original_lpips": rounded(view.original_lpips, 5),
+        "lpips_fidelity": rounded(view.lpips_original, 5),
         "mse": view.error,
     }
 
 
-def _rounded(value: float | None, digits: int = 4) -> float | None:
+def rounded(value: float | None, digits: int = 4) -> float | None:
+    """A figure without the digits that mean nothing; `None` stays `None`."""
     return None if value is None else round(value, digits)

@@ -14,7 +14,7 @@ from flexgs_edge._version import __version__
 from flexgs_edge.goals.steps import Scored, SearchResult
 from flexgs_edge.packed.sensitivity import Sensitivity
 from flexgs_edge.quality.view_quality import Quality
-from flexgs_edge.report.as_json import _rounded, quality_json, step_json
+from flexgs_edge.report.as_json import quality_json, rounded, step_json
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
 
 
@@ -151,7 +151,7 @@ class CompressResult:
             "sensitivity": [{**asdict(item), "loss": item.loss} for item in self.sensitivity],
             "quality": quality_json(self.quality) if self.quality else None,
             "quality_views": self.quality_views,
-            "training_fidelity": _rounded(self.training_fidelity),
+            "training_fidelity": rounded(self.training_fidelity),
             "scored": asdict(self.scored) if self.scored else None,
             "warnings": list(self.warnings),
             "scores_saved": self.scores_saved,

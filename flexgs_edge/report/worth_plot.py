@@ -21,7 +21,7 @@ def check_picture(path: str, force: bool) -> None:
 
 
 def write_picture(found: dict[str, Any], path: str, force: bool) -> None:
-    """Draw what `pipeline.worth` found: a dot a change, its modelled drop, and the share of the bytes that it saves."""
+    """Draw what `commands.worth` found: a dot a change, its modelled drop, and the share of the bytes that it saves."""
     png, svg = picture(worth_chart(found))
     with atomic_write(path, force) as file:
         file.write(png if Path(path).suffix.lower() == ".png" else svg)

@@ -26,7 +26,7 @@ from flexgs_edge.errors import DeviceError, InputError
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
 from flexgs_edge.views.one_view import Drawn
-from flexgs_edge.views.worker import Drawing, _draw_planes, _draw_sums, _version, _warm_up
+from flexgs_edge.views.worker import Drawing, draw_planes, draw_sums, warm_up, worker_version
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -98,7 +98,7 @@ class Cluster:
                 set_as_default=False,
                 direct_to_workers=self._local is not None,
             )
-            versions = set(client.run(_version).values())
+            versions = set(client.run(worker_version).values())
         except (OSError, ValueError, ImportError) as error:
             raise InputError(
                 f"--cluster {address}: no cluster of workers with flexgs-edge answers ({error})"
@@ -111,7 +111,7 @@ class Cluster:
                 f"{', '.join(sorted(versions)) or 'no worker'}"
             )
         if processes is not None:
-            client.run(_warm_up, self._drawing)
+            client.run(warm_up, self._drawing)
 
     @property
     def ready(self) -> bool:
@@ -141,7 +141,7 @@ class Cluster:
 
     def planes(self, source: SceneSource, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
         """`Renderer.render_planes` of each view, in their order."""
-        return self._drawn(_draw_planes, source, [partial(_words, camera) for camera in cameras])
+        return self._drawn(draw_planes, source, [partial(_words, camera) for camera in cameras])
 
     def sums(
         self,
@@ -156,7 +156,7 @@ class Cluster:
         def words(view: int) -> tuple[Any, ...]:
             return kind, cameras[view], None if targets is None else targets(view), pictures
 
-        return self._drawn(_draw_sums, source, [partial(words, view) for view in range(len(cameras))])
+        return self._drawn(draw_sums, source, [partial(words, view) for view in range(len(cameras))])
 
     def _drawn(
         self, draw: Callable[..., Any], source: SceneSource, views: Sequence[Callable[[], tuple[Any, ...]]]

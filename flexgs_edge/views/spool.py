@@ -17,7 +17,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.views.one_view import Part
 
 
-class _Dense:
+class DenseSums:
     """Sums of one view of all rows of a chunk, on the backend."""
 
     def __init__(self, backend: Backend, shape: tuple[int, ...]) -> None:
@@ -41,7 +41,7 @@ class _Dense:
         self._array.release()
 
 
-class _Spool:
+class Spool:
     """What the rows of a scene got in some views, in a scratch file: view by view, rows ascending."""
 
     def __init__(self, storage: Storage, starts: np.ndarray) -> None:
@@ -88,7 +88,7 @@ class _Spool:
         if not pieces:
             return
         coming = self._disk.submit(self._read, *pieces[0][1:])
-        dense = _Dense(backend, (chunk.stride, *self._record["sums"].shape))
+        dense = DenseSums(backend, (chunk.stride, *self._record["sums"].shape))
         try:
             for number, (camera, *_) in enumerate(pieces, start=1):
                 block = coming.result()

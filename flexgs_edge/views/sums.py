@@ -19,7 +19,7 @@ from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import padded
 from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.one_view import Drawn, Part, view_parts, view_sums
-from flexgs_edge.views.spool import _Dense, _Spool
+from flexgs_edge.views.spool import DenseSums, Spool
 
 
 class ChunkSums(Protocol):
@@ -50,8 +50,8 @@ class ViewSums:
     def __init__(self, bench: Bench, scene: DeviceScene, makers: Sequence[Maker]) -> None:
         self._bench, self._renderer, self._scene, self._makers = bench, bench.renderer, scene, makers
         self._held: dict[int, tuple[int, list[ChunkSums]]] = {}
-        self._spool: _Spool | None = None
-        self._dense: _Dense | None = None
+        self._spool: Spool | None = None
+        self._dense: DenseSums | None = None
 
     def draw(
         self,
@@ -117,7 +117,7 @@ class ViewSums:
             shape = chunk.stride, *parts[0][1].shape[1:]
             if self._dense is None or self._dense.shape != shape:
                 self._drop_dense()
-                self._dense = _Dense(renderer.backend, shape)
+                self._dense = DenseSums(renderer.backend, shape)
             inside = [(rows[at], values[at]) for (rows, values), at in zip(parts, some, strict=True)]
             sums = self._dense.of(inside, chunk.base)
             for part in held:
@@ -130,7 +130,7 @@ class ViewSums:
 
     def _add_parts(self, parts: Iterable[Part], camera: Camera) -> None:
         if self._spool is None:
-            self._spool = _Spool(self._renderer.storage, self._scene.starts)
+            self._spool = Spool(self._renderer.storage, self._scene.starts)
         self._spool.add(parts, camera)
 
     def parts(self) -> Iterator[tuple[slice, list[Any]]]:

@@ -62,13 +62,14 @@ class _Desk:
 _DESK = _Desk()
 
 
-def _draw_planes(held: tuple[str, MemorySource], drawing: Drawing, camera: Camera) -> np.ndarray:
+def draw_planes(held: tuple[str, MemorySource], drawing: Drawing, camera: Camera) -> np.ndarray:
+    """A view, as `Renderer.render_planes` gives it."""
     with _DESK.lock:
         renderer, scene = _DESK.ready(held, drawing)
         return renderer.render_planes(scene, camera)
 
 
-def _draw_sums(
+def draw_sums(
     held: tuple[str, MemorySource],
     drawing: Drawing,
     kind: str,
@@ -76,21 +77,23 @@ def _draw_sums(
     target: np.ndarray | None,
     picture: bool,
 ) -> Drawn:
+    """The sums of a view: see `drawn_sums`."""
     with _DESK.lock:
         renderer, scene = _DESK.ready(held, drawing)
         return drawn_sums(renderer, scene, kind, camera, target, picture)
 
 
-def _warm_up(drawing: Drawing) -> None:
+def warm_up(drawing: Drawing) -> None:
     """Draw one Gaussian as views will be: a worker's first view takes 0.3 s, as its kernels are loaded."""
     planes = {name: np.zeros((field.width(0), 1), np.float32) for name, field in FIELD.items()}
     planes["quats"][0] = 1
     camera = Camera("", TILE, TILE, np.eye(3), np.array([0.0, 0.0, 1.0]), TILE, TILE, TILE / 2, TILE / 2)
     target = np.zeros((3, TILE, TILE), np.float16)
     held = "", MemorySource(planes)
-    _draw_sums(held, drawing, "removal_sums", camera, None, picture=True)
-    _draw_sums(held, drawing, "residual_and_removal_sums", camera, target, picture=False)
+    draw_sums(held, drawing, "removal_sums", camera, None, picture=True)
+    draw_sums(held, drawing, "residual_and_removal_sums", camera, target, picture=False)
 
 
-def _version() -> str:
+def worker_version() -> str:
+    """The version of this program that a worker runs."""
     return __version__

@@ -135,7 +135,7 @@ def test_workers_keep_the_scene_that_was_sent_last() -> None:
     again, second = desk.ready(("b", source), DRAWING)
     assert again is renderer and second is not first
     assert desk.ready(("b", source), Drawing(**{**vars(DRAWING), "near": 0.3}))[0].near == 0.3
-    assert worker._version() == __version__
+    assert worker.worker_version() == __version__
 
 
 def compress(folder: Path, name: str, *words: str) -> subprocess.Popen[str]:

@@ -11,11 +11,11 @@ from flexgs_edge.codec.header import (
     PREAMBLE_BYTES,
     HeaderError,
     Section,
-    _integer,
-    _origin,
-    _parse,
-    _short,
     canonical_json,
+    checked_integer,
+    checked_origin,
+    parse_json,
+    shown,
 )
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
@@ -183,27 +183,29 @@ def encode_header(header: Header) -> bytes:
 
 def decode_header(block: bytes) -> Header:
     """Read and check a padded header; raises `HeaderError` for anything but what `encode_header` can write."""
-    record = _parse(block)
+    record = parse_json(block)
     if not isinstance(record, dict) or tuple(sorted(record)) != _KEYS:
-        raise HeaderError(f"wanted an object with the keys {', '.join(_KEYS)}, got {_short(record)}")
-    count = _integer("count", record["count"], 0, MAX_COUNT)
-    sh_count = _integer("sh_count", record["sh_count"], 0, count)
+        raise HeaderError(f"wanted an object with the keys {', '.join(_KEYS)}, got {shown(record)}")
+    count = checked_integer("count", record["count"], 0, MAX_COUNT)
+    sh_count = checked_integer("sh_count", record["sh_count"], 0, count)
     lowest, highest = (1, MAX_SH_DEGREE) if sh_count else (0, 0)
-    sh_degree = _integer("sh_degree", record["sh_degree"], lowest, highest)
-    bits = BitSpec(**{name: _integer(f"bits.{name}", v, 1, 16) for name, v in _attributes("bits", record["bits"])})
+    sh_degree = checked_integer("sh_degree", record["sh_degree"], lowest, highest)
+    bits = BitSpec(
+        **{name: checked_integer(f"bits.{name}", v, 1, 16) for name, v in _attributes("bits", record["bits"])}
+    )
     groups = {}
     for field in FIELDS:
         rows = sh_count if field.name == "sh_rest" else count
         value = dict(_attributes("groups", record["groups"]))[field.bits]
-        groups[field.bits] = _integer(f"groups.{field.bits}", value, min(rows, 1), rows)
+        groups[field.bits] = checked_integer(f"groups.{field.bits}", value, min(rows, 1), rows)
     settings = record["settings"]
     if not isinstance(settings, dict):
-        raise HeaderError(f"settings: wanted an object, got {_short(settings)}")
-    return Header(count, sh_count, sh_degree, _origin(record["origin"]), bits, groups, settings, len(block))
+        raise HeaderError(f"settings: wanted an object, got {shown(settings)}")
+    return Header(count, sh_count, sh_degree, checked_origin(record["origin"]), bits, groups, settings, len(block))
 
 
 def _attributes(name: str, value: object) -> list[tuple[str, object]]:
     names = sorted(field.bits for field in FIELDS)
     if not isinstance(value, dict) or sorted(value) != names:
-        raise HeaderError(f"{name}: wanted an object with the keys {', '.join(names)}, got {_short(value)}")
+        raise HeaderError(f"{name}: wanted an object with the keys {', '.join(names)}, got {shown(value)}")
     return list(value.items())

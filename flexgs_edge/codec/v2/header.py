@@ -12,11 +12,11 @@ from flexgs_edge.codec.header import (
     PREAMBLE_BYTES,
     HeaderError,
     Section,
-    _integer,
-    _origin,
-    _parse,
-    _short,
     canonical_json,
+    checked_integer,
+    checked_origin,
+    parse_json,
+    shown,
 )
 from flexgs_edge.codec.v2.channels import COUNT_MOST, Channels, channel_parts
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes, plan_chunks
@@ -179,33 +179,31 @@ def encode_header(header: GridHeader) -> bytes:
 
 def decode_header(block: bytes) -> GridHeader:
     """Read and check a header; raises `HeaderError` for anything but what `encode_header` can write."""
-    record = _parse(block)
+    record = parse_json(block)
     if not isinstance(record, dict) or tuple(sorted(record.keys() - {_OPTIONAL})) != _KEYS:
         raise HeaderError(
-            f"wanted an object with the keys {', '.join(_KEYS)} and perhaps {_OPTIONAL}, got {_short(record)}"
+            f"wanted an object with the keys {', '.join(_KEYS)} and perhaps {_OPTIONAL}, got {shown(record)}"
         )
-    count = _integer("count", record["count"], 0, MAX_COUNT)
+    count = checked_integer("count", record["count"], 0, MAX_COUNT)
     layers = _integers("layers", record["layers"], 0, MAX_COUNT)
     if not 1 <= len(layers) <= LAYERS_MOST or sum(layers) != count:
-        raise HeaderError(
-            f"layers: wanted 1 to {LAYERS_MOST} counts that add up to {count}, got {_short(list(layers))}"
-        )
+        raise HeaderError(f"layers: wanted 1 to {LAYERS_MOST} counts that add up to {count}, got {shown(list(layers))}")
     low = _integers("low", record["low"], -CODE_LIMIT, CODE_LIMIT)
     if len(low) != 3:
-        raise HeaderError(f"low: wanted three integers, got {_short(list(low))}")
+        raise HeaderError(f"low: wanted three integers, got {shown(list(low))}")
     if not isinstance(record["settings"], dict):
-        raise HeaderError(f"settings: wanted an object, got {_short(record['settings'])}")
-    sh_degree = _integer("sh_degree", record["sh_degree"], 0, MAX_SH_DEGREE)
+        raise HeaderError(f"settings: wanted an object, got {shown(record['settings'])}")
+    sh_degree = checked_integer("sh_degree", record["sh_degree"], 0, MAX_SH_DEGREE)
     return GridHeader(
         count,
         sh_degree,
-        _origin(record["origin"]),
+        checked_origin(record["origin"]),
         _steps(record["steps"], sh_degree),
         layers,
-        _integer("chunk_rows", record["chunk_rows"], 1, CHUNK_ROWS),
-        _integer("depth", record["depth"], 0, POSITION_BITS),
+        checked_integer("chunk_rows", record["chunk_rows"], 1, CHUNK_ROWS),
+        checked_integer("depth", record["depth"], 0, POSITION_BITS),
         (low[0], low[1], low[2]),
-        _integer("model_bytes", record["model_bytes"], 0, MODEL_MOST),
+        checked_integer("model_bytes", record["model_bytes"], 0, MODEL_MOST),
         record["settings"],
         _cut_from(record["cut_from"]),
         _channels(record[_OPTIONAL], count, sh_degree) if _OPTIONAL in record else None,
@@ -216,19 +214,19 @@ def decode_header(block: bytes) -> GridHeader:
 def _steps(value: object, sh_degree: int) -> dict[str, Any]:
     names = ("chroma", "dc", "opacity", "position", "rotation", "scale", "sh")
     if not isinstance(value, dict) or tuple(sorted(value)) != names:
-        raise HeaderError(f"steps: wanted an object with the keys {', '.join(names)}, got {_short(value)}")
+        raise HeaderError(f"steps: wanted an object with the keys {', '.join(names)}, got {shown(value)}")
     numbers = [value[name] for name in names[:-1]]
     if not isinstance(value["sh"], list) or len(value["sh"]) != sh_degree:
-        raise HeaderError(f"steps.sh: wanted {sh_degree} numbers, got {_short(value['sh'])}")
+        raise HeaderError(f"steps.sh: wanted {sh_degree} numbers, got {shown(value['sh'])}")
     numbers += value["sh"]
     if not all(type(number) is float and math.isfinite(number) for number in numbers):
-        raise HeaderError(f"steps: wanted finite numbers with a decimal point, got {_short(value)}")
+        raise HeaderError(f"steps: wanted finite numbers with a decimal point, got {shown(value)}")
     try:
         steps = StepSizes.from_json(value).to_json()
     except (InputError, OverflowError) as error:
         raise HeaderError(f"steps: {error}") from None
     if steps != value:
-        raise HeaderError(f"steps: wanted float32 numbers, got {_short(value)}")
+        raise HeaderError(f"steps: wanted float32 numbers, got {shown(value)}")
     return steps
 
 
@@ -236,25 +234,25 @@ def _cut_from(value: object) -> dict[str, int] | None:
     if value is None:
         return None
     if not isinstance(value, dict) or tuple(sorted(value)) != ("bytes", "count", "layers"):
-        raise HeaderError(f"cut_from: wanted null or an object with bytes, count and layers, got {_short(value)}")
-    return {name: _integer(f"cut_from.{name}", value[name], 0, 2**63 - 1) for name in sorted(value)}
+        raise HeaderError(f"cut_from: wanted null or an object with bytes, count and layers, got {shown(value)}")
+    return {name: checked_integer(f"cut_from.{name}", value[name], 0, 2**63 - 1) for name in sorted(value)}
 
 
 def _channels(value: object, count: int, sh_degree: int) -> Channels:
     if not isinstance(value, dict) or tuple(sorted(value)) != ("bytes", "rows"):
-        raise HeaderError(f"channels: wanted an object with bytes and rows, got {_short(value)}")
+        raise HeaderError(f"channels: wanted an object with bytes and rows, got {shown(value)}")
     taken = _integers("channels.bytes", value["bytes"], 0, COUNT_MOST)
     rows = _integers("channels.rows", value["rows"], 0, count)
     kinds = len(channel_parts(sh_degree))
     if len(taken) != kinds or len(rows) != sh_degree:
-        raise HeaderError(f"channels: wanted {kinds} bytes and {sh_degree} rows, got {_short(value)}")
+        raise HeaderError(f"channels: wanted {kinds} bytes and {sh_degree} rows, got {shown(value)}")
     return Channels(taken, rows)
 
 
 def _integers(name: str, value: object, lowest: int, highest: int) -> tuple[int, ...]:
     if not isinstance(value, list):
-        raise HeaderError(f"{name}: wanted a list of integers, got {_short(value)}")
-    return tuple(_integer(name, number, lowest, highest) for number in value)
+        raise HeaderError(f"{name}: wanted a list of integers, got {shown(value)}")
+    return tuple(checked_integer(name, number, lowest, highest) for number in value)
 
 
 __all__ = ["GridHeader", "decode_header", "encode_header", "least_bytes"]

@@ -37,6 +37,8 @@ class Candidate:
     excess : float
         By how much the target was missed; zero or less holds.
     seconds : float
+    left_out : int
+        Gaussians that no scored pose sees and that would have made all others coarser (see `Kept`).
     """
 
     multiplier: float
@@ -46,6 +48,7 @@ class Candidate:
     measurement: Measurement
     excess: float
     seconds: float
+    left_out: int = 0
 
     @property
     def holds(self) -> bool:

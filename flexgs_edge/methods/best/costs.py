@@ -35,7 +35,7 @@ class RemovalCosts:
     Attributes
     ----------
     removal : np.ndarray
-        [N] f64, of removing the Gaussian (kernels.md: exact with the other splats' hits frozen).
+        [N] f64, of removing the Gaussian (exact with the other splats' hits frozen).
     weight2 : np.ndarray
         [N] f64, sum of squared weights (alpha T)^2; 0 for Gaussians that no pose sees.
     sh : np.ndarray

@@ -51,7 +51,7 @@ FARTHER = 0.05
 PROBES = 4
 """Unmended results that are looked at between two whole ones, at most: less than a tenth of the time each."""
 FARTHEST = 2.0
-"""The same for probes together."""
+"""Largest change of the log of the multiplier by all probes of one aim."""
 
 
 def rate_from(fidelity: float | None) -> float:
@@ -68,7 +68,7 @@ class GridSearch(MultiplierSearch[GridScene]):
 
     Parameters
     ----------
-    path : PruneRounds
+    rounds : PruneRounds
     size_of : callable
         Exact bytes of a grid's file.
     measure : callable
@@ -79,7 +79,7 @@ class GridSearch(MultiplierSearch[GridScene]):
 
     def __init__(
         self,
-        path: PruneRounds,
+        rounds: PruneRounds,
         size_of: Callable[[GridScene], int],
         measure: Measure,
         effort: Effort,
@@ -87,7 +87,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         on_step: Callable[[Candidate], None] | None = None,
         steps: int = 0,
     ) -> None:
-        super().__init__(path, measure, effort, on_step)
+        super().__init__(rounds, measure, effort, on_step)
         self.size_of, self.refit, self.steps = size_of, refit, steps
         if steps:
             self.pruned_part, self.keeps_best = PRUNED_DISTILLED, True
@@ -100,14 +100,14 @@ class GridSearch(MultiplierSearch[GridScene]):
 
     def _before_refit(self, multiplier: float) -> GridScene:
         kept, steps = self._choice(multiplier)
-        return to_grid(kept.planes, kept.degrees, steps, self.path.origin, storage=self.path.storage)[0]
+        return to_grid(kept.planes, kept.degrees, steps, self.rounds.origin, storage=self.rounds.storage)[0]
 
     def _probe(self, multiplier: float, target: Target) -> float:
         """The excess of a multiplier's result without a refit of its own."""
         grid = self._before_refit(multiplier)
         if target.limit_bytes is not None:
             return target.excess(self.size_of(grid), None)
-        return target.excess(0, self.measure(values_of(grid, self.path.storage), estimate=True))
+        return target.excess(0, self.measure(values_of(grid, self.rounds.storage), estimate=True))
 
     def _aim(self, multiplier: float, steps: Sequence[Candidate], target: Target) -> float:
         """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""
@@ -150,27 +150,30 @@ class GridSearch(MultiplierSearch[GridScene]):
         kept = self.kept(multiplier)
         mended = self._descended(multiplier) if self.steps else self._mended
         if mended is not None:
-            kept.planes = mended.apply(kept.rows, kept.degrees, kept.planes, self.path.storage)
-        snapshot = self.path.snapshots[kept.snapshot]
+            kept.planes = mended.apply(kept.rows, kept.degrees, kept.planes, self.rounds.storage)
+        snapshot = self.rounds.snapshots[kept.snapshot]
         if self._slopes is None:
             # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
             self._slopes = probe_slopes(
-                self.path.renderer, snapshot.planes, self.path.origin, self.path.cameras, self.effort.probed
+                self.rounds.renderer, snapshot.planes, self.rounds.origin, self.rounds.cameras, self.effort.probed
             )
         steps = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
-        kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0), self.path.storage)
+        count = len(kept.rows)
+        kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0), self.rounds.storage)
+        kept.left_out = count - len(kept.rows)
         return kept, holdable(steps, kept.planes)
 
     def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, GridScene]:
         started = time.perf_counter()
         kept, steps = self._choice(multiplier)
         grid = self._distilled(multiplier, kept, steps) if self.steps else self._finish(kept, steps)
-        grid = lowered(grid, self.path.storage)
+        grid = lowered(grid, self.rounds.storage)
         size = self.size_of(grid)
-        measurement = self.measure(values_of(grid, self.path.storage))
+        measurement = self.measure(values_of(grid, self.rounds.storage))
         excess = target.excess(size, measurement)
         seconds = time.perf_counter() - started
-        return Candidate(multiplier, len(kept.rows), grid.sh_count, size, measurement, excess, seconds), grid
+        found = Candidate(multiplier, len(kept.rows), grid.sh_count, size, measurement, excess, seconds, kept.left_out)
+        return found, grid
 
     def _descended(self, multiplier: float) -> Refitted | None:
         """Values of the last descent that kept what this multiplier keeps and more.
@@ -183,72 +186,72 @@ class GridSearch(MultiplierSearch[GridScene]):
 
     def _distilled(self, multiplier: float, kept: Kept, steps: StepSizes) -> GridScene:
         """All values moved towards the original's renders with the grid in view, on the grid, and the constant refitted."""
-        path = self.path
+        rounds = self.rounds
         first = self._descended(multiplier) is None
         count, rate = (self.steps, 1.0) if first else (math.ceil(FURTHER_STEPS * self.steps), FURTHER_RATE)
         rate *= rate_from(self.measure(kept.planes, estimate=True).fidelity)
         moved = distil(
-            path.renderer,
+            rounds.renderer,
             kept.planes,
             kept.degrees,
-            path.origin,
-            [*path.cameras, *path.between],
-            path.targets,
+            rounds.origin,
+            [*rounds.cameras, *rounds.between],
+            rounds.targets,
             Schedule(count, rate),
             steps,
-            progress=path.progress,
+            progress=rounds.progress,
         )
         own = np.arange(len(kept.rows))
         self._descents.append((multiplier, Refitted.of(kept.rows, kept.degrees, own, moved, fields=tuple(moved))))
-        grid, order = to_grid(moved, kept.degrees, holdable(steps, moved), path.origin)
+        grid, order = to_grid(moved, kept.degrees, holdable(steps, moved), rounds.origin)
         if not self.refit:
             return grid
         moved = refit_colours(
-            path.bench,
+            rounds.bench,
             values_of(grid),
             kept.degrees[order],
-            path.origin,
-            path.cameras,
-            path.targets,
+            rounds.origin,
+            rounds.cameras,
+            rounds.targets,
             rounds=1,
             bands=False,
-            subsets=self.effort.subsets_of(len(path.cameras)),
-            progress=path.progress,
+            subsets=self.effort.subsets_of(len(rounds.cameras)),
+            progress=rounds.progress,
         )
         return recolour(grid, moved["sh_dc"], moved["sh_rest"])
 
     def _finish(self, kept: Kept, steps: StepSizes) -> GridScene:
         """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
-        path, storage, planes = self.path, self.path.storage, kept.planes
+        rounds, storage, planes = self.rounds, self.rounds.storage, kept.planes
         fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
         fine = holdable(fine, planes)
-        grid, order = to_grid(planes, kept.degrees, fine, path.origin, storage=storage)
+        grid, order = to_grid(planes, kept.degrees, fine, rounds.origin, storage=storage)
         degrees = kept.degrees[order]
         moved = values_of(grid, storage)
         if self.refit:
-            shared = (path.origin, path.cameras, path.targets)
+            shared = (rounds.origin, rounds.cameras, rounds.targets)
             if self.effort.refit_rounds:
                 moved = refit_colours(
-                    path.bench,
+                    rounds.bench,
                     moved,
                     degrees,
                     *shared,
                     rounds=self.effort.refit_rounds,
-                    subsets=self.effort.subsets_of(len(path.cameras)),
-                    progress=path.progress,
+                    subsets=self.effort.subsets_of(len(rounds.cameras)),
+                    progress=rounds.progress,
                 )
                 self._mended = Refitted.of(kept.rows, kept.degrees, order, moved, storage)
             grid = replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree]))
             coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], storage), storage)
             moved = refit_colours(
-                path.bench,
+                rounds.bench,
                 coarse,
                 degrees,
                 *shared,
                 rounds=1,
                 bands=False,
-                subsets=self.effort.subsets_of(len(path.cameras)),
-                progress=path.progress,
+                subsets=self.effort.subsets_of(len(rounds.cameras)),
+                progress=rounds.progress,
             )
         final = replace(grid.steps, dc=steps.dc, sh=steps.sh[: grid.sh_degree])
         return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"], storage)

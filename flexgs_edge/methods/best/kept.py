@@ -78,6 +78,8 @@ class Kept:
         [n] u8, SH degrees.
     weight2 : np.ndarray
         [n] f64, sums of squared weights.
+    left_out : int
+        Rows that would have asked for coarser steps of all others, and went.
     """
 
     snapshot: int
@@ -85,6 +87,7 @@ class Kept:
     planes: dict[str, np.ndarray]
     degrees: np.ndarray
     weight2: np.ndarray
+    left_out: int = 0
 
     def take(self, keep: np.ndarray, storage: Storage = IN_MEMORY) -> Kept:
         """Some of the rows: [n] bool."""

@@ -267,14 +267,12 @@ def search_rounds(
 
     search = make(rounds, measure, report)
     found = search.run(run.target, run.options.best_effort)
-    if isinstance(found.product, GridScene):
-        beyond = len(search.kept(found.chosen.multiplier).rows) - found.product.count
-        if beyond:
-            LOG.warning(
-                "%d Gaussians that no scored pose sees were left out: they lie so far away, or are so extreme, that all others "
-                "would have to be coded more coarsely",
-                beyond,
-            )
+    if found.chosen.left_out:
+        LOG.warning(
+            "%d Gaussians that no scored pose sees were left out: they lie so far away, or are so extreme, that all others "
+            "would have to be coded more coarsely",
+            found.chosen.left_out,
+        )
     return found.product, _as_search(found, source.count)
 
 

@@ -45,7 +45,7 @@ class MultiplierSearch(ABC, Generic[Product]):
 
     Parameters
     ----------
-    path : PruneRounds
+    rounds : PruneRounds
     measure : callable
         Quality of planes without quantization, where the search starts.
     effort : Effort
@@ -60,12 +60,12 @@ class MultiplierSearch(ABC, Generic[Product]):
 
     def __init__(
         self,
-        path: PruneRounds,
+        rounds: PruneRounds,
         measure: Measure,
         effort: Effort,
         on_step: Callable[[Candidate], None] | None = None,
     ) -> None:
-        self.path, self.measure, self.effort, self.on_step = path, measure, effort, on_step
+        self.rounds, self.measure, self.effort, self.on_step = rounds, measure, effort, on_step
         self.bits = BitModel()
 
     @abstractmethod
@@ -124,18 +124,18 @@ class MultiplierSearch(ABC, Generic[Product]):
     def _start(self, target: Target) -> float:
         """Walk down until pruning alone has used up its part of the target; the multiplier at that cut."""
         for _ in range(MOST_ROUNDS):
-            last = self.path.snapshots[-1]
+            last = self.rounds.snapshots[-1]
             if target.limit_bytes is not None:
                 if last.count * self.bits.base / 8 <= target.limit_bytes:
                     break
-            elif len(self.path.snapshots) > 1:
+            elif len(self.rounds.snapshots) > 1:
                 excess = target.excess(0, self.measure(last.planes, estimate=True))
                 if excess >= math.log(self.pruned_part):
                     break
             if last.count < 16:
                 break
-            self.path.descend(self.effort.keep)
-        return self._cut(self.path.snapshots[-1])
+            self.rounds.descend(self.effort.keep)
+        return self._cut(self.rounds.snapshots[-1])
 
     def _cut(self, snapshot: Snapshot) -> float:
         """The multiplier at which a snapshot would lose half a round more."""
@@ -148,9 +148,9 @@ class MultiplierSearch(ABC, Generic[Product]):
     def _snapshot(self, multiplier: float) -> tuple[int, np.ndarray, np.ndarray]:
         """The first snapshot that this multiplier would not cut by more than a round, and its choice; walks on if needed."""
         for index in range(MOST_ROUNDS + 1):
-            if index == len(self.path.snapshots):
-                self.path.descend(self.effort.keep)
-            snapshot = self.path.snapshots[index]
+            if index == len(self.rounds.snapshots):
+                self.rounds.descend(self.effort.keep)
+            snapshot = self.rounds.snapshots[index]
             keep, degrees = self.choose(snapshot.costs, multiplier)
             if keep.mean() >= self.effort.keep or snapshot.count < 16:
                 break
@@ -159,8 +159,8 @@ class MultiplierSearch(ABC, Generic[Product]):
     def kept(self, multiplier: float) -> Kept:
         """What a multiplier keeps."""
         index, keep, degrees = self._snapshot(multiplier)
-        snapshot = self.path.snapshots[index]
-        rows, storage = np.flatnonzero(keep), self.path.storage
+        snapshot = self.rounds.snapshots[index]
+        rows, storage = np.flatnonzero(keep), self.rounds.storage
         planes = drop_bands(snapshot.planes, rows, degrees[rows], snapshot.costs.sh_mean, SH_C0, storage)
         weight2 = storage.take(snapshot.costs.weight2, rows)
         return Kept(index, storage.take(snapshot.rows, rows), planes, degrees[rows], weight2)

@@ -38,16 +38,16 @@ class FileSearch(MultiplierSearch[WrittenFile]):
 
     def __init__(
         self,
-        path: PruneRounds,
+        rounds: PruneRounds,
         files: FileMaker,
         measure: Measure,
         effort: Effort,
         refit: bool = True,
         on_step: Callable[[Candidate], None] | None = None,
     ) -> None:
-        super().__init__(path, measure, effort, on_step)
+        super().__init__(rounds, measure, effort, on_step)
         self.files, self.refit = files, refit
-        self.bits = bit_model(files.format, len(path.snapshots[0].costs.sh))
+        self.bits = bit_model(files.format, len(rounds.snapshots[0].costs.sh))
 
     def choose(self, costs: RemovalCosts, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
         """See `MultiplierSearch`; one degree for all where the format has no other way."""
@@ -64,7 +64,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         kept = self.kept(multiplier)
         planes, degrees = kept.planes, kept.degrees
         planes["sh_rest"] = lower_degree(planes["sh_rest"], int(degrees.max(initial=0)))
-        order = near_order(MemorySource(planes, origin=self.path.origin))
+        order = near_order(MemorySource(planes, origin=self.rounds.origin))
         file = self._finish(take_rows(planes, order), degrees[order])
         assert file.measurement is not None
         excess = target.excess(file.size, file.measurement)
@@ -73,37 +73,37 @@ class FileSearch(MultiplierSearch[WrittenFile]):
 
     def _finish(self, planes: dict[str, np.ndarray], degrees: np.ndarray) -> WrittenFile:
         """All colours refitted to the decoded geometry, then the constant to the decoded SH; geometry goes in as it was."""
-        path = self.path
+        rounds = self.rounds
         if not self.refit:
-            return self.files.make(MemorySource(planes, origin=path.origin))
-        found, rows = self.files.geometry(MemorySource(planes, origin=path.origin))
-        shared = (degrees[rows], found.origin, path.cameras, path.targets)
+            return self.files.make(MemorySource(planes, origin=rounds.origin))
+        found, rows = self.files.geometry(MemorySource(planes, origin=rounds.origin))
+        shared = (degrees[rows], found.origin, rounds.cameras, rounds.targets)
         geometry = found.read(slice(0, found.count), list(FIELD))
         colours = {name: np.ascontiguousarray(planes[name][:, rows]) for name in ("sh_dc", "sh_rest")}
         moved = refit_colours(
-            path.bench,
+            rounds.bench,
             {**geometry, **colours},
             *shared,
             rounds=self.effort.refit_rounds,
-            subsets=self.effort.subsets_of(len(path.cameras)),
-            progress=path.progress,
+            subsets=self.effort.subsets_of(len(rounds.cameras)),
+            progress=rounds.progress,
         )
         planes = {**planes, "sh_dc": _put(moved["sh_dc"], rows), "sh_rest": _put(moved["sh_rest"], rows)}
         if len(planes["sh_rest"]):
-            place, coded = self.files.write(MemorySource(planes, origin=path.origin))
+            place, coded = self.files.write(MemorySource(planes, origin=rounds.origin))
             decoded = coded.read(slice(0, coded.count), list(FIELD))
             place.unlink()
             mended = refit_colours(
-                path.bench,
+                rounds.bench,
                 {**decoded, "sh_dc": moved["sh_dc"]},
                 *shared,
                 rounds=1,
                 bands=False,
-                subsets=self.effort.subsets_of(len(path.cameras)),
-                progress=path.progress,
+                subsets=self.effort.subsets_of(len(rounds.cameras)),
+                progress=rounds.progress,
             )
             planes["sh_dc"] = _put(mended["sh_dc"], rows)
-        return self.files.make(MemorySource(planes, origin=path.origin))
+        return self.files.make(MemorySource(planes, origin=rounds.origin))
 
 
 def _put(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -123,4 +123,4 @@ def bit_model(format: Format, sh_degree: int) -> BitModel:
 def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[WrittenFile]:
     """Searches for a file of another program's format."""
     plan = EFFORTS[options.effort]
-    return lambda path, measure, report: FileSearch(path, files, measure, plan, options.refit, report)
+    return lambda rounds, measure, report: FileSearch(rounds, files, measure, plan, options.refit, report)

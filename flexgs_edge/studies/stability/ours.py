@@ -80,40 +80,40 @@ def walked(
         yield rounds
 
 
-def scored_pixels(path: PruneRounds) -> int:
+def scored_pixels(rounds: PruneRounds) -> int:
     """Pixels that a path looks at in all its poses."""
-    return sum(camera.width * camera.height for camera in path.cameras)
+    return sum(camera.width * camera.height for camera in rounds.cameras)
 
 
-def search(studied: StudyScene, path: PruneRounds, target: Target, judge: Judge | None = None) -> Whole:
+def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: Judge | None = None) -> Whole:
     """The search for a target along a path; the closest result where it cannot be met."""
     judge = judge or studied.judge
-    made = _search(studied, path, judge, path.renderer)
+    made = _search(studied, rounds, judge, rounds.renderer)
     with studied.run.clock.stage("search"):
         found = made.run(target, best_effort=True)
     multiplier = found.chosen.multiplier
     return _whole(made, found.product, multiplier, found.reached)
 
 
-def whole_at(studied: StudyScene, path: PruneRounds, judge: Judge, multiplier: float) -> Whole:
+def whole_at(studied: StudyScene, rounds: PruneRounds, judge: Judge, multiplier: float) -> Whole:
     """The whole result at a multiplier, without a search."""
-    made = _search(studied, path, judge, path.renderer)
+    made = _search(studied, rounds, judge, rounds.renderer)
     with studied.run.clock.stage("search"):
         grid = made.at(multiplier)
     return _whole(made, grid, multiplier, True)
 
 
-def _search(studied: StudyScene, path: PruneRounds, judge: Judge, renderer: Renderer) -> FixedSearch:
+def _search(studied: StudyScene, rounds: PruneRounds, judge: Judge, renderer: Renderer) -> FixedSearch:
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
-        with renderer.load(MemorySource(planes, origin=path.origin)) as scene:
+        with renderer.load(MemorySource(planes, origin=rounds.origin)) as scene:
             return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))
 
     options = replace(studied.run.options, refit=True)
-    made = grid_search(options, GridCoder(renderer), FixedSearch)(path, measure, lambda step: None)
+    made = grid_search(options, GridCoder(renderer), FixedSearch)(rounds, measure, lambda step: None)
     assert isinstance(made, FixedSearch)
     return made
 
 
 def _whole(made: FixedSearch, grid: GridScene, multiplier: float, reached: bool) -> Whole:
-    rows = made.path.scene_rows(made.kept(multiplier).rows)
-    return Whole(grid, coded_size(grid, {}), multiplier, rows, scored_pixels(made.path), reached)
+    rows = made.rounds.scene_rows(made.kept(multiplier).rows)
+    return Whole(grid, coded_size(grid, {}), multiplier, rows, scored_pixels(made.rounds), reached)

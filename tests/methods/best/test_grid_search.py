@@ -36,7 +36,7 @@ BYTES = 4000
 """The multiplier at which the worlds lose 1 dB, and the bytes that they take there (53 bits for each of 600 Gaussians)."""
 
 
-class FakePath:
+class FakeRounds:
     """A path whose costs are known: descending removes the cheapest and changes no cost."""
 
     renderer = origin = targets = None
@@ -72,7 +72,7 @@ class World:
     def __init__(self, loss: Callable[[float], float], size: Callable[[float], float], floor: float = 0.0) -> None:
         self.loss, self.size, self.floor = loss, size, floor
         self.grids: list[GridScene] = []
-        self.path = FakePath()
+        self.rounds = FakeRounds()
 
     def size_of(self, grid: GridScene) -> int:
         self.grids.append(grid)
@@ -81,7 +81,7 @@ class World:
 
     def measure(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         if self.multiplier is None:  # the walk down, before anything was coded: pruning alone
-            costs = self.path.snapshots[-1].costs
+            costs = self.rounds.snapshots[-1].costs
             least = costs.removal[costs.weight2 > 0].min(initial=1e9)
             drop = 0.45 * max(self.loss(max(least / 50, 1e-30)), self.floor)
         else:
@@ -105,12 +105,12 @@ def _known_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def search(
-    world: World, target: Target, path: FakePath | None = None, best_effort: bool = False, **words: Any
+    world: World, target: Target, rounds: FakeRounds | None = None, best_effort: bool = False, **words: Any
 ) -> RateResult[GridScene]:
     words = {"effort": EFFORT, "refit": False, **words}
     World.multiplier = None
-    world.path = path or FakePath()
-    found = GridSearch(world.path, world.size_of, world.measure, **words)  # type: ignore[arg-type]
+    world.rounds = rounds or FakeRounds()
+    found = GridSearch(world.rounds, world.size_of, world.measure, **words)  # type: ignore[arg-type]
     return found.run(target, best_effort)
 
 
@@ -135,7 +135,7 @@ def test_a_world_with_a_shallow_slope_is_met_as_well() -> None:
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_the_unit_of_errors_does_not_matter(scale: float) -> None:
     world = World(lambda m: (m / (scale * AT)) ** 0.6, lambda m: BYTES * (m / (scale * AT)) ** -0.45)
-    found = search(world, MaxDrop(1.0), FakePath(scale=scale))
+    found = search(world, MaxDrop(1.0), FakeRounds(scale=scale))
     assert found.reached and found.chosen.excess > -EFFORT.close
     assert found.chosen.multiplier == pytest.approx(scale * AT, rel=0.1)
 
@@ -212,10 +212,10 @@ def test_the_same_search_every_time() -> None:
 
 
 def test_the_path_is_walked_down_by_the_effort_s_share() -> None:
-    path = FakePath()
-    found = search(powers(), MaxDrop(1.0), path, effort=replace(EFFORT, keep=0.7))
-    assert set(path.shares) == {0.7} and found.chosen.count <= path.snapshots[0].count
-    counts = [snapshot.count for snapshot in path.snapshots]
+    rounds = FakeRounds()
+    found = search(powers(), MaxDrop(1.0), rounds, effort=replace(EFFORT, keep=0.7))
+    assert set(rounds.shares) == {0.7} and found.chosen.count <= rounds.snapshots[0].count
+    counts = [snapshot.count for snapshot in rounds.snapshots]
     assert counts == sorted(counts, reverse=True)
 
 
@@ -226,20 +226,20 @@ def test_larger_multipliers_keep_fewer() -> None:
 
 
 def test_unseen_gaussians_stay() -> None:
-    path = FakePath(unseen=60)
-    found = search(powers(), MaxDrop(1.0), path)
-    positions = np.rint(path.snapshots[0].planes["means"][:, :60] / found.product.steps.position).astype(int)
+    rounds = FakeRounds(unseen=60)
+    found = search(powers(), MaxDrop(1.0), rounds)
+    positions = np.rint(rounds.snapshots[0].planes["means"][:, :60] / found.product.steps.position).astype(int)
     kept = {tuple(p) for p in found.product.position.T.tolist()}
     assert found.reached and all(tuple(p) in kept for p in positions.T.tolist())
 
 
 def test_unseen_gaussians_that_would_coarsen_the_grid_go() -> None:
-    calm, astray = FakePath(unseen=60), FakePath(unseen=60)
+    calm, astray = FakeRounds(unseen=60), FakeRounds(unseen=60)
     astray.snapshots[0].planes["means"][:, 7] = 1e7
     steps, counts = zip(
         *(
             (found.product.steps, found.product.count)
-            for found in (search(powers(), MaxDrop(1.0), path) for path in (calm, astray))
+            for found in (search(powers(), MaxDrop(1.0), rounds) for rounds in (calm, astray))
         )
     )
     assert steps[0] == steps[1] and counts[1] == counts[0] - 1
@@ -248,12 +248,12 @@ def test_unseen_gaussians_that_would_coarsen_the_grid_go() -> None:
 @pytest.mark.parametrize("count", [1, 2, 15, 17])
 @pytest.mark.parametrize("target", [MaxDrop(1.0), MaxSize(3000, "drop")])
 def test_few_gaussians(count: int, target: Target) -> None:
-    found = search(powers(), target, FakePath(count))
+    found = search(powers(), target, FakeRounds(count))
     assert found.reached and found.product.count <= count
 
 
 def test_nothing_that_any_pose_sees() -> None:
-    found = search(powers(), MaxDrop(1.0), FakePath(40, unseen=40), best_effort=True)
+    found = search(powers(), MaxDrop(1.0), FakeRounds(40, unseen=40), best_effort=True)
     assert found.product.count == 40 and found.product.sh_count == 0
 
 
@@ -286,9 +286,9 @@ def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: 
     monkeypatch.setattr(search_module, "refit_colours", lambda renderer, planes, *_, **__: planes)
     monkeypatch.setattr(search_module, "rate_from", lambda fidelity: 1.0)
     world = World(lambda m: found / DISTILLED * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
-    path = FakePath()
-    path.cameras, path.between, path.progress = [], [], None  # type: ignore[attr-defined]
-    result = search(world, MaxDrop(1.0), path, refit=True, steps=100)
+    rounds = FakeRounds()
+    rounds.cameras, rounds.between, rounds.progress = [], [], None  # type: ignore[attr-defined]
+    result = search(world, MaxDrop(1.0), rounds, refit=True, steps=100)
     assert result.reached and len(seen) == len(result.steps)
     tried: list[float] = []
     for step, call in zip(result.steps, seen, strict=True):
