@@ -12,11 +12,11 @@ import pytest
 
 from flexgs_edge.errors import TargetError
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, MinFidelity, Target
+from flexgs_edge.grid import to_grid as grid
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.grid.to_grid import to_grid as grid
 from flexgs_edge.memory.storage import IN_MEMORY
-from flexgs_edge.methods.best import multiplier as search_module
+from flexgs_edge.methods.best import grid_search as search_module
 from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
@@ -287,7 +287,7 @@ def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: 
     monkeypatch.setattr(search_module, "rate_from", lambda fidelity: 1.0)
     world = World(lambda m: found / DISTILLED * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
     rounds = FakeRounds()
-    rounds.cameras, rounds.between, rounds.progress = [], [], None  # type: ignore[attr-defined]
+    rounds.cameras, rounds.between, rounds.progress, rounds.bench = [], [], None, None  # type: ignore[attr-defined]
     result = search(world, MaxDrop(1.0), rounds, refit=True, steps=100)
     assert result.reached and len(seen) == len(result.steps)
     tried: list[float] = []
