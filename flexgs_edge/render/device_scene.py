@@ -11,12 +11,12 @@ import numpy as np
 from flexgs_edge.constants import LANES
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.render import fit as fit_module
 from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.chunk_loads import ChunkLoads
 from flexgs_edge.render.chunks import Chunk, ChunkArrays, QuantizedPlanes, SourcePlanes
 from flexgs_edge.render.fit import (
     AHEAD_SHARE,
-    DEFAULT,
     MOST_SUMS,
     RAW_BYTES,
     SUM_BYTES,
@@ -50,7 +50,7 @@ class DeviceScene:
         Views will be compared with targets on the backend: room for these is taken with the view's.
     view_sums : int
         Planes of sums that a view has at most.
-    fit : Fit
+    fit : Fit, optional
         How it shares memory with its views.
     """
 
@@ -63,7 +63,7 @@ class DeviceScene:
         sum_bytes: int = SUM_BYTES,
         targets: bool = False,
         view_sums: int = MOST_SUMS,
-        fit: Fit = DEFAULT,
+        fit: Fit | None = None,
     ) -> None:
         self.backend = backend
         self.count = planes.count
@@ -75,7 +75,7 @@ class DeviceScene:
         self.targets = targets
         self.sum_bytes = sum_bytes
         self.view_sums = view_sums
-        self.fit = fit
+        self.fit = fit or fit_module.DEFAULT
         self.changes = 0
         """Times that its values have changed."""
         self.shown: int | None = None
@@ -89,7 +89,7 @@ class DeviceScene:
         """First row of the one that is being used."""
         self._rows = 0
         self._chunk_row_bytes = streamed_bytes(planes.sh_degree)
-        self._least_rows = min(fit.least_rows, max(self.count, 1))
+        self._least_rows = min(self.fit.least_rows, max(self.count, 1))
 
     @property
     def source(self) -> SceneSource | None:

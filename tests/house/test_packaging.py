@@ -82,7 +82,7 @@ def test_name_version_licence_and_command(archives: tuple[Path, Path]) -> None:
     assert f"\nName: flexgs-edge\nVersion: {flexgs_edge.__version__}\n" in metadata
     assert "Requires-Python: >=3.10" in metadata
     assert re.search(r"^License(-Expression)?: Apache-2\.0$", metadata, re.MULTILINE)
-    assert "flexgs-edge = flexgs_edge.cli:main" in wheel.read(f"{info}/entry_points.txt").decode()
+    assert "flexgs-edge = flexgs_edge.cli.app:main" in wheel.read(f"{info}/entry_points.txt").decode()
     assert any(name.endswith("LICENSE") for name in wheel.namelist())
 
 

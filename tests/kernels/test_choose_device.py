@@ -121,7 +121,7 @@ def test_no_platform(tmp_path: Path) -> None:
     code = (
         "from flexgs_edge.memory.budget import MemoryBudget\n"
         "from flexgs_edge.errors import DeviceError\n"
-        "from flexgs_edge.kernels import open_backend\n"
+        "from flexgs_edge.kernels.open_backend import open_backend\n"
         "assert open_backend('numpy', MemoryBudget(1 << 30)).is_numpy\n"
         "try:\n    open_backend(None, MemoryBudget(1 << 30))\n"
         "except DeviceError as error:\n    print(error)\n"

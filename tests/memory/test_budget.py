@@ -190,6 +190,6 @@ def test_memory_where_nothing_can_be_read(tmp_path: Path) -> None:
 def test_the_peak_is_this_process_s_own() -> None:
     """ru_maxrss survives exec: a child of a large process would report its parent."""
     ballast = np.ones(200 * 2**20, np.uint8)
-    command = [sys.executable, "-c", "from flexgs_edge.memory.budget import peak_rss; print(peak_rss())"]
+    command = [sys.executable, "-c", "from flexgs_edge.memory.process import peak_rss; print(peak_rss())"]
     found = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[2])
     assert int(found.stdout) < ballast.nbytes

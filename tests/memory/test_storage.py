@@ -86,7 +86,7 @@ def test_rows_in_any_order_are_taken(storage: Storage, monkeypatch: pytest.Monke
     values = storage.copy(np.random.default_rng(4).normal(size=(3, COUNT)))
     fetched = []
     monkeypatch.setattr(memory_rows, "fetch", lambda plane, rows: fetched.append(rows))
-    for whole in (storage.WHOLE_BYTES, 0):
+    for whole in (storage_module.WHOLE_BYTES, 0):
         monkeypatch.setattr(storage, "whole_bytes", whole)
         for rows, apart in (
             (np.arange(0, COUNT, 2), False),
@@ -156,8 +156,8 @@ def test_small_arrays_stay_in_memory(tmp_path: Path) -> None:
 
 def test_a_kill_leaves_nothing(tmp_path: Path) -> None:
     code = (
-        "import os, signal, sys; from flexgs_edge.memory.storage import Scratch; room = Scratch(sys.argv[1])\n"
-        "values = room.empty((1 << 20,), 'f8'); values[:] = 1; file = room.file(); file.write(bytes(1 << 20)); file.flush()\n"
+        "import os, signal, sys; from flexgs_edge.memory.storage import ScratchStorage; storage = ScratchStorage(sys.argv[1])\n"
+        "values = storage.empty((1 << 20,), 'f8'); values[:] = 1; file = storage.file(); file.write(bytes(1 << 20)); file.flush()\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)

@@ -22,6 +22,7 @@ from flexgs_edge.run.run import Run
 from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
+from flexgs_edge.views.bench import Bench
 from tiny_project import COUNT, make_project
 
 VIEWS = [0, 3, 8]
@@ -61,13 +62,13 @@ def half_of(source: SceneSource) -> dict[str, np.ndarray]:
 def count_images(monkeypatch: pytest.MonkeyPatch) -> list[None]:
     """Gets longer whenever a scene's views are drawn from now on."""
     drawn: list[None] = []
-    images = Renderer.images
+    images = Bench.images
 
-    def counted(self: Renderer, *words: object) -> object:
+    def counted(self: Bench, *words: object) -> object:
         drawn.append(None)
         return images(self, *words)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Renderer, "images", counted)
+    monkeypatch.setattr(Bench, "images", counted)
     return drawn
 
 
