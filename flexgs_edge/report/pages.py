@@ -209,7 +209,7 @@ def _search_section(result: CompressResult, material: Material) -> list[str]:
         "<h2>Search</h2>",
         f"<p>{text(words)}</p>",
         f'<div class="two"><div>{search_chart.step_chart(search.steps, search.chosen, material.target)}</div>',
-        f"<details{state}><summary>All steps</summary>{table(heads, rows, 'StepSizes of the search')}</details></div>",
+        f"<details{state}><summary>All steps</summary>{table(heads, rows, 'Steps of the search')}</details></div>",
     ]
 
 
