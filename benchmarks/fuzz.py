@@ -1,6 +1,6 @@
 """Mutates files by the million and shows that every reader says what is wrong, or reads what is right.
 
-    python -m benchmarks.fuzz                          # a million, and writes docs/fuzzing.md: 8 processor minutes
+    python -m benchmarks.fuzz                          # a million, and writes docs/results/fuzzing.md: 8 processor minutes
     python -m benchmarks.fuzz --part 0.1               # a tenth of it
     python -m benchmarks.fuzz --tries 2000 --only v2   # so many of one kind; writes nothing
 
@@ -42,7 +42,7 @@ from flexgs_edge.scene.source import SceneSource
 
 SEEDS = ROOT / "tests" / "fuzz" / "seeds"
 """Small valid files that mutations start from."""
-TABLE = ROOT / "docs" / "fuzzing.md"
+TABLE = ROOT / "docs" / "results" / "fuzzing.md"
 SLOW = 1.0
 """Processor seconds that no try may take."""
 STUCK = 20.0
@@ -275,18 +275,13 @@ def fuzz(kind: Kind, first: int, tries: int, keep: Path | None = None) -> Tally:
 
 HEAD = """# Fuzzing
 
-Small valid files (`tests/fuzz/seeds`) are changed and read. `python -m benchmarks.fuzz` makes this page; each try has a number,
-which is the seed of its choices, so all of it can be made again. A part of it runs with the tests (`tests/fuzz`), and so do the
-files of `tests/fuzz/corpus`, each of which must be refused.
+Small valid files (`tests/fuzz/seeds`) are changed and read. `python -m benchmarks.fuzz` makes this page. Each try has a number,
+the seed of its choices, so it can be made again. The tests repeat a part (`tests/fuzz`), and read the files of
+`tests/fuzz/corpus`, which must be refused.
 
-*Plain* changes of a container leave its checksums as they were: `verify` has to find every one. *Sealed* ones have their
-checksums made right again, so that the decoders meet them: they may give values, all finite, or an error that names the file. A
-change is of one to four bits, bytes or numbers, or pieces cut out, put in, doubled and moved; of text, words and lines; of JSON,
-values and keys. Warnings of arithmetic count as crashes.
-
-Found so, and mended: camera files with lists nested hundreds of levels deep ended in a `RecursionError`; rotations and
-quaternions of 1e200 in camera files, and grid steps of 1e300 in a header, gave a warning of NumPy beside the error. The files are
-in the corpus.
+*Plain* changes of a container leave its checksums as they were: `verify` must find every one. *Sealed* ones correct them, so that
+the decoders meet the change: they may give finite values, or an error that names the file. A change is of up to four bits, bytes
+or numbers, or of pieces; in text, of words and lines; in JSON, of values and keys. A warning of arithmetic counts as a crash.
 
 | what | tries | refused | read | not found | crashes, warnings | over {slow:g} s | slowest | most allocated | of its bound |
 |---|---|---|---|---|---|---|---|---|---|

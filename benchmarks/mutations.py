@@ -1,11 +1,11 @@
 """Plants one fault at a time in a copy of the kernels and shows which test turns red.
 
-    python -m benchmarks.mutations                    # all, and writes docs/mutations.md
+    python -m benchmarks.mutations                    # all, and writes docs/results/mutations.md
     python -m benchmarks.mutations --only conic -v    # those whose name holds a word; writes nothing
 
-The twins stay as they are, so that the comparison with them sees every fault by construction. What counts is the first
-column: tests against the float64 reference, which knows neither kernels nor twins. (A coder has no values of its own to be wrong
-in: what its kernels are held against is the coder in NumPy, in the second column.)
+The twins stay as they are, so that the comparison with them sees every fault by construction. What counts are the tests against
+the float64 reference, which knows neither kernels nor twins. (A coder has no values of its own to be wrong in: its kernels are
+held against the coder in NumPy.)
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 
 from benchmarks.harness import ROOT, SCENES
 
-TABLE = ROOT / "docs" / "mutations.md"
+TABLE = ROOT / "docs" / "results" / "mutations.md"
 SURVIVED = "survived"
 
 
@@ -286,25 +286,34 @@ def judge(place: Path, mutation: Mutation | None, tests: Tests, verbose: bool = 
 
 
 def table(rows: list[tuple[Mutation, tuple[str | None, ...]]]) -> str:
-    """The page."""
+    """The page: faults by the tests that see them."""
+    seen: dict[str, list[str]] = {}
+    drawn = [row for row in rows if row[0].tests.golden and row[0].form != "gpu" and row[0].file != "dequantize.cl"]
+    golden = [bool(found[2]) for _, found in drawn]
+    for mutation, (reference, twins, _) in rows:
+        first = reference if mutation.reference else twins
+        seen.setdefault(_test(first) if first and twins else SURVIVED, []).append(mutation.name)
     lines = [
         "# Planted faults",
         "",
-        "Each row is one fault planted in a copy of the OpenCL kernels, and the first test that turned red: against the",
-        "float64 reference of the tests, against the NumPy twins (which are left as they are), and against the golden",
-        "renders of the fox scene. Made by `python -m benchmarks.mutations`; three of the rows run with every test run",
-        "(`tests/test_kernels_mutations.py`), and so does the check that the text of all of them is still in the kernels.",
+        f"{len(rows)} faults were planted in a copy of the OpenCL kernels, one at a time. Against the NumPy twins, which stay",
+        f"as they are, {sum(bool(found[1]) for _, found in rows)} of them turned a test red. A row gives the first test against",
+        "the float64 reference that turned red too, or the twins' test for faults that change no value, and the faults. Of",
+        f"{len(golden)} faults in drawing, {sum(golden)} also turn the golden renders of the fox scene red.",
         "",
-        "| planted fault | against the float64 reference | against the twins | fox goldens |",
-        "|---|---|---|---|",
+        "`python -m benchmarks.mutations` makes this page in about ten minutes. `test_kernels_mutations.py` plants three",
+        "faults with every test run, and checks that the text of all is still in the kernels.",
+        "",
+        "| first test | faults |",
+        "|---|---|",
     ]
-    for mutation, (reference, twins, golden) in rows:
-        first = f"`{reference}`" if reference else "not a matter of value" if not mutation.reference else SURVIVED
-        second = f"`{twins}`" if twins else SURVIVED
-        used = mutation.form != "gpu" and mutation.file != "dequantize.cl" and mutation.tests.golden
-        third = "red" if golden else "within limits" if used else "not used there"
-        lines.append(f"| {mutation.name} | {first} | {second} | {third} |")
+    lines += [f"| {test} | {'; '.join(names)} |" for test, names in seen.items()]
     return "\n".join(lines) + "\n"
+
+
+def _test(name: str) -> str:
+    """A test without its parameters."""
+    return f"`{name.partition('[')[0]}`"
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""A part of the fuzzing of docs/fuzzing.md with every test run, and a folder of files that must be refused."""
+"""A part of the fuzzing of docs/results/fuzzing.md with every test run, and a folder of files that must be refused."""
 
 from __future__ import annotations
 

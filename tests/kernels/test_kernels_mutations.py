@@ -1,4 +1,4 @@
-"""The tests must be able to fail: a few faults planted in the kernels turn tests red (all of them: docs/mutations.md)."""
+"""The tests must be able to fail: a few faults planted in the kernels turn tests red (all of them: docs/results/mutations.md)."""
 
 from __future__ import annotations
 

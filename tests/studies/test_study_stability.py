@@ -209,7 +209,7 @@ def test_a_bit_is_worth_the_same_in_each_pixel_of_fewer(studied: StudyScene) -> 
 def test_moved_scenes_are_compressed_alike_and_half_positions_are_not(study: Study) -> None:
     rows = {(row["move"], row["method"]): row for row in rows_of(study, "moves")}
     # 400 Gaussians on small views: one of them more or less is a quarter of a per cent, and steps that are a little other are 2 %
-    # of the bytes. On the sample the bounds hold (docs/stability.md).
+    # of the bytes. On the sample the bounds hold (docs/results/stability.md).
     for move in ("moved 1e5, float64", "scaled 1e-3", "scaled 1e3"):
         for method in ("best", "paper"):
             row = rows[move, method]
