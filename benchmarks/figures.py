@@ -38,7 +38,7 @@ SCENES = {
     "figure": SCENES_DIR / "figure",
 }
 """The bundled scene, and two that the repository does not hold."""
-DEFAULT, NUMPY = "compress", "compress --device numpy --effort fast"
+DEFAULT = "compress"
 EFFORTS = {
     "compress --effort fast": "`--effort fast`",
     DEFAULT: "default",
@@ -47,9 +47,9 @@ EFFORTS = {
     "compress --method paper": "`--method paper`",
 }
 FORMATS = ("compress -o X.spz", "compress -o X.sog", "compress -o X.compressed.ply")
-COMMANDS = {**{command: tuple(SCENES) for command in EFFORTS}, **dict.fromkeys((*FORMATS, NUMPY), ("still_life",))}
+COMMANDS = {**{command: tuple(SCENES) for command in EFFORTS}, **dict.fromkeys(FORMATS, ("still_life",))}
 """What is run, and on which scenes."""
-NAN_CELL = "\u2013"
+NONE = "\u2013"
 
 
 # Running
@@ -192,15 +192,13 @@ def megabytes(size: float) -> str:
 
 
 def scenes_table(rows: Sequence[Row]) -> str:
-    """Every command on every scene: size, ratio, drop, processor seconds, peak of memory."""
+    """Every command on every scene: size, ratio, processor seconds."""
 
     def cell(scene: str, command: str) -> str:
         if scene not in COMMANDS[command]:
-            return NAN_CELL
-        size, ratio, drop, cpu, peak = (
-            figure(rows, scene, command, column) for column in ("bytes", "ratio", "drop_db", "cpu_seconds", "peak_mib")
-        )
-        return f"{megabytes(size)} MB, {ratio:.1f}x, {drop:.2f} dB, {cpu:.0f} s, {peak:.0f} MiB"
+            return NONE
+        size, ratio, cpu = (figure(rows, scene, command, column) for column in ("bytes", "ratio", "cpu_seconds"))
+        return f"{megabytes(size)} MB, {ratio:.1f}x, {cpu:.0f} s"
 
     commands = [command for command in COMMANDS if command != NUMPY]
     return table(
@@ -215,17 +213,14 @@ def span(values: Iterable[float]) -> str:
     return f"{least}x" if least == most else f"{least} to {most}x"
 
 
-def effort_table(rows: Sequence[Row], more: Sequence[str] = ()) -> str:
+def effort_table(rows: Sequence[Row]) -> str:
     """What each effort takes beside the default: factors of processor time and bytes over all scenes."""
 
     def factors(command: str, column: str) -> str:
         scenes = COMMANDS[command]
         return span(figure(rows, s, command, column) / figure(rows, s, DEFAULT, column) for s in scenes)
 
-    names = {**EFFORTS, NUMPY: "`--effort fast --device numpy`"}
-    lines = [
-        (names[command], factors(command, "cpu_seconds"), factors(command, "bytes")) for command in (*EFFORTS, *more)
-    ]
+    lines = [(name, factors(command, "cpu_seconds"), factors(command, "bytes")) for command, name in EFFORTS.items()]
     return table(("", "processor time", "bytes"), lines)
 
 
@@ -233,7 +228,7 @@ def capped_table(_: Sequence[Row]) -> str:
     """Runs of `benchmarks.memory`: limits, peaks and scratch files by the number of Gaussians."""
 
     def mib(value: str) -> str:
-        return f"{int(value) >> 20} MiB" if value else NAN_CELL
+        return f"{int(value) >> 20} MiB" if value else NONE
 
     lines = [
         (
@@ -241,7 +236,7 @@ def capped_table(_: Sequence[Row]) -> str:
             mib(row["cap"]),
             mib(row["limit"]),
             mib(row["anonymous_peak"] or row["resident_peak"]),
-            f"{int(row['scratch']) / 1e9:.1f} GB" if row["scratch"] else NAN_CELL,
+            f"{int(row['scratch']) / 1e9:.1f} GB" if row["scratch"] else NONE,
             f"{float(row['processor_seconds']):.0f}",
             f"{float(row['seconds']):.0f}",
             f"{megabytes(float(row['bytes']))} MB",
@@ -255,7 +250,6 @@ def capped_table(_: Sequence[Row]) -> str:
 TABLES: dict[str, Callable[[Sequence[Row]], str]] = {
     "scenes": scenes_table,
     "effort": effort_table,
-    "board": lambda rows: effort_table(rows, (NUMPY,)),
     "capped": capped_table,
 }
 BLOCK = re.compile(r"(<!-- figures: ([^>]*?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
