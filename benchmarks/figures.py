@@ -2,6 +2,7 @@
 
 python -m benchmarks.figures run [--scene still_life ...] [--command "compress --effort fast" ...]
 python -m benchmarks.figures tables [--check]
+python -m benchmarks.figures picture
 
 A table stands in a page between `<!-- figures: NAME -->` and `<!-- end -->`. `run` replaces rows of the same scene and command.
 """
@@ -23,6 +24,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from PIL import Image, ImageDraw
 
 from benchmarks.harness import ROOT, CheckFailed, check, revision
 
@@ -49,6 +52,7 @@ EFFORTS = {
 FORMATS = ("compress -o X.spz", "compress -o X.sog", "compress -o X.compressed.ply")
 COMMANDS = {**{command: tuple(SCENES) for command in EFFORTS}, **dict.fromkeys(FORMATS, ("still_life",))}
 """What is run, and on which scenes."""
+PICTURE, VIEW, LABEL = ROOT / "docs" / "images" / "still_life.jpg", "24", 26
 NONE = "\u2013"
 
 
@@ -200,10 +204,8 @@ def scenes_table(rows: Sequence[Row]) -> str:
         size, ratio, cpu = (figure(rows, scene, command, column) for column in ("bytes", "ratio", "cpu_seconds"))
         return f"{megabytes(size)} MB, {ratio:.1f}x, {cpu:.0f} s"
 
-    commands = [command for command in COMMANDS if command != NUMPY]
-    return table(
-        ("command", *SCENES), ((f"`{command}`", *(cell(name, command) for name in SCENES)) for command in commands)
-    )
+    lines = ((f"`{command}`", *(cell(name, command) for name in SCENES)) for command in COMMANDS)
+    return table(("command", *SCENES), lines)
 
 
 def span(values: Iterable[float]) -> str:
@@ -298,9 +300,40 @@ def write_tables() -> None:
             print(f"{page.relative_to(ROOT)}: written")
 
 
+# The picture of README.md
+
+
+def picture() -> None:
+    """One held-out view of the bundled scene: the original, by the paper's method, and by the default."""
+    name = "still_life"
+    with tempfile.TemporaryDirectory(prefix="figures-") as folder:
+
+        def draw(scene: Path) -> Image.Image:
+            views = Path(folder) / scene.suffix[1:]
+            words = ["render", str(scene), "-o", str(views), "-f", "-q", "--views", VIEW]
+            words += ["--cameras", str(SCENES[name] / "cameras.json")]
+            subprocess.run(
+                [sys.executable, "-m", "flexgs_edge", *words], cwd=ROOT, stdout=subprocess.DEVNULL, check=True
+            )
+            return Image.open(next(views.glob("*.png"))).convert("RGB")
+
+        original = SCENES[name] / "point_cloud.ply"
+        shown = [(f"original PLY: {megabytes(original.stat().st_size)} MB", draw(original))]
+        for command, label in (("compress --method paper", "--method paper"), (DEFAULT, "--method best")):
+            taken, output = compress(SCENES[name], command, Path(folder))
+            check_result(taken, output)
+            shown.append((f"{label}: {megabytes(len(taken.file))} MB", draw(output)))
+    wide, high = shown[0][1].size
+    whole = Image.new("RGB", (wide * len(shown), high + LABEL), "white")
+    for k, (words, view) in enumerate(shown):
+        whole.paste(view, (k * wide, LABEL))
+        ImageDraw.Draw(whole).text((k * wide + 8, 4), words, fill="black", font_size=LABEL - 10)
+    whole.save(PICTURE, quality=88)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("run", "tables"))
+    parser.add_argument("what", choices=("run", "tables", "picture"))
     parser.add_argument("--scene", action="append", choices=SCENES, help="default: all that are there")
     parser.add_argument("--command", action="append", choices=COMMANDS, help="default: all")
     parser.add_argument("--repeats", type=int, default=1, help="timed runs after the one that is checked; default: 1")
@@ -310,6 +343,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.what == "run":
         run(options.scene or list(SCENES), options.command or list(COMMANDS), options.repeats)
+    elif options.what == "picture":
+        picture()
     elif options.check:
         if found := stale():
             raise CheckFailed("\n".join([*found, "run: python -m benchmarks.figures tables"]))
