@@ -229,24 +229,23 @@ def effort_table(rows: Sequence[Row]) -> str:
 def capped_table(_: Sequence[Row]) -> str:
     """Runs of `benchmarks.memory`: limits, peaks and scratch files by the number of Gaussians."""
 
-    def mib(value: str) -> str:
-        return f"{int(value) >> 20} MiB" if value else NONE
+    def per(value: str, unit: float, digits: str = ".0f") -> str:
+        return f"{float(value) / unit:{digits}}" if value else NONE
 
     lines = [
         (
-            f"{int(row['gaussians']):,}".replace(",", " "),
-            mib(row["cap"]),
-            mib(row["limit"]),
-            mib(row["anonymous_peak"] or row["resident_peak"]),
-            f"{int(row['scratch']) / 1e9:.1f} GB" if row["scratch"] else NONE,
-            f"{float(row['processor_seconds']):.0f}",
-            f"{float(row['seconds']):.0f}",
-            f"{megabytes(float(row['bytes']))} MB",
+            per(row["gaussians"], 1e6, ".2g"),
+            per(row["cap"], 1 << 20),
+            per(row["limit"], 1 << 20),
+            per(row["anonymous_peak"] or row["resident_peak"], 1 << 20),
+            per(row["scratch"], 1e9, ".1f"),
+            per(row["processor_seconds"], 1),
+            megabytes(float(row["bytes"])),
         )
-        for row in read_rows(MEMORY_CSV)
+        for row in sorted(read_rows(MEMORY_CSV), key=lambda row: (int(row["gaussians"]), bool(row["cap"])))
     ]
-    head = ("Gaussians", "cap", "`--memory-limit`", "peak", "scratch", "processor seconds", "seconds", "file")
-    return table(head, lines)
+    units = ("Gaussians, million", "cap, MiB", "limit, MiB", "peak, MiB", "scratch, GB", "processor, s", "file, MB")
+    return table(units, lines)
 
 
 TABLES: dict[str, Callable[[Sequence[Row]], str]] = {
