@@ -43,8 +43,8 @@ SCENES = {
 """The bundled scene, and two that the repository does not hold."""
 DEFAULT = "compress"
 EFFORTS = {
-    "compress --effort fast": "`--effort fast`",
     DEFAULT: "default",
+    "compress --effort fast": "`--effort fast`",
     "compress --effort thorough": "`--effort thorough`",
     "compress --effort max": "`--effort max`",
     "compress --method paper": "`--method paper`",
@@ -186,26 +186,25 @@ def figure(rows: Sequence[Row], scene: str, command: str, column: str) -> float:
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table."""
-    lines = [list(head), ["---"] * len(head), *map(list, rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    lines = ["| " + " | ".join(line) + " |" for line in [head, *rows]]
+    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
 
 
 def megabytes(size: float) -> str:
     """Three digits of a size in MB (10^6 bytes)."""
-    return f"{size / 1e6:.3g}" if size < 9.995e6 else f"{size / 1e6:.1f}"
+    return f"{size / 1e6:#.3g}" if size < 9.995e6 else f"{size / 1e6:.1f}"
 
 
 def scenes_table(rows: Sequence[Row]) -> str:
-    """Every command on every scene: size, ratio, processor seconds."""
+    """Every effort on every scene: size, ratio, processor seconds."""
 
     def cell(scene: str, command: str) -> str:
-        if scene not in COMMANDS[command]:
-            return NONE
         size, ratio, cpu = (figure(rows, scene, command, column) for column in ("bytes", "ratio", "cpu_seconds"))
         return f"{megabytes(size)} MB, {ratio:.1f}x, {cpu:.0f} s"
 
-    lines = ((f"`{command}`", *(cell(name, command) for name in SCENES)) for command in COMMANDS)
-    return table(("command", *SCENES), lines)
+    return table(
+        ("command", *SCENES), ((f"`{command}`", *(cell(name, command) for name in SCENES)) for command in EFFORTS)
+    )
 
 
 def span(values: Iterable[float]) -> str:
