@@ -81,15 +81,15 @@ def test_paths_that_pages_name_exist(repository: Path) -> None:
         *(repository / name for name in ("flexgs_edge", "benchmarks", "cl_kernels", "tests", "deploy")),
     )
     known = {path.name for root in roots[1:] for path in root.rglob("*.*")}
-    missing = []
+    missing = set()
     for page in pages_of(repository):
         name = page.relative_to(repository)
-        missing += [f"{name}:{k}: no {path}" for k, path in places(page, PATH) if not (repository / path).exists()]
+        missing |= {f"{name}:{k}: no {path}" for k, path in places(page, PATH) if not (repository / path).exists()}
         for k, path in places(page, SOURCE):
             there = any((root / path).exists() for root in roots) if "/" in path else path in known
             if not there:
-                missing.append(f"{name}:{k}: no {path}")
-    assert not missing, "\n".join(missing)
+                missing.add(f"{name}:{k}: no {path}")
+    assert not missing, "\n".join(sorted(missing))
 
 
 def resolves(name: str) -> bool:
@@ -183,6 +183,19 @@ def test_commands_and_options_that_pages_show_exist(repository: Path) -> None:
 
 def test_tables_are_those_of_the_file_of_figures(repository: Path) -> None:
     assert figures.stale(repository) == [], "run: python -m benchmarks.figures tables"
+
+
+def test_a_row_replaces_that_of_its_scene_and_command(tmp_path: Path) -> None:
+    place = tmp_path / "figures.csv"
+    row = dict.fromkeys(figures.COLUMNS, "1") | {"scene": "fox", "command": "compress --effort fast"}
+    for new in (row, {**row, "scene": "still_life"}, {**row, "command": figures.DEFAULT}, {**row, "bytes": "2"}):
+        figures.put(new, place)
+    found = [(each["scene"], each["command"], each["bytes"]) for each in figures.read_rows(place)]
+    assert found == [
+        ("still_life", "compress --effort fast", "1"),
+        ("fox", figures.DEFAULT, "1"),
+        ("fox", "compress --effort fast", "2"),
+    ]
 
 
 def test_a_changed_table_is_found() -> None:
