@@ -1,7 +1,7 @@
 """Runs of `compress` under caps that the kernel keeps, one line each in a CSV file, and the chart of their peaks by Gaussians.
 
-python -m benchmarks.memory run SCENE.ply --cameras POSES.json [--cap 512MiB --limit 480MiB] [--csv docs/memory.csv]
-python -m benchmarks.memory draw [--csv docs/memory.csv] [--png docs/images/memory.png]
+python -m benchmarks.memory run SCENE.ply --cameras POSES.json [--cap 512MiB --limit 480MiB] [--csv docs/results/memory.csv]
+python -m benchmarks.memory draw [--csv docs/results/memory.csv] [--png docs/images/memory.png]
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from benchmarks.harness import ROOT, check
 from flexgs_edge.report.plots import LineChart, Series, picture
 from flexgs_edge.units import parse_size
 
-CSV, PNG = ROOT / "docs" / "memory.csv", ROOT / "docs" / "images" / "memory.png"
+CSV, PNG = ROOT / "docs" / "results" / "memory.csv", ROOT / "docs" / "images" / "memory.png"
 COLUMNS = (
     "gaussians", "cap", "limit", "seconds", "processor_seconds", "group_peak", "anonymous_peak", "resident_peak", "scratch",
     "bytes", "sha256",

@@ -12,9 +12,9 @@ Usage: deploy/on-device.sh SCENE [OPTIONS OF COMPRESS...]
 Sets this checkout up (as deploy/setup.sh does), then compresses SCENE: a .ply, a .fgs or a model folder.
 
   deploy/on-device.sh garden/point_cloud.ply                       writes garden/point_cloud.fgs
-  deploy/on-device.sh garden/point_cloud.ply --effort fast         in two thirds of the time, some more bytes
+  deploy/on-device.sh garden/point_cloud.ply --effort fast         faster, some more bytes
   deploy/on-device.sh garden/point_cloud.ply -o /mnt/ssd/garden.fgs --memory-limit 2GiB
-  deploy/on-device.sh garden/point_cloud.ply --method paper                       a quick look: four to six times the bytes,
+  deploy/on-device.sh garden/point_cloud.ply --method paper                       a quick look: much larger files,
   deploy/on-device.sh garden/point_cloud.ply --method paper -f --max-drop 0.5     again, with the scores of that call
 
 What follows SCENE goes to `flexgs-edge compress` (.venv/bin/flexgs-edge compress --help lists it). Added unless given:
