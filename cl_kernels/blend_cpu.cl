@@ -1,5 +1,5 @@
 // Front-to-back blending of one tile by one work-item: explicit vectors over 4x4 blocks, no __local, no barriers.
-// 13 times faster on CPUs than a work-item a pixel. Same bits as blend_gpu.cl and at every W.
+// Far faster on CPUs than a work-item a pixel. Same bits as blend_gpu.cl and at every W.
 // Twin: flexgs_edge.kernels.twins.blend
 //
 // A pixel that has ended keeps its transmittance with the sign flipped: then T (1 - alpha) < TRANSMITTANCE_MIN holds for every
@@ -184,7 +184,7 @@ __kernel void BLEND(
     }
     const uint2 pair = pairs[n];
     const size_t ahead = pairs[min(n + AHEAD, last - 1)].x;
-    // Records and sums lie in row order, so a tile's are all over the memory: without this a third of the blend waits for them.
+    // Records and sums lie in row order, so a tile's are all over the memory: without this the blend waits for them.
     FETCH(records + ahead * 16);
 #if STATS
     FETCH(sums + ahead * (2 * SUMS));
@@ -214,7 +214,7 @@ __kernel void BLEND(
     while (mask) {
       const int b = 31 - (int)clz(mask & (0u - mask));
       mask &= mask - 1;
-      // W 8 or 4: without it lane_y is worked out anew for each vector, a fifth of the blend.
+      // W 8 or 4: without it the compiler works lane_y out anew for each vector.
 #pragma unroll
       for (int v = 0; v < BLOCK_VECTORS; ++v) {
         const int k = b * BLOCK_VECTORS + v;
@@ -237,7 +237,7 @@ __kernel void BLEND(
 #endif
 #if STATS == 2 || STATS == 4
         // What the pixel would change by without this splat: its own light goes, what lies behind it gets brighter. As one
-        // product: half the operations of the plain form, and as exact where nearly all of the light is there.
+        // product: fewer operations than the plain form, and as exact where nearly all of the light is there.
         const FW ratio = weight / trans[k];
         const FW er = fma(cr, trans[k], red[k] - whole_r[k]), eg = fma(cg, trans[k], green[k] - whole_g[k]);
         const FW eb = fma(cbl, trans[k], blue[k] - whole_b[k]);

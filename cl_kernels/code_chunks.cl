@@ -625,7 +625,7 @@ inline bool get_channels(Chunk *c, uint rows, int sh_degree, bool base_only, __g
 }
 
 // Decodes chunks, or counts the symbols of their channels (positions aside). One kernel for both directions, although each leaves
-// arrays of the other alone: it is most of what the codec adds to a start without compiled kernels, half a second a copy.
+// arrays of the other alone: it is most of what the codec adds to a start without compiled kernels.
 __kernel void code_chunks(
     const uint counting,               // 1: counts, 0: decodes
     const uint stride,                 // numbers of a plane: rows of the largest chunk, and 96 more

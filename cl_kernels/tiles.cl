@@ -103,7 +103,7 @@ inline size_t draft_start(__global const uint *room) {
   return start;
 }
 
-// Spans are worked out once, here; `tile_scatter` only moves what this wrote (half the time of working them out again).
+// Spans are worked out once, here; `tile_scatter` only moves what this wrote.
 __kernel void tile_count(
     const uint from,
     const uint count,

@@ -176,9 +176,9 @@ VOLUME_POWER: Final = 0.1
 GROUP_ROWS: Final = 512
 """Rows per quantization group. The paper's 1000 groups weigh 528 kB whatever N is."""
 DEFAULT_BASE_PSNR: Final = 34.0
-"""PSNR of a model against its photos when there are none (dB): cautious, most scenes are worse and lose less. Measured with
-automatic views: 1 dB modelled from 34 is .44 dB of drop on a model of 31.2 dB, 1.19 dB on one of 35.1; from 36 the first,
-quantized as in the paper, cannot reach it, from 33 the second loses 1.59 dB."""
+"""PSNR of a model against its photos when there are none (dB). It is cautious: most models have less, and lose less. A
+higher value can put the target out of reach, a lower one loses too much of a good model:
+docs/results/tuning.md#default_base_psnr"""
 DEFAULT_HOLDOUT: Final = 8
 """Every 8th view by name is held out: the field's convention since Mip-NeRF 360."""
 MAX_VIEW_WIDTH: Final = 1600

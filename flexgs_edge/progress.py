@@ -26,7 +26,7 @@ class Progress:
         if not self.enabled:
             yield from items
             return
-        from tqdm import tqdm  # 20 ms of import that a quiet run need not pay
+        from tqdm import tqdm  # slow to import; a quiet run need not pay for it
 
         yield from tqdm(items, desc=label, total=total, leave=False, file=sys.stderr)
 

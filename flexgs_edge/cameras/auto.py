@@ -32,7 +32,7 @@ SHOWN_SHARE = {True: 0.5, False: 0.65}
 """Places that show less than this share of what the best one shows, in all directions together, are left out: who is inside a
 room sees all walls, from outside it is half of them. Where SH tell directions (True), they tell this too."""
 QUICK = 5
-"""Every 5th witness judges all candidates, all of them judge the better ones: a third of the time, the same views."""
+"""Every 5th witness judges all candidates, and all of them judge the better ones: faster, and the same views."""
 DIRECTIONS = 192
 OPEN_DEPTH = 0.25
 """Largest optical depth, along its side, of a cell in which a camera may stand."""
@@ -142,7 +142,7 @@ class _Frame:
         """[D, n] bool: which of `points` ([3, n]) are in a view from `place`."""
         lines = points - place[:, None]
         lines /= np.maximum(np.linalg.norm(lines, axis=0), 1e-12)
-        # einsum, not @: these products are too small for BLAS, whose threads take ten times as long on a busy machine.
+        # einsum, not @: these products are too small for BLAS, whose threads are far slower on a busy machine.
         inside: np.ndarray = np.einsum("dx,xn->dn", self.directions, lines) > math.cos(self.cone)
         return inside
 

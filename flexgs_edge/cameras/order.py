@@ -13,9 +13,8 @@ DIGITS = 6
 GAIN_DIGITS = 4
 """The same of what a camera adds, as a share of all points."""
 SAME_VIEW = 0.2
-"""Cosines of two directions that a point is seen from differ by less where these say something of each other: up to 37 degrees.
-The paper's file of fox, from measured costs of 8 poses, has a fidelity of 38.1 dB with it, and of 37.2 dB with
-exp(-(1 - cosine) / 0.5), which reaches farther."""
+"""Two views of a point tell something of each other where the cosines of their directions differ by less: up to 37
+degrees. A wider reach leaves out views that are needed: docs/results/tuning.md#same_view"""
 
 
 def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, count: int) -> list[int]:

@@ -23,7 +23,7 @@ def info(path: str | Path) -> dict[str, Any]:
     """
     place = Path(path)
     if place.suffix.lower() == ".fgs":
-        # The coder: a third of the time that a .ply takes, which does not need it.
+        # Imports the coder, which a .ply does not need.
         from flexgs_edge.run.contents import contents
 
         if place.is_file():
@@ -32,7 +32,7 @@ def info(path: str | Path) -> dict[str, Any]:
 
 
 def _scene_info(path: Path) -> dict[str, Any]:
-    # Cameras, options and other programs' formats: a fifth of the time that a .fgs takes, which needs none of them.
+    # Imports cameras, options and other programs' formats, none of which a .fgs needs.
     from flexgs_edge.io.formats import format_of
     from flexgs_edge.run.companions import companions_of
 

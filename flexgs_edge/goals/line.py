@@ -17,13 +17,14 @@ AIM = -0.01
 NEAREST = 0.1
 """A new step keeps this share of the interval between its neighbours away from both: curves are not quite smooth."""
 CLOSE = 0.03
-"""Excess (log of loss or size over limit) that counts as close enough below the target: about 1.5 % of the bytes."""
+"""Excess (log of loss or size over limit) that counts as close enough below the target."""
 LINE_STEPS = {"fast": 4, "balanced": 6, "thorough": 10}
 """Measured points on a line at each `--effort`, beyond those that are there already."""
 START = 300
 """Prune rate, in thousandths, where a search for a quality starts."""
 SLOPE = 5.0
-"""Excess of a quality (log of the loss over its limit) per unit of the prune rate: fox and the sample lie at 4 to 6."""
+"""Excess of a quality (log of the loss over its limit) per unit of the prune rate:
+docs/results/tuning.md#prior_slopes"""
 
 
 def next_point(points: Iterable[tuple[float, float]], slope: float, stride: float) -> float:

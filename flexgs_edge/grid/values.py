@@ -101,7 +101,7 @@ def _spread_bands(grid: GridScene, degrees: np.ndarray, bands: Sequence[np.ndarr
         values = _rgb(chosen.reshape(3, 2 * degree + 1, len(has)), grid.steps.colour(grid.steps.sh[degree - 1]))
         band = planes[:, degree * degree - 1 : (degree + 1) ** 2 - 1]
         for colour, coefficients in zip(band, values, strict=True):
-            # Plane by plane: one list of places for all of them at once takes five times as long.
+            # Plane by plane: one list of places for all of them at once is much slower.
             for plane, value in zip(colour, coefficients, strict=True):
                 plane[has] = value
     return planes.reshape(planes.shape[0] * planes.shape[1], len(degrees))

@@ -24,8 +24,8 @@ class Format:
     max_degree : int
         Highest SH degree.
     sorted : bool
-        Rows must come in an order in which neighbours are near each other: each 256 share a range, and the converter does
-        not sort (unsorted, positions of the sample were 7 times worse).
+        Rows must come in an order in which neighbours are near each other: each 256 share a range, and the converter
+        does not sort. Unsorted, positions are several times worse.
     shuffled : bool
         The converter sorts rows by itself.
     probed : bool
@@ -35,11 +35,11 @@ class Format:
     one_degree : bool
         Bytes fall with the SH degree of the whole scene only: SH that are zero take as much as any.
     row_bytes : float
-        What a Gaussian of SH degree 3 takes, about (fox and the sample): where searches start.
+        About what a Gaussian of SH degree 3 takes: where searches start.
     sh_bytes : float
         SH's part of it.
     memory : int
-        Bytes a Gaussian that the converter holds at most (measured on fox and the sample).
+        Bytes a Gaussian that the converter holds at most.
     """
 
     suffix: str

@@ -1,10 +1,10 @@
 """SH of `.spz` files at a step of our choosing.
 
-The format stores each coefficient as a byte, (code - 128) / 128, and leaves the rounding to the writer. The converter keeps 5
-bits of degree 1 and 4 of the others: nearly all of what its files lose (of 1.59 dB on fox, 1.58). SH come last in the stream, so
-they are replaced while it is copied. Layout: magic, version, count, SH degree, 12 bits behind the point, flags and a zero (16
-bytes), then by array: positions 9 bytes a Gaussian, opacity 1, colour 3, scales 3, rotation 3 (version 2) or 4 (version 3), and
-SH by Gaussian, coefficient, channel; all of it one gzip stream.
+The format stores each coefficient as a byte, (code - 128) / 128, and leaves the rounding to the writer. The converter
+keeps 5 bits of degree 1 and 4 of the others, and nearly all of the loss of its files comes from that. SH come last in
+the stream, so we replace them while we copy it. Layout: magic, version, count, SH degree, 12 bits behind the point,
+flags and a zero (16 bytes), then by array: positions 9 bytes a Gaussian, opacity 1, colour 3, scales 3, rotation 3
+(version 2) or 4 (version 3), and SH by Gaussian, coefficient, channel; all of it one gzip stream.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.scene.source import SceneSource
 
 SH_STEP = 8
-"""Step of the codes, in units of 1/128: half of the converter's own above degree 1. Unpruned fox then loses .41 dB for 2.8 bytes
-a Gaussian more; another halving would cost 5 bytes a Gaussian and gain .34 dB."""
+"""Step of the codes, in units of 1/128: half of the converter's own above degree 1. A smaller step costs more bytes
+than it is worth: docs/results/tuning.md#sh_step"""
 CONVERTER_STEP = 16
 _HEADER = struct.Struct("<IIIBBBB")
 _MAGIC = 0x5053474E
@@ -56,7 +56,7 @@ def refine_sh(coded: Path, source: SceneSource, finished: Path, chunk_rows: int 
         with (
             gzip.open(coded) as old,
             open(finished, "xb") as file,
-            # No name and no time in the header: same scene, same bytes. Level 9 saves 2 % for 24 us a Gaussian.
+            # No name and no time in the header: same scene, same bytes.
             gzip.GzipFile(filename="", mode="wb", compresslevel=9, fileobj=file, mtime=0) as new,
         ):
             _copy(old, new, source, chunk_rows)

@@ -24,7 +24,8 @@ _CODEC = ("code_chunks.cl", "encode_chunks.cl")
 _BLENDS = {spec.stats: name for name, spec in KERNELS.items() if spec.stats is not None}
 """Kernels that the files of the blend make, by STATS."""
 _BLENDS_TOGETHER = (0, 2, 3, 4)
-"""What makes one program: a built one from PoCL's cache takes 40 to 70 ms, however small it is, and building one 300 ms more."""
+"""What makes one program. Each program costs time to load and to build, however small it is:
+docs/results/tuning.md#programs"""
 
 
 def kernel_dir() -> Path:

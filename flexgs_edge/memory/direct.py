@@ -2,8 +2,7 @@
 
 Under a cap a page that is read through the cache is charged to the control group, pushes another page out, and is copied; and
 where more is read in turn than there is room for, pages are pushed out before they are read again. Read past the cache they leave
-those alone that are there. A gigabyte in pieces of 128 KiB under a cap of 256 MiB: 2.4 s through mapped pages, 1.0 s copied from
-the cache, 0.6 s past it.
+those alone that are there: docs/results/tuning.md#disks
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from typing import BinaryIO
 import numpy as np
 
 BUFFER_BYTES = 1 << 21
-"""Of each thread that reads past the cache: one huge page. Into small ones, which lie anywhere, a disk gave 0.9 GB a second, not
-2.9."""
+"""Of each thread that reads past the cache: one huge page. A disk fills small pages, which lie anywhere, more slowly:
+docs/results/tuning.md#disks"""
 _HELD = threading.local()
 
 

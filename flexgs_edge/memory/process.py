@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 SAMPLE_SECONDS = 0.05
-"""Seconds between looks at the memory: peaks that are shorter may be missed. A look takes 30 microseconds."""
+"""Seconds between looks at the memory: peaks that are shorter may be missed."""
 
 _MALLOPT = {-3: 8 << 20, -1: 32 << 20, -8: 2}
 """glibc's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD in bytes, and M_ARENA_MAX: heaps of threads."""
@@ -111,10 +111,9 @@ def _left_in_groups(proc: Path, groups: Path) -> Iterator[int]:
 def return_freed_memory() -> None:
     """Have the C library return large arrays to the system when they are freed; nothing where it is not glibc.
 
-    By default every free of a mapped array raises the size that is mapped (to 32 MiB), so that the arrays of two threads end
-    up in heaps with holes: a search of 400 000 Gaussians in scratch files peaked at 307 MiB instead of 202 with limits of 2 and
-    1 MiB. Those cost a fifth of the time (97 instead of 80 s for a million, and 59 MiB less): pages that come back are cleared,
-    by a fault each. To be called before anything large is allocated.
+    By default every free of a mapped array raises the size that is mapped (to 32 MiB), so the arrays of two threads end
+    up in heaps with holes, and the peak rises. Lower limits cost time instead: the kernel clears each page that comes
+    back, by a fault each. To be called before anything large is allocated: docs/results/tuning.md#memory
     """
     with suppress(OSError, AttributeError):
         mallopt = ctypes.CDLL(None).mallopt

@@ -22,7 +22,7 @@ COPY_ROWS = 1 << 18
 DENSE = 4
 """Rows read for one that is wanted, at most: rather than page by page."""
 READERS = 4
-"""Threads that read past the cache: in pieces of 256 KiB a disk gave one of them 1.2 GB a second, two 1.6, four 1.8."""
+"""Threads that read past the cache. One alone does not keep a disk busy: docs/results/tuning.md#disks"""
 _READING = ThreadPoolExecutor(READERS, "read")
 _TAKING = ThreadPoolExecutor(2, "take")
 """Planes at a time of which rows are taken: while one is read or written, the other is looked up in."""
@@ -154,7 +154,7 @@ def read_rows(values: np.ndarray, rows: slice) -> np.ndarray:
 def put_rows(values: np.ndarray, rows: slice, part: np.ndarray) -> None:
     """`values[..., rows] = part`; a mapped array is written to its file.
 
-    Through mapped pages each costs a fault of its own: 2.4 seconds of a processor for a gigabyte under a cap, 0.3 written so.
+    Through mapped pages, each page would cost a fault of its own: docs/results/tuning.md#disks
     """
     held = map_of(values)
     if held is None or not hasattr(os, "pwrite"):
@@ -184,8 +184,9 @@ def take_rows(values: np.ndarray, rows: np.ndarray, out: np.ndarray, whole_bytes
 
     `whole_bytes`: of a plane that memory may hold as a whole, two of them at a time.
 
-    Of files rows out of order are looked up in one plane at a time, or two, which memory holds where it cannot hold all (going
-    through all planes for every part of the rows, 1 M Gaussians read 150 GB under a cap of 512 MiB).
+    Of files, rows out of order are looked up in one plane at a time, or two, which memory holds where it cannot hold
+    all. Going through all planes for every part of the rows would read the files many times:
+    docs/results/tuning.md#disks
     """
     planes = [(values[place], out[place]) for place in np.ndindex(values.shape[:-1])]
     if not planes:

@@ -20,8 +20,8 @@ from flexgs_edge.units import format_size
 _SMALL = 1 << 16
 """Bytes below which an array stays in memory in any case: a file each would cost more than it saves."""
 WHOLE_BYTES = 1 << 26
-"""Bytes of a plane that is held as a whole while rows in any order are taken from it, at least: six million took 0.4 s instead of
-22, and forty million, in their first minutes, went at 20 s for each of 59 planes."""
+"""Least bytes of a plane that is held as a whole while rows in any order are taken from it. From a file, each row would
+be a read of its own: docs/results/tuning.md#disks"""
 WHOLE_SHARE = 16
 """Part of the limit (one in 16) that such a plane may take where that is more."""
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -147,8 +147,9 @@ class ScratchStorage(Storage):
         held.storage, held.file = self, file
         self.count(size)
         if hasattr(mmap, "MADV_RANDOM"):
-            # Of one row of values the kernel may read ahead. Of planes, a part of the rows is a piece of each: a disk that reads
-            # 8 MiB ahead read 180 GB for 1 M Gaussians under a cap of 512 MiB. `fetch` asks for those pieces instead.
+            # Of one row of values the kernel may read ahead. Of planes, a part of the rows is a piece of each: reading
+            # ahead would read the file many times over. `fetch` asks for those pieces instead.
+            # docs/results/tuning.md#disks
             held.madvise(mmap.MADV_SEQUENTIAL if len(shape) == 1 else mmap.MADV_RANDOM)
         values = np.frombuffer(held, dtype).reshape(shape)
         held.address = values.ctypes.data

@@ -16,9 +16,10 @@ from flexgs_edge.memory.process import current_rss
 LPIPS_SIDE = 31
 """The smallest side that AlexNet's five layers leave a pixel of."""
 LOAD_BYTES = 1100 * 2**20
-"""What loading takes at its peak (measured: 660 MiB for the libraries, the file of weights twice)."""
+"""Bound on what loading takes at its peak: the libraries, and the file of weights twice.
+docs/results/tuning.md#memory"""
 WORK_BYTES = 300
-"""Bytes a pixel that comparing two pictures holds for a moment (measured: 220 to 270, and the two pictures)."""
+"""Bound on the bytes a pixel that comparing two pictures holds for a moment: docs/results/tuning.md#memory"""
 BACKBONE = "alexnet-owt-7be5be79.pth"
 """torchvision's file of AlexNet's weights, 244 MB; those that `lpips` adds are in the package."""
 BACKBONE_URL = f"https://download.pytorch.org/models/{BACKBONE}"

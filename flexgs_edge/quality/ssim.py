@@ -1,4 +1,4 @@
-"""SSIM of images on a backend: scikit-image's with a Gaussian window, in a tenth of its time."""
+"""SSIM of images on a backend: scikit-image's with a Gaussian window."""
 
 from __future__ import annotations
 

@@ -189,7 +189,7 @@ def compare_view(
     ssims : callable, optional
         Also measure this similarity of all pairs of images.
     lpips : callable, optional
-        Also measure this distance of two images (about 3 s a megapixel for LPIPS).
+        Also measure this distance of two images. LPIPS takes seconds for each pair.
     """
     if photo is not None and original_error is None:
         original_error = mse(original, photo)

@@ -13,8 +13,7 @@ from flexgs_edge.render.fit import padded
 SLOTS = 2
 """Chunks that there is always room for: one that is drawn, and one that is loaded."""
 MOST_SLOTS = 3
-"""The same where memory has room: the disk rests less between two chunks (126 views of six million within 1 GiB were projected in
-76 s instead of 80; what the disk gives changes by as much from hour to hour)."""
+"""The same where memory has room: the disk rests less between two chunks. docs/results/tuning.md#most_slots"""
 Span = tuple[int, int, int]
 """First row, row after the last, and SH degree of a chunk."""
 

@@ -81,8 +81,8 @@ def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
 
 
 DEVICE_ROWS = 40_000
-"""Gaussians from which a device codes. 85 000 of fox: coded in 0.9 s instead of 1.5, decoded in 0.15 instead of 0.8; building the
-kernels takes 4 s, once on a machine."""
+"""Gaussians from which a device codes. Below, the kernels take longer to start than they save:
+docs/results/tuning.md#device_rows"""
 
 
 def coding_device(backend: Backend | None, budget: MemoryBudget, count: int, sh_degree: int) -> Backend | None:

@@ -21,8 +21,7 @@ FIT_STEP = 2
 FIT_GAP = 2.0
 """Fidelity on training poses above that on held-out views, dB, from which a choice counts as fitted to what was scored."""
 NEEDED_VIEWS = 16
-"""Scored poses from which more change little: on the sample, ranked by costs from 8, 16 and all 70 poses, 0.99, 0.81 and 0.75 dB
-are lost at one size (docs/performance.md)."""
+"""Scored poses from which more change little: docs/results/speed.md#scoring-fewer-views"""
 UNSEEN_SHARE = 0.01
 """Share of the Gaussians in none of the automatic views that is worth a word."""
 

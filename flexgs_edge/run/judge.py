@@ -21,7 +21,7 @@ from flexgs_edge.views.bench import Bench
 SHARE = 4
 """Reference images may take this part of the free budget (one in four): the rest is for the scene and its views."""
 LIBRARY_BYTES = 12 * 2**20
-"""What Pillow takes when it is loaded and decodes (measured: 8 MiB)."""
+"""Bound on what Pillow takes when it is loaded and decodes: docs/results/tuning.md#memory"""
 WORK_BYTES = 100
 """Bytes a pixel that decoding a photo, or SSIM, holds for a moment (32 of SSIM's are the backend's)."""
 ESTIMATE_STEP = 2
@@ -90,7 +90,7 @@ class Judge:
         self._original_error, self._coarse_error, self._known = [], {}, {}
         images = self.bench.images(scene, self.cameras)
         for i, drawn in enumerate(progress.track(images, "drawing the original", len(self.cameras))):
-            # Clamped once, and contiguous by channel as renders are: comparing is then four times as fast.
+            # Clamped once, and contiguous by channel as renders are: comparing is then much faster.
             image = _planes(drawn)
             self._keep(("original", i), image)
             if self.photos is not None:
@@ -129,7 +129,7 @@ class Judge:
         progress: Progress = SILENT,
         lpips: Distance | None = None,
     ) -> Quality:
-        """Quality of `scene` over the views (LPIPS takes about 3 s a megapixel and pair).
+        """Quality of `scene` over the views. LPIPS takes far longer than drawing them.
 
         One that reports draws nothing twice: a scene that is the same to the bit has the same quality.
         """

@@ -19,7 +19,7 @@ from flexgs_edge.views.cluster import Cluster
 from flexgs_edge.views.worker import Drawing
 
 BUILD_BYTES = 24 * 2**20
-"""What building our kernels adds to the loaded compiler (measured with PoCL, nothing cached: 19 MiB)."""
+"""Bound on what building our kernels adds to the loaded compiler: docs/results/tuning.md#memory"""
 
 
 def open_bench(run: Run[Any], cluster: str | None = None) -> Bench:
@@ -48,7 +48,7 @@ def counted_backend(device: str | None, budget: MemoryBudget, clock: Stopwatch) 
     with clock.stage("device"):
         backend = open_backend(device, budget)
     if not backend.is_numpy:
-        # The runtime and its compiler stay loaded: 80 MiB for PoCL with its kernels cached, 210 MiB without.
+        # The runtime and its compiler stay loaded, and take more where no kernels are cached.
         budget.take("the OpenCL runtime", max(current_rss() - before, 0) + BUILD_BYTES)
     return backend
 

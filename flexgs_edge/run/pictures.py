@@ -24,9 +24,9 @@ MOST_WIDTH = 800
 LAYERS = 4
 """Pictures of a view: original, compressed, error map, photo."""
 PIXEL_BYTES = 1
-"""Bytes a pixel that an encoded picture is allowed for (measured: renders and smooth photos 0.2 to 0.4, pure noise 2.4)."""
+"""Bytes a pixel that an encoded picture is allowed for. Only noise takes more: docs/results/tuning.md#memory"""
 JPEG_QUALITY = 95
-"""The pictures shall differ by what compression did, not by JPEG: 51 dB at this quality, 46 at 90, for a third more bytes."""
+"""The pictures shall differ by what compression did, not by JPEG: docs/results/tuning.md#jpeg_quality"""
 ERROR_QUALITY = 85
 MOST_POINTS = 1500
 """Gaussians that stand for the scene in the plans of the cameras."""

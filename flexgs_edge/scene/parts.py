@@ -12,19 +12,19 @@ from flexgs_edge.scene.rotations import turned
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
 OFFSET = 0.4
-"""How far the halves of a Gaussian are moved along its longest axis, in its standard deviations: nearer halves look more like the
-whole, but are less and less two. Fidelity of samples/still_life in 2, 4 and 8 parts: 0.2: 49.5, 44.3
-and 38.5 dB; 0.3: 48.2, 44.2 and 39.2; 0.4: 47.2, 44.0 and 39.8; 0.5: 45.9 and 43.4."""
+"""How far the halves of a Gaussian are moved along its longest axis, in its standard deviations. Nearer halves look
+more like the whole, but overlap so much that they hardly count as two: docs/results/tuning.md#offset"""
 ALONG = (1.0 - OFFSET**2) ** 0.5
 """Factor on the longest standard deviation: variance less the square of the offset, so that the pair keeps the second moment."""
 ACROSS = 1.04
-"""Factor on the two others. Renderers skip alphas below 1/255, which takes more of the fringe of a fainter Gaussian; a little
-width gives it back (in 2 and 4 parts, 1: 45.8 and 40.8 dB; 1.04: 47.2 and 44.0; 1.06: 46.8 and 43.8)."""
+"""Factor on the two others. Renderers skip alphas below 1/255, which takes more of the fringe of a fainter Gaussian. A
+little width gives it back: docs/results/tuning.md#across"""
 CENTRE = 0.1
-"""Share of the opacity that the light through the middle asks for, the rest being what keeps the sum of alphas (in 2 and 4 parts,
-0: 46.8 and 43.6 dB; 0.1: 47.2 and 44.0; 0.3: 46.6 and 43.4; 1: 40.3 and 37.2)."""
+"""Share of the opacity that keeps the light through the middle; the rest keeps the sum of alphas:
+docs/results/tuning.md#centre"""
 MOST_PARTS = 8
-"""Parts of a Gaussian before there are tiles: 40 dB on the sample; 16 would be 36 dB."""
+"""Most parts of a Gaussian; beyond, scenes are tiled. More parts look too little like the whole:
+docs/results/tuning.md#most_parts"""
 _LOGIT_MOST, _LOG_SCALE_MOST = 80.0, 80.0
 """Beyond these a Gaussian is nothing or everything; exp stays finite."""
 _OVERLAP = float(np.exp(-(OFFSET**2) / (2 * ALONG**2)))

@@ -136,7 +136,7 @@ class SceneSource(ABC):
         """
         rows, size = normalize_rows(rows, self.count)
         if isinstance(rows, np.ndarray):
-            span = as_range(rows)  # gathering was 40 % of quantizing a whole scene
+            span = as_range(rows)  # a slice needs no gathering, which is slow
             rows = rows if span is None else span
         planes: Planes = {}
         for field in fields:

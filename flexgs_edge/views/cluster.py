@@ -36,7 +36,8 @@ SENDINGS = 3
 """Times that a scene is sent when all workers that held it were lost."""
 CONNECT_SECONDS = 30
 NICE = 10
-"""Of processes that are started here: fox, half a second of 14 less."""
+"""Niceness of worker processes that we start here, so that they leave the main process its core:
+docs/results/tuning.md#nice"""
 
 
 class Cluster:

@@ -84,7 +84,7 @@ def draw_sums(
 
 
 def warm_up(drawing: Drawing) -> None:
-    """Draw one Gaussian as views will be: a worker's first view takes 0.3 s, as its kernels are loaded."""
+    """Draw one Gaussian as views will be: a worker's first view is slow, since its kernels are loaded then."""
     planes = {name: np.zeros((field.width(0), 1), np.float32) for name, field in FIELD.items()}
     planes["quats"][0] = 1
     camera = Camera("", TILE, TILE, np.eye(3), np.array([0.0, 0.0, 1.0]), TILE, TILE, TILE / 2, TILE / 2)

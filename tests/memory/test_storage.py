@@ -156,8 +156,9 @@ def test_small_arrays_stay_in_memory(tmp_path: Path) -> None:
 
 def test_a_kill_leaves_nothing(tmp_path: Path) -> None:
     code = (
-        "import os, signal, sys; from flexgs_edge.memory.storage import ScratchStorage; storage = ScratchStorage(sys.argv[1])\n"
-        "values = storage.empty((1 << 20,), 'f8'); values[:] = 1; file = storage.file(); file.write(bytes(1 << 20)); file.flush()\n"
+        "import os, signal, sys\nfrom flexgs_edge.memory.storage import ScratchStorage\nstorage = ScratchStorage(sys.argv[1])\n"
+        "values = storage.empty((1 << 20,), 'f8'); values[:] = 1\n"
+        "file = storage.file(); file.write(bytes(1 << 20)); file.flush()\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)

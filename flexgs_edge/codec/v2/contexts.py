@@ -16,7 +16,8 @@ from flexgs_edge.codec.v2.features import Features
 from flexgs_edge.constants import COARSE_ROWS, VALUE_LIMIT
 
 REACH = (4, 2)
-"""Neighbours on each side for the base channels, and for SH: they are many, and half the reach costs 1 % of their bits."""
+"""Neighbours on each side for the base channels, and for SH. SH are many, so half the reach saves time there and costs
+few bits: docs/results/tuning.md#codec"""
 ONE = 256
 """Features count in 1/256 of a code."""
 
@@ -94,7 +95,7 @@ def plan_passes(position: np.ndarray, reach: int, stride: int = 1) -> Plan:
 def _neighbours(known: np.ndarray, count: int, reach: int, stride: int) -> np.ndarray:
     """[2 * reach, count] of both sides of `count` rows: row j lies between `known` j and j + 1; ends are repeated."""
     padded = np.concatenate([np.repeat(known[:1], reach - 1), known, np.repeat(known[-1:], reach)])
-    # Overlapping views of one array (as_strided takes ten times as long to make them).
+    # Overlapping views of one array. as_strided makes the same, but slowly.
     step = padded.itemsize
     return np.ndarray((2 * reach, count), padded.dtype, padded, 0, (step, stride * step))
 

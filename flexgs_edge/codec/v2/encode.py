@@ -28,7 +28,8 @@ from flexgs_edge.scene.curve import morton
 SAMPLE_CHUNKS = 2
 """Chunks that the predictions are fitted to; tables count all of them."""
 SAMPLE_ROWS = 16384
-"""About as many rows of each of them are fitted to: all rows cost four times the time for 0.01 bits a Gaussian."""
+"""Predictions are fitted to about as many rows of each of them. All rows would take longer and gain hardly a bit:
+docs/results/tuning.md#codec"""
 
 
 def cells_of(grid: GridScene, storage: Storage = IN_MEMORY) -> tuple[np.ndarray, np.ndarray, int]:
@@ -84,7 +85,7 @@ class Encoded:
 
     @property
     def information(self) -> float:
-        """Bytes of the model and of all symbols; the streams take some more (fox: 0.3 %)."""
+        """Bytes of the model and of all symbols. The streams take a little more."""
         return float(self.bits.sum()) / 8 + len(self.model.to_bytes())
 
     @property

@@ -15,8 +15,8 @@ from flexgs_edge.codec.v2.tables import CONTEXTS_MOST, SYMBOLS_MOST
 _HEAD = struct.Struct("<iBiHBBB")
 MEAN_BUCKETS = 12
 SPREAD_BUCKETS = 5
-"""Contexts of symbols that are values: 12 times 5 (8 x 4 costs 0.1 bits a Gaussian more, 16 x 8 gains 0.05 before its
-tables)."""
+"""Contexts of symbols that are values: 12 times 5. More contexts gain less than their tables cost:
+docs/results/tuning.md#codec"""
 RESIDUAL_BUCKETS = 12
 """Contexts of symbols that are residuals: 12 times the side of the rounding."""
 SYMBOL_ROOM = 192

@@ -9,12 +9,12 @@ import numpy as np
 from flexgs_edge.codec.v2.rans import Decoder, Encoder, StreamError, Tables, normalize
 
 LEVELS = 65
-"""Level 0 is absent; level v stands for the weight (4 + (v - 1) % 4) << (v - 1) // 4: steps of 14 to 25 %, which cost
-0.003 bits a symbol, half of what finer levels cost in the file at 100 000 rows."""
+"""Level 0 is absent; level v stands for the weight (4 + (v - 1) % 4) << (v - 1) // 4: steps of 14 to 25 %. They cost
+less than the bytes that finer levels would take in the file: docs/results/tuning.md#codec"""
 SYMBOLS_MOST = 256
 CONTEXTS_MOST = 64
 ENTRY_BITS = 3.0
-"""What one frequency costs in the file, about (measured 2.5 to 3.5): contexts are merged until their tables pay."""
+"""About what one frequency costs in the file: contexts are merged until their tables pay."""
 
 _CLASSES = 5
 """Of a symbol in the first table of an alphabet; in a later one, by the level above: none, rare, often; of a mapping."""

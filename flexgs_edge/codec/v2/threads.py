@@ -12,7 +12,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 THREADS_MOST = 2
-"""Chunks in work at once: each holds about 50 MB while it is coded, and more than two wait for the interpreter."""
+"""Chunks in work at once. Each takes memory while it is coded, and more than two wait for the interpreter."""
 
 
 def thread_count(chunks: int) -> int:

@@ -11,9 +11,8 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.costs import RemovalCosts
 
 SH_FACTOR = 2.0
-"""Costs of dropped SH count this much. They are measured one Gaussian at a time, but neighbours on a surface lose the same
-part of their view dependence and their errors add up: bytes at 1 dB fall by 4 % on fox and stay on the sample scene
-against a factor of 1."""
+"""Costs of dropped SH count this much. We measure them one Gaussian at a time. But neighbours on a surface lose the
+same part of their view-dependent colour, and these errors add up: docs/results/tuning.md#sh_factor"""
 REMOVAL_FACTOR = 1.3
 """Costs of removal count this much, for the same reason: what goes in one cut is measured one by one."""
 
@@ -22,9 +21,8 @@ REMOVAL_FACTOR = 1.3
 class BitModel:
     """What a Gaussian costs.
 
-    The usual figures are near what the coder takes at 1 dB (fox 50 bits and 7, 12 and 16 for the bands; the sample 64 and 11, 18
-    and 25). Searching with the coder's own near the answer, a twentieth of the time of `fast`, is not worth that: balanced, fox
-    547.6 kB at 0.99 dB against 552.6 at 0.95, the sample 120.5 at 0.90 against 114.3 at 0.92; fox at 0.2 dB, fast, 3 % smaller.
+    These are fixed. Asking the coder for its own bits near the answer takes time and does not make files smaller:
+    docs/results/tuning.md#bitmodel
 
     Parameters
     ----------
@@ -118,7 +116,7 @@ def drop_bands(
     if top == 0:
         return {name: storage.take(values, rows) for name, values in planes.items()}
     kept = {name: storage.empty((len(planes[name]), len(rows)), np.float32) for name in ("sh_dc", "sh_rest")}
-    # Taken and cleared at once: six million within 1 GiB wrote and read 0.5 GB more for each choice.
+    # Taken and cleared at once: a second pass would write and read all planes of a scene in scratch files again.
     for part, found in read_ahead(planes["means"].shape[1], sh_mean, planes["sh_dc"], planes["sh_rest"]):
         here = slice(*np.searchsorted(rows, (part.start, part.stop)).tolist())
         inside, some = rows[here] - part.start, degrees[here]

@@ -14,7 +14,8 @@ Product = TypeVar("Product")
 """What a step makes: a grid, or a finished file."""
 
 SLOPE = 0.7
-"""Slope of the log of the drop over the log of the multiplier before two points are measured (fox .55 to .77)."""
+"""Slope of the log of the drop over the log of the multiplier before two points are measured:
+docs/results/tuning.md#slope"""
 SIZE_SLOPE = -0.45
 """The same for the log of the size."""
 LARGEST_STRIDE = 1.2

@@ -30,8 +30,8 @@ SMALLEST_THREE = 1.051
 """Mean square of the turn that errors of three stored components make, the fourth following from them, over theirs: mean of
 1 + |xyz|^2 / (3 w^2) over random rotations in their canonical form."""
 GEOMETRY_MENDED = 2.0
-"""The colour refit that follows takes back about half of the geometry's error: 0 to 4 % fewer bytes at 1 dB on fox and the
-sample scene against 1."""
+"""The colour refit that follows takes back about half of the geometry's error:
+docs/results/tuning.md#geometry_mended"""
 CHROMA = 2.0
 """Steps of Co and Cg in steps of Y. Squared errors in red, green, blue: 3 dY^2 + dCo^2 / 2 + 3/4 dCg^2, so equal slopes ask
 for sqrt(6) and 2."""
@@ -79,8 +79,9 @@ def _on_trial_grid(planes: dict[str, np.ndarray], kind: str, step: np.float32) -
     """The field that changes when values of one kind are rounded to multiples of `step`.
 
     All but opacities get errors of the same mean square instead, along and about each Gaussian's own axes, with signs from the
-    digits of its opacity: where a grid begins depends on the scene's unit and axes, and with it a few large Gaussians' errors,
-    which moved slopes by up to 20 %. All errors have one size, so that it matters little which Gaussian gets which sign.
+    digits of its opacity. Where a grid begins depends on the scene's unit and axes, and the errors of a few large
+    Gaussians with it: they would move the slopes. All errors have one size, so it matters little which Gaussian gets
+    which sign.
     """
     if kind != "opacity":
         digits = planes["opacity_logits"][0].view(np.uint32).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
@@ -159,8 +160,8 @@ def _ranges(planes: np.ndarray) -> list[tuple[np.float32, np.float32]]:
 def reachable(steps: StepSizes, planes: dict[str, np.ndarray], seen: np.ndarray) -> np.ndarray:
     """[n] bool: rows that a grid of these steps can hold beside those that some pose sees.
 
-    One Gaussian far away, in no view, would ask for position steps as large as the scene is small beside it: five of them, a
-    million spreads away, cost the sample scene 14.6 dB.
+    One Gaussian far away, in no view, would ask for position steps as large as the scene itself:
+    docs/results/stability.md
 
     Parameters
     ----------

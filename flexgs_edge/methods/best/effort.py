@@ -11,12 +11,12 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.run.options import CompressOptions
 
 LEAST_VIEWS = 6
-"""Poses a step of the refit at the least: steps after 3 poses each fitted fox's 24 scored ones ever better and all others ever
-worse."""
+"""Least poses for a step of the refit. Steps from fewer fit the scored poses ever better and all others ever worse:
+docs/results/tuning.md#least_views"""
 
 MENDED = 0.66
-"""Loss after the first round of the colour refit over the loss before it, until a whole result tells (fox .61 to .75, the sample
-.8 to .9)."""
+"""Loss after the first round of the colour refit over the loss before it, until a candidate tells:
+docs/results/tuning.md#mended"""
 LARGEST_STEP = 4
 """Most pixels from one to the next: splats of one or two pixels must not fall between them in every view."""
 
@@ -30,33 +30,26 @@ class Effort:
     keep : float
         Share of the Gaussians that stays in each round of the path.
     refit_rounds : int
-        Rounds on all coefficients before SH are put on their grid (one on the constant follows). None in fast: a fifth of its
-        time for 5 % of the bytes.
+        Rounds on all coefficients before SH are put on their grid (one on the constant follows). None in `fast`, where
+        they would cost more time than their bytes are worth: docs/results/tuning.md#refit_rounds
     subsets : int
         Steps a round at most, as for `refit_colours`.
     steps : int
         Whole results that are measured, at most while something holds.
     close : float
-        Excess (log of loss over limit) that ends the search when it is no farther below the target: 0.03 are about 1.5 % of
-        the bytes.
+        Excess (log of loss over limit) that ends the search when it is no farther below the target.
     few : int
-        Scored poses at the least, where there are as many. Balanced, at a target of 1 dB: fox from all 43 poses 563 kB at 0.93
-        dB, from 32 582 kB at 0.86; the sample from all 70 119 kB at 0.87 dB, from 32 121 kB at 0.90.
+        Least scored poses, where there are as many: docs/results/tuning.md#few
     views : int
-        Scored poses at the most: more than `few` where these have too few pixels.
+        Most scored poses: more than `few` where these have too few pixels.
     pixels : int
-        Pixels of all scored poses for each Gaussian at the least: only every k-th one in both directions is looked at while
-        there are as many. Bytes at 1 dB and processor seconds (balanced): fox at every pixel (131 for each Gaussian) 557 kB,
-        123 s; at every second (33) 546 kB, 75 s; every third (15) 8 % more bytes. The sample at every second (92) and third
-        (41): 121 and 119 kB.
+        Least pixels of all scored poses for each Gaussian. We look at every k-th pixel in both directions, with the
+        largest k that leaves as many. More pixels take longer, fewer make files larger: docs/results/tuning.md#pixels
     mended : float
-        `MENDED` at this effort: the fewer pixels are fitted, the less of it holds elsewhere. (More poses than `few` mean more
-        Gaussians, not more pixels for each. A million from 21 poses, fast when it refitted SH:
-        with .66 the first result misses by 0.19 dB and three
-        are measured, with .84 it holds at 0.80 dB.)
+        `MENDED` at this effort: the fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
+        makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#mended
     probed : int
-        Poses that trial grids are judged on, at most. 4 instead of 8 spare fast a tenth of its time; 2 % fewer bytes on fox, as
-        many on the sample: chance.
+        Most poses that trial grids are judged on: docs/results/tuning.md#probed
     passes : float
         Times that the descent to the first whole result looks at every scored pose; 0: colours are refitted instead.
     """

@@ -28,14 +28,14 @@ from flexgs_edge.methods.best.rounds import PruneRounds
 FINE_COLOUR = 2.0**-8
 """Colour steps before the refit, as a share of the final ones: only geometry shall move."""
 FURTHER = 0.92
-"""Loss after each further round of the colour refit over the round before it (fox .92)."""
+"""Loss after each further round of the colour refit over the round before it: docs/results/tuning.md#further"""
 DRIFT = -0.12
-"""What a second refit, which goes on where the first one ended, adds to the excess (fox -.15, the sample -.3 to 0)."""
+"""What a second refit adds to the excess. It goes on where the first one ended: docs/results/tuning.md#drift"""
 DISTILLED = 0.4
-"""Loss after a descent over the loss before it, until a whole result tells; above what was seen (fox and the sample .33): from
-a result that holds, further descents go on with fewer Gaussians, but not with more."""
+"""Loss after a descent over the loss before it, until a candidate tells. This is cautious on purpose: a further descent
+can go on from a candidate that holds with fewer Gaussians, but not with more: docs/results/tuning.md#distilled"""
 DRIFT_DISTILLED = -0.3
-"""`DRIFT` of a further descent (the sample -.43)."""
+"""`DRIFT` of a further descent: docs/results/tuning.md#drift_distilled"""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` where a descent follows: it takes more back than pruning may lose."""
 FURTHER_STEPS = 0.4
@@ -45,11 +45,12 @@ FURTHER_RATE = 0.5
 FULL_RATES, LEAST_RATE = 41.0, 0.25
 """Fidelity before a descent up to which it goes at full rates, dB, and the least share of them: `rate_from`."""
 DECAY = 0.8
-"""Part of that which the next refit adds again (fox .9, the sample .4). Above zero where refits fit the scored poses too well."""
+"""Part of that which the next refit adds again. It is above zero because refits fit the scored poses too well:
+docs/results/tuning.md#decay"""
 FARTHER = 0.05
 """Excess below the target that is aimed at for each result that missed it, from the second in a row on."""
 PROBES = 4
-"""Unmended results that are looked at between two whole ones, at most: less than a tenth of the time each."""
+"""Most probes between two candidates. A probe has no refit of its own, so it is cheap."""
 FARTHEST = 2.0
 """Largest change of the log of the multiplier by all probes of one aim."""
 
@@ -57,8 +58,7 @@ FARTHEST = 2.0
 def rate_from(fidelity: float | None) -> float:
     """Share of its rates that a descent from a fidelity goes at: as the root of the mean squared error.
 
-    Where there is less to mend, full steps break more. From 46.3 dB (fox, at 0.1 dB) full rates end at a mean fidelity of 46.1 dB
-    over six views and half of them at 46.5, from 48.1 (the sample) at 48.9 and 49.5; from 34.2 (fox, at 1 dB) at 36.7 and 36.3.
+    Where there is little error left, full steps break more than they mend: docs/results/tuning.md#rate_from
     """
     return 1.0 if fidelity is None else max(min(1.0, 10 ** ((FULL_RATES - fidelity) / 20)), LEAST_RATE)
 
@@ -178,8 +178,8 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _descended(self, multiplier: float) -> Refitted | None:
         """Values of the last descent that kept what this multiplier keeps and more.
 
-        Not of one that kept less: its values make up for what it lacked, and would be too much of it with that back (fox: .92 dB
-        at 366 kB after 1.15 at 278, where the curve would have .76).
+        Not of one that kept less: its values make up for the Gaussians that it lacked. With these back, they make up
+        for too much: docs/results/tuning.md#descended
         """
         before = [(at, mended) for at, mended in self._descents if at <= multiplier]
         return max(before, key=lambda pair: pair[0])[1] if before else None

@@ -23,8 +23,8 @@ from flexgs_edge.views.bench import Bench
 LOG = logging.getLogger("flexgs_edge")
 
 LAYERS_COST = 1.06
-"""Bytes of a layered file over those of one without, at most: neighbours on the curve are farther apart (1.052 for fox in four
-layers)."""
+"""Most bytes of a layered file over those of one without: neighbours on the curve are farther apart in it.
+docs/results/tuning.md#layers_cost"""
 KEPT_COPIES = 4
 """Times a scene's planes that looking for its grid holds: as read, in order, decoded, and codes."""
 

@@ -13,13 +13,9 @@ from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.depths import visible_depths
 
 NEARER, FARTHER = 0.5, 2.0
-"""Distances of poses that are made, as parts of their own pose's. They come on top: in the place of 16 of 48 given ones they cost
-fox 22 % of its bytes.
-
-Scenes differ in what is missing: at the default target without any the sample (fast) is 5.0 dB below its training poses' fidelity
-at half the distance and 1.5 at twice, fox 0.8 and 7.6. One nearer for each given pose, and one farther for every second, leave
-2.4 dB of the sample and 2.2 of fox. With one for each pose, five of eight nearer and two farther, it was 2.7 and 4.0; three and
-four, 3.7 and 1.7; one of both for each pose 1.1 on fox, for 7 % more bytes. docs/guards.md has all figures."""
+"""Distances of the poses that we make, as parts of their own pose's. They come on top of the given ones: in their place
+they make files larger. Scenes differ in what is missing, so there are nearer and farther ones:
+docs/results/tuning.md#nearer"""
 BETWEEN, FAR = 8, 2
 """One of so many given poses has one half way to the nearest pose in the place of a nearer one, or a farther one as well."""
 

@@ -31,13 +31,13 @@ class Measure(Protocol):
 
 
 PRUNED_PART = 0.45
-"""Part of the allowed loss that pruning alone has used up when a whole result meets the target (fox .45, the sample .55): where
-the search starts."""
+"""Part of the allowed loss that pruning alone uses up when a candidate meets the target. The search starts there:
+docs/results/tuning.md#pruned_part"""
 MOST_ROUNDS = 24
 EXTRA_STEPS = 4
 """Steps beyond the effort's own while nothing holds, or what does is far below the target."""
 FAR = 0.25
-"""Excess below the target that is far: a sixth of the bytes."""
+"""Excess below the target that counts as far: the file is much larger than it needs to be."""
 
 
 class MultiplierSearch(ABC, Generic[Product]):

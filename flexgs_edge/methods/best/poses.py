@@ -17,9 +17,9 @@ from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.source import SceneSource
 
 FINE_DROP, FINE_FIDELITY, FINE_RATIO = 0.3, 42.0, 30.0
-"""Targets beyond these (dB, dB, times) keep most SH of most Gaussians: as many values as a part of the pixels has, and colours
-refitted to these fit nothing else. They get all pixels of as many poses as the effort takes. fox at 0.1 dB takes 1.93 MB from
-every second pixel, 1.72 MB from all; at 0.5 dB 0.85 MB from either, and there 32x loses 0.28 dB at a fidelity of 42.3 dB."""
+"""Targets beyond these (dB, dB, times) keep most SH of most Gaussians. These are as many values as a part of the pixels
+has, so colours refitted to a part would fit nothing else. Such targets get all pixels of as many poses as the effort
+takes: docs/results/tuning.md#fine_drop"""
 SAMPLE_ROWS = 4096
 """Gaussians whose positions tell which poses see what."""
 
@@ -45,8 +45,8 @@ def scored_poses(
 ) -> ScoredPoses:
     """As many poses as the effort scores, each next one with the most to add to what those before it see.
 
-    With `views_margin` made ones come on top (see `with_margin`). Costs from 16 such poses lose
-    less than those from all 43 of fox, and 0.06 dB more than those from all 70 of the sample (docs/performance.md).
+    With `views_margin` made ones come on top (see `with_margin`). A few such poses give costs that are about as good as
+    those from all poses: docs/results/speed.md#scoring-fewer-views
     """
     plan = EFFORTS[options.effort]
     order = covering_order(cameras, some_positions(source), renderer.near, plan.views)

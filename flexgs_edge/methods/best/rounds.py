@@ -31,9 +31,8 @@ from flexgs_edge.views.references import References
 from flexgs_edge.views.sums import ViewSums
 
 PARTS = 2
-"""Interleaved parts of the poses; each round measures one, and keeps the sums of the others for the rows that stay. Bytes at 1 dB
-on fox (balanced, refits alike) by processor seconds: one part, .8 kept a round 585 kB / 141 s; two parts, .8 571 / 110, .88 558 /
-134; four parts, .88 581 / 122."""
+"""Each pruning round measures one of this many interleaved sets of cameras and reuses the sums of the others. One set
+is slower, four make files larger: docs/results/tuning.md#parts"""
 
 
 @dataclass

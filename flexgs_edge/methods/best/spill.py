@@ -41,10 +41,11 @@ BAND_BYTES = 20
 """The same for each SH degree: a cost in double precision, a mean colour."""
 WORK_PLANES = 11
 """What a whole result holds for a moment, in planes of its rows (at degree 3, of 236 bytes): the rows without what was dropped,
-codes, values of codes twice, colours of the last refit and of this one, and sums of the refit twice. With 6, fox at a fidelity
-of 48 dB (nearly all rows stay) had a peak 90 MiB above its limit, with 9 one of 12 MiB."""
+codes, values of codes twice, colours of the last refit and of this one, and sums of the refit twice. With fewer, a
+scene of which nearly all rows stay goes over its limit: docs/results/tuning.md#work_planes"""
 DESCENTS = 3
-"""Times the scene's stored planes that the values of all descents take: two results at 0.1 dB, six or more at 1 dB."""
+"""Times the scene's stored planes that the values of all descents take. A strict target keeps more rows and needs fewer
+candidates: docs/results/tuning.md#descents"""
 SPILLED_ROW_BYTES = 24
 """Bytes that each row of a scene in scratch files takes of memory for a moment: choosing the cheapest rows, and lists of rows."""
 SPOOL_ROW_BYTES = 52

@@ -21,8 +21,8 @@ from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import SceneSource
 
 SH_A_PRUNE = {".spz": 0.5, ".sog": 1.5}
-"""SH rate for each unit of the prune rate, by the bytes that SH take (5.5 of 22, and 27 of 40): loss rises 2 to 3 times as fast
-with the prune rate as with the SH rate, and slowly at first with either. Where only the scene's degree counts there is none."""
+"""SH rate for each unit of the prune rate: larger where SH take more of the bytes, since pruning loses more than
+dropping SH. Formats in which only the scene's degree counts have none: docs/results/tuning.md#sh_a_prune"""
 
 
 def search_pruned_files(
@@ -86,7 +86,7 @@ class _PrunedFiles:
         keeps_sh = np.zeros(self.source.count, bool)
         keeps_sh[with_sh] = True
         rows = np.sort(np.concatenate([with_sh, without]))
-        # Along a curve bytes repeat: 4 to 7 % of .spz.
+        # Along a curve bytes repeat, so .spz files are smaller.
         rows = rows[near_order(self.source.select(rows))]
         file = self.files.make(TrimmedSource(self.source.select(rows), keeps_sh[rows], degree if with_sh.size else 0))
         excess = 0.0 if self.target is None else self.target.excess(file.size, file.measurement)

@@ -19,7 +19,7 @@ from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import SceneSource
 
 QUANTIZE_COPIES = 4
-"""Times a chunk's planes that quantizing holds at once: as read, gathered, and the codes in between (measured: 3.3)."""
+"""Times a chunk's planes that quantizing holds at once: as read, gathered, and the codes in between."""
 
 
 class SceneEvaluator:

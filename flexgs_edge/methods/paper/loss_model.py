@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from flexgs_edge.goals.choice import Choice
 
 PRIOR_SLOPES = (5.0, 2.0)
-"""Excess (log of the loss over its limit) per unit of p and of s before anything is measured: fox and the sample scene
-lie at 4 to 6 and 1.5 to 3."""
+"""Excess (log of the loss over its limit) per unit of p and of s before anything is measured:
+docs/results/tuning.md#prior_slopes"""
 PRIOR_WEIGHT = 1e-3
 """Weight of the prior slopes against one measured point at the limit: decides only where points do not."""
 WIDTH = 0.5

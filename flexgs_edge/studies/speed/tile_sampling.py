@@ -21,8 +21,8 @@ from flexgs_edge.quality.psnr import mean_psnr, psnr
 NORMAL_95 = 1.959964
 """Standard errors that a two-sided interval of 95 % reaches to either side."""
 FLOOR = 0.2
-"""Share of a view's mean that is expected of every tile besides: one that was exact before need not be so now. Measured on the
-sample scene, 20 % of the tiles, first step of a search: half-widths of 0.108, 0.104 and 0.111 dB at 0.05, 0.2 and 0.5."""
+"""Share of a view's mean that is expected of every tile besides: one that was exact before need not be so now.
+docs/results/tuning.md#floor"""
 DECIBEL = 10.0 / math.log(10.0)
 """dB of a factor e of the error."""
 

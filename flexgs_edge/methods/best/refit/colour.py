@@ -24,9 +24,8 @@ from flexgs_edge.views.sums import Maker, ViewSums
 RELAX_DC = 1.0
 RELAX_SH = 0.25
 """Step of a round, as a share of the SIRT step of the constant alone. With all bands moving at once, a pixel seen by one pose
-moves by its residual times 1 + 15 mean |Y_k| * this, which must stay below 2 or steps after few poses grow: at 0.6 a second
-refit of fox at 0.1 dB, where nearly all Gaussians keep their SH, went from a drop of 0.11 to 2.5 dB. At 1 dB both end at the
-same bytes."""
+moves by its residual times 1 + 15 mean |Y_k| * this. It must stay below 2, or steps from few poses grow and grow:
+docs/results/tuning.md#relax_sh"""
 
 
 def refit_colours(

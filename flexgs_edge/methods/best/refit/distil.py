@@ -24,18 +24,16 @@ FIELD_RATES = {
     "sh_dc": 2.5e-3,
     "sh_rest": 2.5e-3 / 20,
 }
-"""The same of the other values: the reference program's, three times for scales and rotations. They take tens of thousands of
-steps there and hundreds here: at 71 kB and 210 steps the sample loses 1.18 dB so, 1.42 with those of the reference program (and
-half its opacity's), 1.40 with twice all of these."""
+"""The same of the other values: the reference program's, three times as much for scales and rotations. That program
+takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
 LAST = 0.1
 """Rates at the end as a share of those at the beginning, of the steps with geometry and of those without; they fall by the same
 share at each step."""
 ON_GRID, HOLDING = 0.5, 0.75
 """Shares of the steps before views are drawn from values on their grids, and before geometry is held there."""
 HELD = ("means", "log_scales", "quats")
-"""Fields that stay where they are from then on. Codes of geometry that flip back and forth move whole splats, and the
-last of them decide: the sample at 71 kB and 420 steps lost 1.07 to 1.79 dB with them free, by what views came last; 1.07 with
-them held (fidelity 39.4, not 37.5 to 39.3), 1.40 without this part. Opacities held as well: 1.19."""
+"""Fields that stay where they are from then on. Codes of geometry that flip back and forth move whole splats, so the
+views that come last would decide: docs/results/tuning.md#held"""
 
 
 @dataclass(frozen=True)
