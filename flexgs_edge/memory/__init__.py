@@ -1,1 +1,1 @@
-"""Bytes held: the budget, what the system says, and arrays in memory or in scratch files."""
+"""The memory limit of a run, the memory that the system reports, and large arrays in memory or in scratch files."""

@@ -1,8 +1,8 @@
 """One memory limit for the whole run, in bytes, and the planner that keeps it.
 
-The limit counts everything: what the process holds when planning starts (Python, libraries, the OpenCL compiler)
-plus every array and device buffer that a stage declares. A stage says what it needs as `fixed` bytes plus `per_row`
-bytes; the planner answers with the rows that fit, or raises with the smallest limit that would do.
+The limit counts what the process already holds (Python, libraries, the OpenCL compiler) and every array and device buffer
+that a stage declares. A stage asks for `fixed` bytes plus `per_row` bytes. The planner answers with the rows that fit, or
+raises an error that names the smallest sufficient limit.
 """
 
 from __future__ import annotations
@@ -17,39 +17,48 @@ from flexgs_edge.units import format_mib
 
 @dataclass
 class MemoryBudget:
-    """A limit in bytes and what is taken from it.
+    """A memory limit, and the bytes that are taken from it.
 
     Parameters
     ----------
     limit : int
         Bytes that the whole process may hold.
     used : int
-        Bytes held when planning starts, by default what the process holds now.
+        Bytes already held; `from_limit` takes the resident memory of the process.
     """
 
     limit: int
     used: int = 0
     reclaimers: list[Callable[[int], None]] = field(default_factory=list)
-    """Called with the bytes that are short before a stage is refused: caches give back what they can spare."""
+    """Functions to call with the missing bytes before a stage is refused; each lets a cache free memory."""
 
     @classmethod
     def from_limit(cls, limit: int | None) -> MemoryBudget:
-        """A budget of `limit` bytes, or of 3/4 of the memory that is free now."""
+        """A budget of `limit` bytes; by default, the memory held now plus 3/4 of the memory that is available."""
         used = current_rss()
         return cls(limit if limit is not None else used + available_memory() * 3 // 4, used)
 
     @property
     def free(self) -> int:
-        """Bytes not yet taken."""
+        """Bytes not taken yet."""
         return self.limit - self.used
 
     def rows(self, stage: str, per_row: int, fixed: int = 0, minimum: int = 1, most: int = 1 << 20) -> int:
         """Rows of a chunk for `stage`: as many as fit, at most `most`.
 
+        Parameters
+        ----------
+        stage : str
+            Name of the stage, for the error message.
+        per_row, fixed : int
+            Bytes that the stage needs: for each row, and in any case.
+        minimum, most : int
+            Least and most rows of a chunk.
+
         Raises
         ------
         BudgetError
-            When not even `minimum` rows fit; the message names the smallest limit that would do.
+            If not even `minimum` rows fit; the message names the smallest sufficient limit.
         """
         rows = min(most, (self.free - fixed) // max(per_row, 1))
         if rows < minimum:
@@ -58,7 +67,7 @@ class MemoryBudget:
         return rows
 
     def require(self, stage: str, size: int) -> None:
-        """Check that `size` more bytes fit (raises `BudgetError` naming the smallest limit that would)."""
+        """Raise `BudgetError` unless `size` more bytes fit; the message names the smallest sufficient limit."""
         for reclaim in self.reclaimers:
             if size > self.free:
                 reclaim(size - self.free)
@@ -69,7 +78,7 @@ class MemoryBudget:
             )
 
     def take(self, stage: str, size: int) -> None:
-        """Take `size` bytes for as long as the stage lasts (give them back with `give`)."""
+        """Take `size` bytes until `give` returns them; raises `BudgetError` if they do not fit."""
         self.require(stage, size)
         self.used += size
 

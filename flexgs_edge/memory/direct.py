@@ -1,8 +1,8 @@
-"""Reading files past the kernel's cache of pages, where it does not hold them.
+"""Read scratch files past the kernel's page cache (O_DIRECT), if the cache does not hold the pages already.
 
-Under a cap a page that is read through the cache is charged to the control group, pushes another page out, and is copied; and
-where more is read in turn than there is room for, pages are pushed out before they are read again. Read past the cache they leave
-those alone that are there: docs/results/tuning.md#disks
+Under a memory cap, each page read through the cache counts against the cap, evicts another page and is copied. If we read
+more in turn than fits, pages are evicted before we need them again. A read past the cache leaves cached pages alone:
+docs/results/tuning.md#disks
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from typing import BinaryIO
 import numpy as np
 
 BUFFER_BYTES = 1 << 21
-"""Of each thread that reads past the cache: one huge page. A disk fills small pages, which lie anywhere, more slowly:
+"""Bytes of the buffer of each thread that reads past the cache: one huge page. Disks fill scattered small pages more slowly:
 docs/results/tuning.md#disks"""
 _HELD = threading.local()
 
 
 class DirectFile:
-    """An open file, opened once more to be read past the cache."""
+    """A second descriptor of an open file, which reads past the cache."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
 
     @classmethod
     def of(cls, file: BinaryIO) -> DirectFile | None:
-        """`file` once more; None where the system or the disk cannot."""
+        """Open `file` again; None if the system or the disk does not support it."""
         with suppress(OSError, AttributeError):
             return cls(os.open(f"/proc/self/fd/{file.fileno()}", os.O_RDONLY | os.O_DIRECT))
         return None
 
     def read(self, at: int, out: memoryview) -> None:
-        """Fill `out` (bytes) from byte `at` of the file on; raises `EOFError` where the file ends before."""
+        """Fill `out` (bytes) from byte `at` of the file; raises `EOFError` if the file is too short."""
         buffer = _buffer()
         while out:
-            # Places and sizes are to be whole blocks of the disk; a page is.
+            # O_DIRECT takes only offsets and sizes in whole blocks of the disk; a page is a multiple of them.
             start = at // mmap.PAGESIZE * mmap.PAGESIZE
             end = min(-(-(at + len(out)) // mmap.PAGESIZE) * mmap.PAGESIZE, start + BUFFER_BYTES)
             got = os.preadv(self._descriptor, [buffer[: end - start]], start)
@@ -51,14 +51,14 @@ class DirectFile:
             out, at = out[len(part) :], at + len(part)
 
     def close(self) -> None:
-        """Close this opening of it."""
+        """Close the second descriptor."""
         os.close(self._descriptor)
 
 
 def _buffer() -> memoryview:
-    """The buffer of the thread that asks."""
+    """The read buffer of the current thread."""
     if not hasattr(_HELD, "buffer"):
-        pages = mmap.mmap(-1, 2 * BUFFER_BYTES, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)  # shared ones stay small
+        pages = mmap.mmap(-1, 2 * BUFFER_BYTES, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)  # shared: no huge pages
         if hasattr(mmap, "MADV_HUGEPAGE"):
             with suppress(OSError):
                 pages.madvise(mmap.MADV_HUGEPAGE)
@@ -69,9 +69,9 @@ def _buffer() -> memoryview:
 
 
 def is_cached(address: int, size: int) -> bool:
-    """Whether memory seems to hold the `size` bytes of a file that are mapped at `address`; True where nobody can tell.
+    """Whether the page cache seems to hold `size` bytes of a file mapped at `address`; True if the system does not tell.
 
-    Asked are the first page and the last: neighbours come and go together, and what is wrong now and then costs only time.
+    We ask for the first and the last page only, since neighbours come and go together. A wrong answer costs time, no data.
     """
     library = _library()
     if library is None:
@@ -79,7 +79,7 @@ def is_cached(address: int, size: int) -> bool:
     held = ctypes.c_ubyte()
     for place in (address, address + max(size - 1, 0)):
         told = library.mincore(place // mmap.PAGESIZE * mmap.PAGESIZE, 1, ctypes.byref(held)) == 0
-        if told and not held.value & 1:  # the other bits may be anything
+        if told and not held.value & 1:  # the other bits are undefined
             return False
     return True
 

@@ -1,4 +1,4 @@
-"""Columns of planes in another order."""
+"""Read columns of planes in another order, such as the Morton order of a file, without holding the planes in memory."""
 
 from __future__ import annotations
 
@@ -11,10 +11,19 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 
 
 class OrderedPlanes:
-    """Columns of planes in another order (None: their own), read in parts.
+    """Columns of planes in another order, read in parts.
 
-    From memory they are looked up as they are asked for. In files all are put in order first, plane by plane: otherwise places
-    all over every plane would be read for each part.
+    Planes in memory are indexed when they are read. Planes in files are reordered first, one by one; otherwise every part
+    would read pages all over every plane.
+
+    Parameters
+    ----------
+    planes : mapping of str to np.ndarray
+        [width, n] of each field.
+    order : np.ndarray or None
+        [n], the row that comes at each place; None keeps the order.
+    storage : Storage
+        Holds the reordered planes.
     """
 
     def __init__(self, planes: Mapping[str, np.ndarray], order: np.ndarray | None, storage: Storage) -> None:
@@ -24,7 +33,7 @@ class OrderedPlanes:
             self._order = None
 
     def parts(self, count: int, *fields: str) -> Iterator[tuple[slice, list[np.ndarray]]]:
-        """Of the first `count` rows some at a time, and [width, m] of each field."""
+        """Yield the first `count` rows part by part: their slice, and [width, m] of each field."""
         planes = [self._planes[field] for field in fields]
         if self._order is None:
             yield from read_ahead(count, *planes)
@@ -33,7 +42,7 @@ class OrderedPlanes:
             yield rows, [values[:, self._order[rows]] for values in planes]
 
     def band(self, degree: int, rows: np.ndarray) -> np.ndarray:
-        """[3, 2l + 1, m] coefficients of one SH degree of some rows."""
+        """[3, 2l + 1, m], the coefficients of SH degree l of the given rows."""
         values = self._planes["sh_rest"]
         band = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
         rgb = values.reshape(3, len(values) // 3, values.shape[1])[:, band]
@@ -41,10 +50,15 @@ class OrderedPlanes:
 
 
 def stable_order(keys: np.ndarray, storage: Storage = IN_MEMORY, rows: int = 1 << 22) -> np.ndarray:
-    """[n] i64, what `np.argsort(keys, kind="stable")` gives, with no more than about `rows` keys sorted at a time in memory.
+    """Argsort as `np.argsort(keys, kind="stable")`, with about `rows` keys in memory at a time.
 
-    Keys are split by value into parts of about equal size (as a sample says), which are sorted one after the other; equal keys
-    are never split.
+    We split the keys by value into parts of about equal size, estimated from a sample, and sort one part after the other.
+    Equal keys always fall into one part.
+
+    Returns
+    -------
+    np.ndarray
+        [n] i64.
     """
     count = len(keys)
     if not storage.spills or count <= rows:

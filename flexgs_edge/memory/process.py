@@ -1,4 +1,4 @@
-"""What the system says of this process: memory held, memory left, and memory given back."""
+"""Memory of this process as the system reports it: held now, at its peak, and still available."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from contextlib import suppress
 from pathlib import Path
 
 SAMPLE_SECONDS = 0.05
-"""Seconds between looks at the memory: peaks that are shorter may be missed."""
+"""Seconds between two samples of the memory; shorter peaks may be missed."""
 
 _MALLOPT = {-3: 8 << 20, -1: 32 << 20, -8: 2}
-"""glibc's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD in bytes, and M_ARENA_MAX: heaps of threads."""
+"""Settings of glibc: M_MMAP_THRESHOLD and M_TRIM_THRESHOLD in bytes, and M_ARENA_MAX, the number of heaps for threads."""
 
 
 def peak_rss() -> int:
     """Peak resident memory of this process so far, in bytes."""
     try:
-        # Not ru_maxrss where it can be helped: that one survives exec, so it may be the peak of whoever started us.
+        # ru_maxrss survives exec, so it may be the peak of the program that started this one.
         with open("/proc/self/status", "rb") as status:
             return next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:")) * 1024
     except (OSError, StopIteration):
@@ -30,7 +30,7 @@ def peak_rss() -> int:
 
 
 def current_rss() -> int:
-    """Resident memory of this process now, in bytes (the peak where /proc is missing)."""
+    """Resident memory of this process now, in bytes; its peak if there is no /proc."""
     try:
         with open("/proc/self/statm") as statm:
             return int(statm.read().split()[1]) * resource.getpagesize()
@@ -39,7 +39,7 @@ def current_rss() -> int:
 
 
 def anonymous_rss() -> int | None:
-    """Resident memory of this process without a file behind it, in bytes; None where the system does not tell."""
+    """Resident memory of this process without pages of files, in bytes; None if the system does not tell."""
     try:
         with open("/proc/self/status", "rb") as status:
             return next(int(line.split()[1]) for line in status if line.startswith(b"RssAnon:")) * 1024
@@ -48,9 +48,9 @@ def anonymous_rss() -> int | None:
 
 
 class AnonymousPeak:
-    """Watches the memory that no file stands behind, from now on: the kernel keeps no peak of it.
+    """Samples the peak of the anonymous memory in a thread, since the kernel keeps no such peak.
 
-    Pages of mapped scratch files are resident as long as nobody needs the room, so they tell nothing of what a run needs.
+    Resident pages of mapped scratch files do not count: the kernel drops them as soon as it needs the room.
     """
 
     def __init__(self) -> None:
@@ -64,16 +64,15 @@ class AnonymousPeak:
             self.peak = max(self.peak or 0, anonymous_rss() or 0) or None
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop sampling."""
         self._stop.set()
         self._thread.join()
 
 
 def available_memory(proc: str | Path = "/proc", groups: str | Path = "/sys/fs/cgroup") -> int:
-    """Memory that the machine could give now, in bytes (1 GiB where it cannot tell).
+    """Memory that this process can still get, in bytes; 1 GiB if the system does not tell.
 
-    A control group (a container, a service) with a limit gives what is left of its own: no error comes beyond it, the
-    kernel kills the process.
+    A limit of a control group (a container, a service) counts too: beyond it the kernel kills the process, with no error.
     """
     free = 2**30
     with suppress(OSError):
@@ -84,7 +83,7 @@ def available_memory(proc: str | Path = "/proc", groups: str | Path = "/sys/fs/c
 
 
 def _left_in_groups(proc: Path, groups: Path) -> Iterator[int]:
-    """Bytes that each memory limit above this process leaves, in both versions of the kernel's interface."""
+    """Bytes left under each memory limit above this process, for versions 1 and 2 of control groups."""
     try:
         lines = (proc / "self" / "cgroup").read_text().splitlines()
     except OSError:
@@ -98,22 +97,22 @@ def _left_in_groups(proc: Path, groups: Path) -> Iterator[int]:
             used, cache = "memory.usage_in_bytes", "total_inactive_file"
         else:
             continue
-        # From inside a container the path may be the host's: the folders that are there count, from the top down.
+        # In a container, the path may be the host's. We take the folders that exist, from the top down.
         for part in ("", *(part for part in path.split("/") if part not in ("", ".."))):
             place = place / part
             with suppress(OSError, ValueError):  # ValueError: the word "max"
                 limit = int((place / most).read_text())
                 stat = dict(line.split() for line in (place / "memory.stat").read_text().splitlines())
-                # Files read once are counted as used, and given up first.
+                # Inactive file pages count as used, but the kernel drops them first.
                 yield limit - int((place / used).read_text()) + int(stat.get(cache, 0))
 
 
 def return_freed_memory() -> None:
-    """Have the C library return large arrays to the system when they are freed; nothing where it is not glibc.
+    """Make glibc return large freed arrays to the system; does nothing with another C library.
 
-    By default every free of a mapped array raises the size that is mapped (to 32 MiB), so the arrays of two threads end
-    up in heaps with holes, and the peak rises. Lower limits cost time instead: the kernel clears each page that comes
-    back, by a fault each. To be called before anything large is allocated: docs/results/tuning.md#memory
+    By default, each freed mapped array raises the size from which glibc maps (up to 32 MiB). Then arrays of several threads
+    leave holes in heaps, and the peak rises. Lower limits than ours cost time: the kernel clears each page that is mapped
+    again. Call this before any large allocation: docs/results/tuning.md#memory
     """
     with suppress(OSError, AttributeError):
         mallopt = ctypes.CDLL(None).mallopt

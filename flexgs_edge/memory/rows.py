@@ -1,4 +1,4 @@
-"""Rows of arrays that may lie in mapped files: read from the kernel's cache or past it, and written without their pages."""
+"""Copy rows of arrays that may lie in mapped scratch files, with plain reads and writes instead of page faults."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ import numpy as np
 from flexgs_edge.memory.direct import BUFFER_BYTES, DirectFile, is_cached
 
 BLOCK_ROWS = 1 << 14
-"""Rows at a time of what is done row by row: 24 MB of all fields in double precision, with the copies that NumPy makes."""
+"""Rows of a part in loops over rows: 24 MB of all fields in f64, with the copies that NumPy makes."""
 AHEAD_ROWS = 1 << 15
 """Rows that are read ahead at a time."""
 COPY_ROWS = 1 << 18
-"""Rows of one plane at a time: a megabyte."""
+"""Rows of one plane that are copied at a time: a megabyte of f32."""
 DENSE = 4
-"""Rows read for one that is wanted, at most: rather than page by page."""
+"""Listed rows are read as one span if it holds at most so many rows for each listed one, else page by page."""
 READERS = 4
-"""Threads that read past the cache. One alone does not keep a disk busy: docs/results/tuning.md#disks"""
+"""Threads that read past the cache. One thread does not keep a disk busy: docs/results/tuning.md#disks"""
 _READING = ThreadPoolExecutor(READERS, "read")
 _TAKING = ThreadPoolExecutor(2, "take")
-"""Planes at a time of which rows are taken: while one is read or written, the other is looked up in."""
+"""Threads that take listed rows: while one plane is read or written, another is indexed."""
 READING_BYTES = (READERS + 4) * BUFFER_BYTES
-"""Buffers of these threads, and of those that take planes, load chunks or read ahead."""
+"""Bytes of the buffers of the reading threads, and of the threads that take rows, load chunks or read ahead."""
 _Piece = tuple[DirectFile, int, memoryview]
-"""A file, a byte of it, and what to fill from there on."""
+"""A part to read: its file, its first byte in the file, and the memory to fill."""
 
 
 class _Owner(Protocol):
-    """Whose file it is."""
+    """The storage that a mapped file belongs to."""
 
     used: int
-    """Bytes of its mapped files."""
+    """Bytes of all its mapped files."""
 
     def full(self, size: int, error: OSError) -> Exception:
-        """What to raise when `size` bytes cannot be had."""
+        """The error to raise if the disk has no room for `size` bytes."""
 
 
 class MappedFile(mmap.mmap):
-    """A mapped file that counts itself."""
+    """A mapped scratch file; when it is freed, its bytes no longer count in its storage."""
 
     storage: _Owner
     address: int
@@ -51,7 +51,7 @@ class MappedFile(mmap.mmap):
 
     @cached_property
     def direct(self) -> DirectFile | None:
-        """It, to be read past the cache."""
+        """The file, opened to be read past the cache; None if that is not possible."""
         return DirectFile.of(self.file)
 
     def __del__(self) -> None:
@@ -63,13 +63,13 @@ class MappedFile(mmap.mmap):
 
 
 def blocks(count: int, rows: int = BLOCK_ROWS) -> Iterator[slice]:
-    """Parts of rows: their numbers in double precision, several copies of them, are held for a part at a time."""
+    """Yield parts of `count` rows, so that temporary arrays of row numbers and f64 values stay small."""
     for start in range(0, count, rows):
         yield slice(start, min(start + rows, count))
 
 
 def fetch(values: np.ndarray, rows: slice) -> None:
-    """Have the kernel read a part of every plane of a mapped array, all of it at once; nothing is done for one in memory.
+    """Ask the kernel to read rows of every plane of a mapped array at once; no effect on arrays in memory.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def fetch(values: np.ndarray, rows: slice) -> None:
 
 
 def copy_rows(values: np.ndarray, rows: slice, out: np.ndarray) -> None:
-    """`out[...] = values[..., rows]`; a mapped array is read from its file, while other threads go on.
+    """Copy `values[..., rows]` to `out`; a mapped array is read from its file, without the interpreter's lock.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def copy_rows(values: np.ndarray, rows: slice, out: np.ndarray) -> None:
 
 
 def copy_all_rows(pairs: Iterable[tuple[np.ndarray, np.ndarray]], rows: slice) -> None:
-    """`copy_rows` of several arrays and where they go, which the disk reads at a time."""
+    """Do `copy_rows` for several pairs (values, out) at once, which keeps the disk busy."""
     missing = [piece for values, out in pairs for piece in _copy_cached(values, rows, out)]
     readers = min(READERS, len(missing))
     if readers < 2:
@@ -122,7 +122,7 @@ def _read_pieces(pieces: Sequence[_Piece]) -> None:
 
 
 def _copy_cached(values: np.ndarray, rows: slice, out: np.ndarray) -> list[_Piece]:
-    """`copy_rows` of what the kernel's cache holds, or of all where nothing else can be read; what is left."""
+    """Copy the rows that are in memory or in the page cache; return the parts that must be read past the cache."""
     held = map_of(values)
     if held is None or not hasattr(os, "preadv") or out.strides[-1] != out.itemsize:
         fetch(values, rows)
@@ -143,7 +143,7 @@ def _copy_cached(values: np.ndarray, rows: slice, out: np.ndarray) -> list[_Piec
 
 
 def read_rows(values: np.ndarray, rows: slice) -> np.ndarray:
-    """`values[..., rows]`, not to be changed: a view of an array in memory, a copy of a mapped one."""
+    """`values[..., rows]`, read-only: a view of an array in memory, or a copy of a mapped one."""
     if map_of(values) is None:
         return values[..., rows]
     out = np.empty((*values.shape[:-1], rows.stop - rows.start), values.dtype)
@@ -152,9 +152,9 @@ def read_rows(values: np.ndarray, rows: slice) -> np.ndarray:
 
 
 def put_rows(values: np.ndarray, rows: slice, part: np.ndarray) -> None:
-    """`values[..., rows] = part`; a mapped array is written to its file.
+    """Set `values[..., rows] = part`; a mapped array is written to its file.
 
-    Through mapped pages, each page would cost a fault of its own: docs/results/tuning.md#disks
+    A write through the mapped pages would fault on each page: docs/results/tuning.md#disks
     """
     held = map_of(values)
     if held is None or not hasattr(os, "pwrite"):
@@ -167,26 +167,34 @@ def put_rows(values: np.ndarray, rows: slice, part: np.ndarray) -> None:
         while left:
             try:
                 size = os.pwrite(held.file.fileno(), left, at)
-            except OSError as error:  # blocks are reserved; a disk that copies on writing may still be full
+            except OSError as error:  # copy-on-write disks may be full although the blocks are reserved
                 raise held.storage.full(len(left), error) from error
             left, at = left[size:], at + size
 
 
 def _planes(held: MappedFile, values: np.ndarray, rows: slice) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """Of each plane of a mapped array: the byte of its file where some rows begin, and the plane's index."""
+    """Yield, for each plane of a mapped array, the byte of the file where the rows begin, and the index of the plane."""
     first = values.ctypes.data - held.address + rows.start * values.itemsize
     for place in np.ndindex(values.shape[:-1]):
         yield first + sum(number * stride for number, stride in zip(place, values.strides, strict=False)), place
 
 
 def take_rows(values: np.ndarray, rows: np.ndarray, out: np.ndarray, whole_bytes: int) -> None:
-    """`out[...] = values[..., rows]`, rows being listed.
+    """Copy listed rows: `out[...] = values[..., rows]`.
 
-    `whole_bytes`: of a plane that memory may hold as a whole, two of them at a time.
+    For files, rows out of order are taken plane by plane, two planes at a time, so that memory holds the planes in use.
+    A loop over parts of the rows would read all planes once a part: docs/results/tuning.md#disks
 
-    Of files, rows out of order are looked up in one plane at a time, or two, which memory holds where it cannot hold
-    all. Going through all planes for every part of the rows would read the files many times:
-    docs/results/tuning.md#disks
+    Parameters
+    ----------
+    values : np.ndarray
+        [..., n].
+    rows : np.ndarray
+        [m], row numbers in any order.
+    out : np.ndarray
+        [..., m], of the same type.
+    whole_bytes : int
+        Bytes of the largest plane that may be held in memory as a whole; two are held at a time.
     """
     planes = [(values[place], out[place]) for place in np.ndindex(values.shape[:-1])]
     if not planes:
@@ -213,7 +221,7 @@ def take_rows(values: np.ndarray, rows: np.ndarray, out: np.ndarray, whole_bytes
 
 
 def read_listed(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """`values[..., rows]`, rows being listed."""
+    """`values[..., rows]` for listed rows, in memory."""
     if map_of(values) is None:
         return values[..., rows]
     out, listed = np.empty((*values.shape[:-1], len(rows)), values.dtype), _Listed(rows)
@@ -227,13 +235,13 @@ def read_listed(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 class _Listed:
-    """Rows to be looked up in planes."""
+    """Row numbers to look up in planes, and the span that they cover."""
 
     def __init__(self, rows: np.ndarray) -> None:
         self.rows = rows
         self.span = slice(int(rows.min()), int(rows.max()) + 1) if len(rows) else slice(0, 0)
         self.dense = self.span.stop - self.span.start <= DENSE * len(rows)
-        """Whether what lies between them is not much more, and may be read as well."""
+        """Whether the span is so short that we read all of it."""
         self.inside = rows - self.span.start if self.dense else rows
 
     def of(self, plane: np.ndarray) -> np.ndarray:
@@ -247,7 +255,7 @@ class _Listed:
 
 
 def read_ahead(count: int, *arrays: np.ndarray) -> Iterator[tuple[slice, list[np.ndarray]]]:
-    """`blocks(count)`, and these rows of arrays ([..., count]), not to be changed; of mapped ones the next are read meanwhile."""
+    """Yield `blocks(count)` with these rows of each array ([..., count]), read-only; the next rows of mapped arrays load ahead."""
     if all(map_of(values) is None for values in arrays):
         for part in blocks(count):
             yield part, [values[..., part] for values in arrays]

@@ -1,4 +1,4 @@
-"""Where large arrays live: in memory, or in scratch files that the kernel may drop from memory whenever it needs the room."""
+"""Where large arrays live: in memory, or in mapped scratch files whose pages the kernel can drop when it needs room."""
 
 from __future__ import annotations
 
@@ -18,42 +18,41 @@ from flexgs_edge.memory.rows import COPY_ROWS, MappedFile, blocks, put_rows, rea
 from flexgs_edge.units import format_size
 
 _SMALL = 1 << 16
-"""Bytes below which an array stays in memory in any case: a file each would cost more than it saves."""
+"""Arrays smaller than so many bytes always stay in memory; a file for each would cost more than it saves."""
 WHOLE_BYTES = 1 << 26
-"""Least bytes of a plane that is held as a whole while rows in any order are taken from it. From a file, each row would
-be a read of its own: docs/results/tuning.md#disks"""
+"""Least size of a plane, in bytes, that may be read as a whole to take rows in any order. Otherwise each row would be a read
+of its own: docs/results/tuning.md#disks"""
 WHOLE_SHARE = 16
-"""Part of the limit (one in 16) that such a plane may take where that is more."""
+"""Such a plane may be as large as this part of the limit (one in 16), if that is more."""
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _IN_MEMORY = {"tmpfs", "ramfs", "devtmpfs"}
 
 
 class Storage:
-    """Arrays in memory."""
+    """Allocates arrays in memory; the base of `ScratchStorage`."""
 
     spills = False
-    """Whether arrays lie in files: then memory holds no more than a few bytes of each row, and whatever else the kernel has
-    room for."""
+    """Whether arrays lie in files. Then memory need hold only a few bytes for each row; the page cache takes what is free."""
     folder: Path | None = None
     whole_bytes = WHOLE_BYTES
-    """See `take_rows`."""
+    """Bytes of the largest plane to hold as a whole; see `take_rows`."""
     peak = 0
-    """Most bytes that lay in files at a time."""
+    """Most bytes that lay in files at one time."""
 
     @property
     def peak_anonymous(self) -> int | None:
-        """Peak of the memory that has no file behind it, since there were such files."""
+        """Peak of the process's memory without file pages, in bytes, if arrays lie in files; else None."""
         return None
 
     def close(self) -> None:
-        """Stop counting; arrays stay as long as they are used."""
+        """Stop sampling the memory; arrays stay valid."""
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        """An array, not initialised; its room is given back with it."""
+        """A new array, not initialised; its room is freed with it."""
         return np.empty(shape, dtype)
 
     def copy(self, values: np.ndarray) -> np.ndarray:
-        """`values` in an array of this room, C-contiguous."""
+        """Copy `values` to a new C-contiguous array of this storage."""
         made = self.empty(values.shape, values.dtype)
         for place in np.ndindex(values.shape[:-1]):
             for part in blocks(values.shape[-1], COPY_ROWS):
@@ -61,20 +60,20 @@ class Storage:
         return made
 
     def take(self, values: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """`values[..., rows]` in an array of this room, C-contiguous."""
+        """Copy `values[..., rows]` to a new C-contiguous array of this storage."""
         made = self.empty((*values.shape[:-1], len(rows)), values.dtype)
         take_rows(values, rows, made, self.whole_bytes)
         return made
 
     def file(self) -> BinaryIO:
-        """A file without a name that is gone when it is closed, whatever ends the process; who writes to it says how much."""
+        """A new nameless file, which vanishes when it is closed or the process ends. Report its size with `count`."""
         return tempfile.TemporaryFile(dir=self.folder)
 
     def count(self, size: int) -> None:
-        """So many bytes more lie in a `file` (less than none: it is closed)."""
+        """Count `size` more bytes in a `file`; a negative size when it is closed."""
 
     def full(self, size: int, error: OSError) -> Exception:
-        """What to raise when `size` bytes of a scratch file cannot be had."""
+        """The error to raise if a scratch file cannot grow by `size` bytes."""
         return error
 
 
@@ -82,22 +81,22 @@ IN_MEMORY = Storage()
 
 
 class ScratchStorage(Storage):
-    """Arrays in files of a folder, mapped.
+    """Allocates arrays in mapped files of a folder.
 
-    The files have no names: whatever ends the process, a kill included, the disk space is free again. Their blocks are reserved
-    before use, so that a full disk is an error and not a signal in the middle of a copy.
+    The files have no names, so their disk space is free again however the process ends. Their blocks are reserved before use,
+    so that a full disk raises an error instead of a signal in the middle of a copy.
 
     Parameters
     ----------
     folder : path
         On a disk.
     limit : int
-        Bytes that the process may hold.
+        Bytes that the process may hold; larger limits let larger planes be held as a whole.
 
     Raises
     ------
     InputError
-        When the folder is none, cannot be written to, or lies in memory (a tmpfs would take what it is to save).
+        If the folder does not exist, cannot be written to, or lies in memory (a tmpfs would take the memory it should save).
     """
 
     spills = True
@@ -133,7 +132,7 @@ class ScratchStorage(Storage):
             self._watch.close()
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        """See `Storage.empty`; raises `BudgetError` when the disk is full."""
+        """See `Storage.empty`; raises `BudgetError` if the disk is full."""
         size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
         if size < _SMALL:
             return np.empty(shape, dtype)
@@ -147,8 +146,8 @@ class ScratchStorage(Storage):
         held.storage, held.file = self, file
         self.count(size)
         if hasattr(mmap, "MADV_RANDOM"):
-            # Of one row of values the kernel may read ahead. Of planes, a part of the rows is a piece of each: reading
-            # ahead would read the file many times over. `fetch` asks for those pieces instead.
+            # The kernel may read ahead in an array with one plane. With several planes, a part of the rows is a piece of
+            # each plane, and reading ahead would read the file many times over. `fetch` asks for the pieces instead:
             # docs/results/tuning.md#disks
             held.madvise(mmap.MADV_SEQUENTIAL if len(shape) == 1 else mmap.MADV_RANDOM)
         values = np.frombuffer(held, dtype).reshape(shape)
@@ -161,7 +160,7 @@ class ScratchStorage(Storage):
         self.peak = max(self.peak, self.used)
 
     def full(self, size: int, error: OSError) -> Exception:
-        """What to raise when `size` bytes cannot be had."""
+        """The error to raise if a scratch file cannot grow by `size` bytes."""
         if error.errno not in _FULL:
             return InputError(f"{self.folder}: cannot make a scratch file of {size} bytes ({error.strerror})")
         with suppress(OSError):
@@ -175,7 +174,7 @@ class ScratchStorage(Storage):
 
 
 def _reserve(descriptor: int, size: int) -> None:
-    """Give a file its blocks (or just its size where the system cannot)."""
+    """Reserve the blocks of a file; if the system cannot, only set its size."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(descriptor, 0, size)
     else:
@@ -183,7 +182,7 @@ def _reserve(descriptor: int, size: int) -> None:
 
 
 def file_system_of(folder: Path, mounts: str | Path = "/proc/self/mounts") -> str | None:
-    """Kind of the file system that `folder` lies on, such as `ext4`; None where the system does not tell."""
+    """Kind of the file system that holds `folder`, such as `ext4`; None if the system does not tell."""
     try:
         lines = Path(mounts).read_text().splitlines()
     except OSError:
@@ -193,7 +192,7 @@ def file_system_of(folder: Path, mounts: str | Path = "/proc/self/mounts") -> st
         _, place, kind = line.split(" ")[:3]
         place = place.replace("\\040", " ")
         inside = os.path.commonpath([place, folder]) == place
-        # Of two on one place, the later one hides the earlier.
+        # If two file systems are mounted on one place, the later one hides the earlier.
         if inside and len(place) >= found[0]:
             found = (len(place), kind)
     return found[1]

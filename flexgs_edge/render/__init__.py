@@ -1,1 +1,1 @@
-"""One view: one camera, one picture, and what a view adds up."""
+"""Render one view: project, sort and blend the splats of a scene, and sum what each Gaussian contributes."""

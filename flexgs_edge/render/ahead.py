@@ -1,7 +1,8 @@
-"""Views that are projected before their turn, with the chunks that the view before them reads anyway.
+"""Project the next views together with the current one, so that a streamed scene is read once for several views.
 
-A scene in scratch files is then read once for several views: what a later one shows waits in a file, 76 bytes a splat, where
-reading its row again takes 236 (at SH degree 3), and as much for each row that the view does not show after all.
+A scene in scratch files costs a read per view. Here each chunk that is read is also projected for the views that come next.
+Their splats wait in a scratch file: 76 bytes a splat, where reading a row again takes 236 (at SH degree 3).
+Reading again would also cost that much for every row that the view does not show.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from flexgs_edge.render.fit import chunk_shapes, shapes_bytes
 from flexgs_edge.render.view_buffers import ViewBuffers
 
 AHEAD_ROW_BYTES = shapes_bytes(chunk_shapes(1)) + 4
-"""Bytes of the scratch file for each splat that such a view shows, the number of its row among them."""
+"""Bytes that one waiting splat takes in the scratch file, its row number included."""
 
 
 class WaitingView:
-    """A view that has not had its turn, in a scratch file; close when done."""
+    """A compact view that is projected already and waits for its turn; its splats lie in a scratch file. Close when done."""
 
     def __init__(self, backend: Backend, storage: Storage, camera: Camera, record: np.ndarray) -> None:
         self.of = camera
@@ -43,7 +44,7 @@ class WaitingView:
         self._written: Future[None] | None = None
 
     def put(self, splats: Splats) -> bool:
-        """See `CompactView.put`: written while the next chunk is projected."""
+        """Append splats (see `CompactView.put`); the disk writes them while the next chunk is projected."""
         self._wait()
         if len(splats[0]):
             self._written = self._disk.submit(self._move, os.pwritev, splats, self.count * AHEAD_ROW_BYTES)
@@ -53,7 +54,13 @@ class WaitingView:
         return True
 
     def fill(self, buffers: ViewBuffers) -> np.ndarray:
-        """Put all of it into the buffers of a view that has room for it: [count] u32, its rows."""
+        """Copy all splats into the buffers of a view, which must have room for them.
+
+        Returns
+        -------
+        np.ndarray
+            [count] u32, the splats' rows of the scene.
+        """
         self._wait()
         self._backend.mark()()  # the view before may still be drawn from these buffers
         rows, at = np.empty(self.count, np.uint32), 0
@@ -86,7 +93,7 @@ class WaitingView:
             written.result()
 
     def close(self) -> None:
-        """Remove the file."""
+        """Remove the scratch file."""
         self._disk.shutdown()
         self._file.close()
         self._storage.count(-AHEAD_ROW_BYTES * self.count)
@@ -94,17 +101,17 @@ class WaitingView:
 
 
 class ViewsAhead:
-    """Projects compact views, and those that come next where reading the scene costs more than to keep them."""
+    """Projects compact views, and the next ones with them if keeping their splats is cheaper than reading the scene again."""
 
     def __init__(self, backend: Backend, ahead: int) -> None:
         self._backend, self._most = backend, ahead
         self._scene: tuple[DeviceScene, int] | None = None
-        """The scene whose views are drawn in turn, and its `changes` when these began to wait."""
+        """The scene whose views are drawn in turn, and its `changes` when the views began to wait."""
         self._coming: Sequence[Camera] = ()
         self._waiting: list[WaitingView] = []
 
     def in_turn(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[Camera]:
-        """The cameras, each when its view is to be drawn; what waits of others is given up."""
+        """Yield each camera when its view is to be drawn; in the end, drop the views that still wait."""
         try:
             for place, camera in enumerate(cameras):
                 if self._scene != (scene, scene.changes):
@@ -123,7 +130,8 @@ class ViewsAhead:
         Returns
         -------
         tuple
-            How many there are, up to which row of the scene, and their rows ([m] u32): None where the buffers have no room.
+            The number of splats, the row of the scene up to which they were counted, and their rows ([m] u32).
+            The rows are None if the buffers have no room.
         """
         assert buffers.rows is not None
         record = camera_record(camera, scene.origin, near)
@@ -152,7 +160,7 @@ class ViewsAhead:
             waiting.close()
 
     def _wait(self, camera: Camera, scene: DeviceScene, storage: Storage, near: float) -> WaitingView:
-        """A view that waits from now on, in place of what waited of it."""
+        """Let a view wait, in place of an earlier wait of the same view."""
         for view in [view for view in self._waiting if view.of is camera]:
             self._waiting.remove(view)
             view.close()
@@ -160,7 +168,7 @@ class ViewsAhead:
         return self._waiting[-1]
 
     def drop(self) -> None:
-        """Give up what waits."""
+        """Drop all waiting views."""
         self._scene, self._coming = None, ()
         for view in self._waiting:
             view.close()

@@ -1,4 +1,4 @@
-"""The record of a camera that the kernels read."""
+"""The camera as the kernels read it: one record of 32 floats."""
 
 from __future__ import annotations
 
@@ -9,9 +9,21 @@ from flexgs_edge.constants import JACOBIAN_MARGIN
 
 
 def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray:
-    """The 32 floats that `project` reads, for a scene re-centred at `origin` ([3] f64, world).
+    """Compute the 32 floats that `project` reads, in float64, and round them once.
 
-    Everything is computed in float64 and rounded once.
+    Parameters
+    ----------
+    camera : Camera
+        In world coordinates.
+    origin : np.ndarray
+        [3] f64, the world point that the scene is centred at.
+    near : float
+        Near plane, scene units.
+
+    Returns
+    -------
+    np.ndarray
+        [32] f32.
     """
     moved = camera.moved(origin)
     x_low = -(moved.cx + 0.5) / moved.fx - JACOBIAN_MARGIN * moved.width / moved.fx
@@ -23,6 +35,6 @@ def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray
     record[9:12] = moved.translation
     record[12:16] = moved.fx, moved.fy, moved.cx, moved.cy
     record[16:21] = near, x_low, x_high, y_low, y_high
-    record[21:24] = -moved.rotation.T @ moved.translation  # so near to the origin the transpose will do
+    record[21:24] = -moved.rotation.T @ moved.translation  # the transpose as inverse is exact enough near the origin
     record[24:27] = moved.width, moved.height, moved.dilation
     return record.astype(np.float32)

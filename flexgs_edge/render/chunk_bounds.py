@@ -1,8 +1,8 @@
-"""Which chunks of a scene a view can see: a box around a chunk's means, and how far its splats reach beyond them.
+"""Bounds of a chunk, to skip chunks that a view cannot see: a box around its means, and how far its splats reach.
 
-A chunk is left out only where `project` would cull each of its rows. In pixels a splat reaches by at most
-s f sqrt(1 + u^2) / z for its largest standard deviation s, and by what the dilation adds; times z, each side of the picture
-becomes a half-space of scene units, and a linear function is largest at a corner of the box.
+A chunk may be skipped only if `project` would cull each of its rows. A splat reaches at most s f sqrt(1 + u^2) / z pixels for
+its largest standard deviation s, plus the dilation. Multiplied by z, each side of the picture becomes a half-space in scene
+units. A linear function is largest at a corner of the box, so the corners decide.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ import numpy as np
 from flexgs_edge.constants import EXTENT_SLACK, LOG2_255, SIGMA_RADIUS_INRIA, TILE
 
 SIGMAS = math.sqrt((LOG2_255 + EXTENT_SLACK) * 2.0 * math.log(2.0))
-"""Standard deviations that an opaque splat reaches in the exact ellipse."""
+"""Standard deviations that the exact ellipse of an opaque splat reaches."""
 INRIA_SPREAD = math.sqrt(math.sqrt(0.1))
-"""What the floor of 0.1 in the larger eigenvalue adds to its root, at most."""
+"""Upper bound of what the floor of 0.1 adds to the square root of the larger eigenvalue."""
 ROUNDING = 1e-5
-"""Share of the largest term that float32 may be off by in `project`: a hundred times what it is."""
+"""Bound of the float32 error in `project`, as a share of the largest term: generous, so that no chunk vanishes by rounding."""
 LARGER = 1.001
-"""The same for extents."""
+"""Factor that widens the extent of a chunk against rounding."""
 
 
 @dataclass(frozen=True)
 class ChunkBounds:
-    """A chunk of a scene.
+    """Bounds of one chunk of a scene.
 
     Parameters
     ----------
     middle, half : np.ndarray
-        [3] f64, of the box around its means, scene units relative to the origin.
+        [3] f64, centre and half size of the box around the means, scene units relative to the origin.
     extent : float
-        Largest standard deviation of a row along any axis of its own.
+        Largest standard deviation of any Gaussian along any of its own axes, scene units.
     """
 
     middle: np.ndarray
@@ -42,13 +42,13 @@ class ChunkBounds:
 
     @classmethod
     def of(cls, means: np.ndarray, log_scales: np.ndarray) -> ChunkBounds:
-        """Of rows with these stored values ([3, n] f32 each, n > 0); what is not finite is seen by every view."""
+        """Bounds of rows with these stored values ([3, n] f32 each, n > 0); if one is not finite, every view sees the chunk."""
         low, high = means.min(axis=1).astype(np.float64), means.max(axis=1).astype(np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
             return cls((low + high) / 2, (high - low) / 2, LARGER * float(np.exp(np.float64(log_scales.max()))))
 
     def seen(self, record: np.ndarray, inria_extent: bool) -> bool:
-        """Whether a view may show a row: `record` is its camera's ([32] f32, from `camera_record`)."""
+        """Whether a view may show a row of the chunk; `record` is its `camera_record` ([32] f32)."""
         camera = record.astype(np.float64)
         rotation, shift = camera[:9].reshape(3, 3), camera[9:12]
         (fx, fy, cx, cy), (width, height), dilation = camera[12:16], camera[24:26], camera[26]

@@ -1,4 +1,4 @@
-"""Chunks of a streamed scene, loaded by another thread while those before them are drawn."""
+"""Load the chunks of a streamed scene in another thread, while the chunks before them are drawn."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from flexgs_edge.render.chunks import ChunkArrays, QuantizedPlanes, SourcePlanes
 from flexgs_edge.render.fit import padded
 
 SLOTS = 2
-"""Chunks that there is always room for: one that is drawn, and one that is loaded."""
+"""Chunks that memory always has room for: one is drawn while the next one loads."""
 MOST_SLOTS = 3
-"""The same where memory has room: the disk rests less between two chunks. docs/results/tuning.md#most_slots"""
+"""Chunks if memory has room for one more: the disk then rests less between two. docs/results/tuning.md#most_slots"""
 Span = tuple[int, int, int]
 """First row, row after the last, and SH degree of a chunk."""
 
 
 @dataclass
 class Loading:
-    """A chunk that another thread loads."""
+    """A chunk that another thread loads; with `stays`, its arrays outlive the view."""
 
     arrays: ChunkArrays
     stays: bool
@@ -34,10 +34,11 @@ class ChunkLoads:
     ----------
     backend : Backend
     planes : SourcePlanes or QuantizedPlanes
+        Fills the chunks.
     may_stay : callable
-        Whether a chunk of so many rows gets arrays of its own, which outlive this.
+        Whether a chunk of so many rows may get arrays of its own, which outlive this object.
     may_add : callable
-        Whether there is room for one more than `SLOTS`.
+        Whether memory has room for one chunk of so many rows beyond `SLOTS`.
     """
 
     def __init__(
@@ -52,11 +53,11 @@ class ChunkLoads:
         self._coming: dict[int, Loading] = {}
         self._held: list[ChunkArrays] = []
         self._free: list[tuple[ChunkArrays, Callable[[], None]]] = []
-        """Slots whose chunk was drawn, and what waits for the kernels that did."""
+        """Slots whose chunk was drawn; the call waits for the kernels that drew it."""
         self._slots = 0
 
     def take(self, span: Span) -> Loading:
-        """A chunk, loaded: where it was not asked for ahead, all others wait for it."""
+        """A loaded chunk; one that was not asked for ahead waits until the chunks before it in the queue are loaded."""
         if span[0] not in self._coming:
             self._ask(span)
         loading = self._coming.pop(span[0])
@@ -64,7 +65,7 @@ class ChunkLoads:
         return loading
 
     def go_on(self, spans: Iterable[Span]) -> None:
-        """Load the first of these chunks meanwhile, as many as there is room for."""
+        """Start to load the first of these chunks, as many as there is room for."""
         for span in spans:
             if len(self._coming) >= MOST_SLOTS - 1:
                 return
@@ -72,22 +73,22 @@ class ChunkLoads:
                 return
 
     def keep(self, loading: Loading) -> None:
-        """Its arrays are not given back: they stay."""
+        """Leave the arrays of a chunk to the caller."""
         self._held.remove(loading.arrays)
 
     def give_back(self, loading: Loading) -> None:
-        """The kernels that draw a chunk have been started."""
+        """Give a slot back after the kernels that draw its chunk were started."""
         self._free.append((loading.arrays, self._backend.mark()))
 
     def close(self) -> None:
-        """Wait for what is being loaded, and free all but what was kept."""
+        """Stop loading, wait for the chunk under way, and free all arrays that were not kept."""
         self._loader.shutdown(cancel_futures=True)
         for arrays in self._held:
             arrays.release()
         self._held, self._free, self._coming = [], [], {}
 
     def _ask(self, span: Span, ahead: bool = False) -> bool:
-        """Have a chunk loaded; one that is asked for ahead leaves a slot for a chunk before it that is not there after all."""
+        """Start to load a chunk; one that is asked for ahead leaves a slot free for a chunk that must come before it."""
         start, stop, _ = span
         done: Callable[[], None] = _nothing
         stays = self._may_stay(stop - start)
@@ -135,4 +136,4 @@ def _fits(arrays: ChunkArrays, span: Span) -> bool:
 
 
 def _nothing() -> None:
-    """Waits for no kernel."""
+    """Wait for nothing: a new slot has no kernels that use it."""

@@ -1,4 +1,4 @@
-"""Chunks of a scene in the backend's memory, and what fills them: values of a source, or codes that are dequantized there."""
+"""Chunks of a scene on the backend, and the two ways to fill them: values of a source, or codes dequantized there."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from flexgs_edge.scene.source import SceneSource
 
 @dataclass
 class Chunk:
-    """Planes of rows [base, base + count) of a scene, ready for `project`."""
+    """Planes of rows [base, base + count) of a scene, ready for the kernel `project`."""
 
     base: int
     count: int
@@ -38,7 +38,7 @@ class Chunk:
     def project(
         self, backend: Backend, camera: Any, base: int, inria_extent: int, antialiased: bool, out: tuple[Any, ...]
     ) -> None:
-        """Splats, depth keys and bounds of tiles of its rows, in arrays that begin with row `base` of it."""
+        """Project the rows to splat records, depth keys and bounds of tiles; `base` is their first row in the arrays `out`."""
         backend.launch(
             "project", (self.stride,), self.count, self.stride, base, self.degree, inria_extent, int(antialiased), camera,
             *self.arrays, *out,
@@ -51,7 +51,7 @@ class Chunk:
 
 
 class ChunkArrays:
-    """What a chunk lies in on the backend: stored planes, and what they are activated to."""
+    """The arrays of a chunk on the backend: stored planes, and the planes that `activate` computes from them."""
 
     def __init__(self, backend: Backend, degree: int, stride: int) -> None:
         self.backend, self.degree, self.stride = backend, degree, stride
@@ -61,7 +61,7 @@ class ChunkArrays:
         self.log2_opacity = backend.array((stride,), np.float32)
 
     def activated(self, base: int, count: int, antialiased: bool) -> Chunk:
-        """The chunk of the rows that are stored."""
+        """Activate the stored rows, and return them as a chunk."""
         stored, stride = self.stored, self.stride
         self.backend.launch(
             "activate", (stride,), stride, int(antialiased), stored["log_scales"], stored["quats"],
@@ -71,7 +71,7 @@ class ChunkArrays:
         return Chunk(base, count, stride, self.degree, stored["means"], self.cov, self.log2_opacity, *colours)
 
     def release_raw(self) -> None:
-        """Free what is not needed once it is activated."""
+        """Free the planes that only `activate` reads."""
         for name in ("log_scales", "quats", "opacity_logits"):
             self.stored[name].release()
 
@@ -82,7 +82,7 @@ class ChunkArrays:
 
 
 class SourcePlanes:
-    """Fills chunks from a `SceneSource`, whose means and scales stay as they are; colours may change."""
+    """Fills chunks from a `SceneSource`. Its colours may change between views; its means and scales may not."""
 
     def __init__(self, backend: Backend, source: SceneSource) -> None:
         self.backend = backend
@@ -90,10 +90,10 @@ class SourcePlanes:
         self.count, self.sh_count, self.sh_degree = source.count, source.sh_count, source.sh_degree
         self.origin = source.origin
         self.bounds: dict[int, ChunkBounds] = {}
-        """Of the chunks loaded so far, by their first rows."""
+        """Bounds of the chunks loaded so far, by their first rows."""
 
     def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
-        """Fill arrays of the backend, [width, padded(stop - start)] by field name."""
+        """Read rows [start, stop) into arrays of the backend, [width, padded(stop - start)] by field name."""
         with ExitStack() as maps:
             host = {
                 name: maps.enter_context(self.backend.mapped(array))[:, : stop - start]
@@ -109,16 +109,16 @@ class SourcePlanes:
 
 
 class QuantizedPlanes:
-    """Fills chunks from a quantized scene: codes and ranges are copied to the backend once and dequantized there."""
+    """Fills chunks from a quantized scene: codes and ranges go to the backend once, and each chunk is dequantized there."""
 
     def __init__(self, backend: Backend, quantized: QuantizedScene) -> None:
         self.backend = backend
         self.count, self.sh_count, self.sh_degree = quantized.count, quantized.sh_count, quantized.sh_degree
         self.origin = quantized.origin
-        self.bounds: dict[int, ChunkBounds] = {}  # every view reads all chunks
+        self.bounds: dict[int, ChunkBounds] = {}  # no bounds: every view draws all chunks
         self._arrays: dict[str, tuple[QuantizedArray, Any, Any, Any]] = {}
         for name, array in quantized.arrays.items():
-            # Three spare bytes: the kernel reads a code through a window of three.
+            # Three spare bytes: the kernel reads each code through a window of three bytes.
             codes = backend.array((array.planes.size + 3,), np.uint8)
             backend.write(codes, array.planes.reshape(-1))
             low = backend.array(array.low.shape, np.float32)
@@ -128,7 +128,7 @@ class QuantizedPlanes:
             self._arrays[name] = (array, codes, low, step)
 
     def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
-        """Fill arrays of the backend, [width, padded(stop - start)] by field name."""
+        """Dequantize rows [start, stop) into arrays of the backend, [width, padded(stop - start)] by field name."""
         rows = stop - start
         for name, plane in planes.items():
             width, stride = plane.shape

@@ -1,4 +1,4 @@
-"""Views that hold the splats that they show, and no other rows of the scene."""
+"""Compact views: buffers that hold only the splats that a view shows, for views with no room for all rows of a scene."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from flexgs_edge.render.fit import chunk_shapes
 from flexgs_edge.render.view_buffers import ViewBuffers
 
 Splats = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Of some rows that a view shows: records [m, 16] f32, depth keys and bounds of tiles [m] u32, rows of the scene [m] u32."""
+"""Splats that a view shows: records [m, 16] f32, depth keys and bounds of tiles [m] u32, rows of the scene [m] u32."""
 
 
 class CompactView(Protocol):
-    """A view that takes what it shows, chunk by chunk, in the order of rows."""
+    """A view that collects its splats, chunk by chunk, in row order."""
 
     record: np.ndarray
     """[32] f32, from `camera_record`."""
     camera: Any
-    """The same on the backend."""
+    """The same record on the backend."""
     count: int
-    """Rows that it shows."""
+    """Splats that the view shows so far."""
 
     def put(self, splats: Splats) -> bool:
-        """Append the rows that it shows of a chunk; False where there is no room for them."""
+        """Append the splats of a chunk that the view shows; False if there is no room for them."""
 
 
 class ShownView:
-    """The view whose turn it is, in its buffers."""
+    """The current view, which collects its splats in its own buffers."""
 
     def __init__(self, backend: Backend, buffers: ViewBuffers, record: np.ndarray) -> None:
         self._backend, self._buffers = backend, buffers
@@ -57,30 +57,30 @@ class ShownView:
 
     @property
     def rows(self) -> np.ndarray:
-        """[count] u32, rows of the scene."""
+        """[count] u32, the splats' rows of the scene."""
         return np.concatenate(self._rows) if self._rows else np.zeros(0, np.uint32)
 
 
 def fill_compact(
     backend: Backend, scene: DeviceScene, out: tuple[Any, ...], views: Sequence[CompactView], inria_extent: int
 ) -> int:
-    """Put the splats that each of some views shows where they belong, in the order of their rows.
+    """Project the scene chunk by chunk, and give each view the splats that it shows, in row order.
 
     Parameters
     ----------
     out : tuple
-        `ViewBuffers.chunk`, which a chunk is projected to for one view after the other.
+        `ViewBuffers.chunk`: a chunk is projected into it for one view after the other.
 
     Returns
     -------
     int
-        Up to which row of the scene: where one of the views has no more room, it stops.
+        The row of the scene that was reached. It stops early if a view has no more room.
     """
 
     def wanted(bounds: ChunkBounds) -> bool:
         return any(bounds.seen(view.record, bool(inria_extent)) for view in views)
 
-    # Made once: fresh pages for every chunk took longer than the copies.
+    # Kept for all chunks: fresh pages for each one take longer than the copies.
     on_host = [np.empty(shape, dtype) for shape, dtype in chunk_shapes(out[0].shape[0]).values()]
     for chunk in scene.chunks(wanted):
         for view in views:

@@ -1,4 +1,4 @@
-"""A scene in the backend's memory, by chunks: kept there when it fits, streamed view by view when it does not."""
+"""A scene on the backend, in chunks: it stays there if it fits into the budget, else each view streams it anew."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ from flexgs_edge.scene.source import SceneSource
 class DeviceScene:
     """A scene on a backend. Iterate over `chunks()` for every view; close when done.
 
-    Whether it stays in the backend's memory or is streamed view by view is decided when the first view asks for it, from what
-    that view leaves free; the result is the same.
+    The first view decides, from the memory that it leaves free, whether the scene stays on the backend or is streamed.
+    The result is the same.
 
     Parameters
     ----------
     backend : Backend
     planes : SourcePlanes or QuantizedPlanes
-        Asked for each chunk once when the scene fits into the budget, once a view when it does not.
+        Loads each chunk: once if the scene fits into the budget, else once a view.
     budget : MemoryBudget
     antialiased : bool
-        How it is drawn: `cov` of the chunks is then the covariance's factor.
+        Draw with antialiasing; `cov` of the chunks then holds the factor of the covariance.
     sum_bytes : int
-        Bytes a row that sums over its views will take on the backend: left free.
+        Bytes a row that sums over views will take on the backend, to be left free.
     targets : bool
-        Views will be compared with targets on the backend: room for these is taken with the view's.
+        Views will be compared with targets on the backend; their room is taken with the view's buffers.
     view_sums : int
-        Planes of sums that a view has at most.
+        Most planes of sums that a view has.
     fit : Fit, optional
-        How it shares memory with its views.
+        How the scene shares memory with its views.
     """
 
     def __init__(
@@ -77,73 +77,78 @@ class DeviceScene:
         self.view_sums = view_sums
         self.fit = fit or fit_module.DEFAULT
         self.changes = 0
-        """Times that its values have changed."""
+        """How many times the values have changed."""
         self.shown: int | None = None
-        """Rows that a compact view has room for; None while views have room for all."""
+        """Rows that a compact view has room for; None while views have room for all rows."""
         self._planes = planes
         self._budget = budget
         self._resident: list[Chunk] = []
         self._pinned: dict[int, Chunk] = {}
-        """Chunks of a compact scene that stay, by their first rows."""
+        """Chunks of a compact scene that stay on the backend, by their first rows."""
         self._drawn = -1
-        """First row of the one that is being used."""
+        """First row of the chunk in use, -1 if none is; `give_way` must not free it."""
         self._rows = 0
         self._chunk_row_bytes = streamed_bytes(planes.sh_degree)
         self._least_rows = min(self.fit.least_rows, max(self.count, 1))
 
     @property
     def source(self) -> SceneSource | None:
-        """Where its values come from; None where that is codes on the backend."""
+        """The source of the values; None if they are codes on the backend."""
         return self._planes.source if isinstance(self._planes, SourcePlanes) else None
 
     @property
     def least_bytes(self) -> int:
-        """Bytes that drawing must leave to the scene: none once it is loaded, else its smallest chunk."""
+        """Bytes that a view must leave to the scene: none once it is loaded, else its smallest chunk."""
         return 0 if self._resident else self.least_chunk_bytes
 
     @property
     def least_chunk_bytes(self) -> int:
-        """Bytes of the smallest chunk."""
+        """Bytes of the smallest chunk of the streamed scene."""
         return padded(self._least_rows) * self._chunk_row_bytes
 
     @property
     def compact_rows(self) -> int:
-        """Rows that a chunk of it has room for once it is compact."""
+        """Rows of a chunk once the scene's views are compact."""
         return padded(min(self.fit.compact_rows, max(self.count, 1)))
 
     @property
     def compact_chunk_bytes(self) -> int:
-        """Bytes of such a chunk."""
+        """Bytes of a chunk once the scene's views are compact."""
         return self.compact_rows * self._chunk_row_bytes
 
     @property
     def whole_bytes(self) -> int:
-        """Bytes of all chunks, loaded."""
+        """Bytes of all chunks when loaded."""
         planes = self._planes
         whole = planes.sh_count * plane_bytes(planes.sh_degree) + (self.count - planes.sh_count) * plane_bytes(0)
-        # Two chunks may be padded at most: the last with SH and the last without.
+        # At most two chunks are padded: the last one with SH and the last one without.
         return whole + 2 * LANES * self._chunk_row_bytes
 
     @property
     def later_bytes(self) -> int:
-        """Bytes that sums over views will take: none once the first view made them."""
+        """Bytes that sums over views will take: none after the first view, which allocates them."""
         return 0 if self.statistics else self.sum_bytes * self.count
 
     @property
     def shown_bytes(self) -> int:
-        """Bytes that each row which a compact view shows takes of the sums of one view: all but what is added up over views."""
+        """Bytes of one view's sums for each row that a compact view shows; the sums over all views are not counted."""
         return 0 if self.statistics else min(self.sum_bytes, sum_bytes(self.view_sums))
 
     @property
     def held_bytes(self) -> int:
-        """Bytes that the loaded scene takes."""
+        """Bytes that the loaded chunks take now."""
         held = (*self._resident, *self._pinned.values())
         return sum(array.nbytes for chunk in held for array in chunk.arrays)
 
     def fingerprint(self, of_source: bool = False) -> bytes | None:
-        """Digest of all that views are drawn from: on the backend, or `of_source` and of streamed scenes the stored values.
+        """Digest of everything that views are drawn from.
 
-        None while nothing is on the backend, and where there is no source.
+        It covers the chunks on the backend. With `of_source`, or if the scene is streamed, it covers the stored values.
+
+        Returns
+        -------
+        bytes or None
+            None if nothing is on the backend and there is no source.
         """
         source = self.source
         if source is not None and (of_source or self._streamed):
@@ -163,21 +168,21 @@ class DeviceScene:
         return digest.digest()
 
     def be_compact(self, shown: int) -> None:
-        """From now on views have room for the rows that they show alone, for so many at first; the scene is streamed."""
+        """Make views compact from now on, with room for `shown` rows at first; the scene is then streamed."""
         self.evict()
         self.shown = shown
         self._least_rows = min(self.fit.compact_rows, max(self.count, 1))
         if self.give_way not in self._budget.reclaimers:
-            self._budget.reclaimers.insert(0, self.give_way)  # before what had to be drawn
+            self._budget.reclaimers.insert(0, self.give_way)  # cached chunks go before anything that costs drawing
 
     def drop_statistics(self) -> None:
-        """Free the sums of a view."""
+        """Free the sums of the last view."""
         for array in self.statistics:
             array.release()
         self.statistics = []
 
     def _decide(self) -> None:
-        """Load the scene if it fits, else find the rows of a streamed chunk (fixed from then on)."""
+        """Load the scene if it fits, else choose the rows of a streamed chunk; later views keep that number."""
         budget, later = self._budget, self.later_bytes
         if self.shown is not None:
             self._rows, self._streamed = self._least_rows, True
@@ -188,21 +193,21 @@ class DeviceScene:
         if not self._rows:
             spare = budget.free - whole if fits else budget.free - later
             per_row = RAW_BYTES if fits else self._chunk_row_bytes
-            # Whole vectors: chunks and the sums over them are padded at the ends of the scene's two parts alone.
+            # Whole vectors: then only the last chunks with and without SH are padded.
             self._rows = max(min(most, (spare // per_row // LANES - 2) * LANES), self._least_rows)
         if fits:
             self._resident = [self._load(*span) for span in self._spans()]
-        # Not asked again in the middle of a view, when part of what it left free is taken.
+        # Fixed here: in the middle of a view, a part of the memory it left free is taken, and the answer would change.
         self.resident, self._streamed = fits, not fits
 
     def evict(self) -> None:
-        """Give the memory of a loaded scene back; the next view decides again."""
+        """Free a loaded scene; the next view decides again whether it fits."""
         for chunk in (*self._resident, *self._pinned.values()):
             chunk.release()
         self._resident, self._pinned, self.resident, self._streamed = [], {}, False, False
 
     def give_way(self, size: int) -> None:
-        """Give back `size` bytes of the chunks that stay, as far as there are any that are not being used."""
+        """Free `size` bytes of chunks that stay, or as many as there are; the chunk in use is kept."""
         for base in sorted(self._pinned.keys() - {self._drawn}, reverse=True):
             if size <= 0:
                 return
@@ -211,11 +216,11 @@ class DeviceScene:
             chunk.release()
 
     def _may_stay(self, rows: int) -> bool:
-        """Whether memory has room for one more chunk of a compact scene."""
+        """Whether memory has room for one more chunk that stays."""
         return self._leaves_free(rows, self.fit.spare_share)
 
     def _may_add(self, rows: int) -> bool:
-        """The same for the time that one view is projected."""
+        """Whether memory has room for one more chunk until the view is projected."""
         return self._leaves_free(rows, AHEAD_SHARE)
 
     def _leaves_free(self, rows: int, share: int) -> bool:
@@ -223,7 +228,7 @@ class DeviceScene:
         return self.shown is not None and self._budget.free - size >= self._budget.limit // share
 
     def _spans(self) -> Iterator[tuple[int, int, int]]:
-        """(start, stop, degree): rows with SH first, then the block without."""
+        """Yield (start, stop, degree) of each chunk: first the rows with SH, then those without."""
         planes = self._planes
         parts = ((0, planes.sh_count, planes.sh_degree), (planes.sh_count, planes.count, 0))
         for first, last, degree in parts:
@@ -232,13 +237,13 @@ class DeviceScene:
 
     @property
     def starts(self) -> np.ndarray:
-        """[chunks + 1] i64: first row of every chunk, and the number of rows."""
+        """[chunks + 1] i64: the first row of every chunk, then the number of rows."""
         if not self._rows:
             self._decide()
         return np.array([*(start for start, _, _ in self._spans()), self.count], np.int64)
 
     def _load(self, start: int, stop: int, degree: int) -> Chunk:
-        """A chunk that stays."""
+        """Load a chunk that stays."""
         arrays = ChunkArrays(self.backend, degree, padded(stop - start))
         self._planes.load(start, stop, arrays.stored)
         chunk = arrays.activated(start, stop - start, self.antialiased)
@@ -246,9 +251,10 @@ class DeviceScene:
         return chunk
 
     def chunks(self, wanted: Callable[[ChunkBounds], bool] | None = None) -> Iterator[Chunk]:
-        """The scene's chunks in row order; a streamed chunk lives until the next one is asked for, and is loaded before.
+        """Yield the chunks in row order; a streamed chunk is valid until the next one is asked for.
 
-        Streamed chunks that were loaded before and whose bounds are not `wanted` are left out, and not read.
+        A streamed chunk loads while the one before it is drawn. If its bounds are known and not `wanted`, it is skipped and
+        not read.
         """
         if not self.resident and not self._streamed:
             self._decide()
@@ -280,7 +286,7 @@ class DeviceScene:
             loads.close()
 
     def refresh(self, *fields: str) -> None:
-        """Read `sh_dc` or `sh_rest` again from a source whose values have changed (streamed chunks do so anyway)."""
+        """Read `sh_dc` or `sh_rest` again after the source's values changed. Streamed chunks are read again in any case."""
         if not isinstance(self._planes, SourcePlanes):
             raise TypeError("only a scene with a source can be refreshed")
         self.changes += 1

@@ -1,4 +1,4 @@
-"""How many bytes a view, a chunk and their sums take, and what fits: memory policy as arithmetic on numbers."""
+"""How many bytes a view, a chunk and their sums take, and what fits into the budget. Arithmetic only; nothing is allocated."""
 
 from __future__ import annotations
 
@@ -11,56 +11,56 @@ from flexgs_edge.constants import LANES, TILE
 from flexgs_edge.scene.fields import FIELD
 
 Shapes = dict[str, tuple[tuple[int, ...], Any]]
-"""Shape and type of arrays, by name."""
+"""Shape and type of each array, by name."""
 
 RAW_BYTES = 4 * (3 + 4 + 1)
-"""Bytes a row that loading needs on top for a moment: stored scale, rotation, opacity."""
+"""Extra bytes a row while a chunk is loaded: stored scale, rotation and opacity, freed after `activate`."""
 GROWTH = 1.1
-"""Room beyond what the part of a view that was seen lets expect."""
+"""Room beyond the estimate that the part of a view projected so far gives."""
 GUESS = 1.02
-"""Room beyond what views have shown so far."""
+"""Room beyond the largest share of rows that a view has shown so far."""
 MOST_SUMS = 6
-"""Planes of sums that a view has at most (`Renderer.residual_and_removal_sums`)."""
+"""Largest number of sum planes of a view (`Renderer.residual_and_removal_sums`)."""
 SORT_DIGIT_BITS = 11
 SORT_DIGITS = 1 << SORT_DIGIT_BITS
 TARGET_BYTES = 6
-"""Bytes a pixel and channel of a target in half precision, and of the residual against it."""
+"""Bytes a pixel and channel of a target (f16) and of the residual against it (f32)."""
 PAIR_BYTES = 20
-"""A pair (8) and its draft (12)."""
+"""Bytes of a pair in a tile list (8) and of its draft (12)."""
 PAIR_SHARE = 8
-"""The tile lists take at most this part (one in eight) of what is free beyond the least: the scene comes next."""
+"""The tile lists take at most this part (one in eight) of the free memory, so that the scene gets the rest."""
 COMPACT_PAIR_SHARE = 2
-"""The same of compact views: tiles of several batches are listed anew for every blend."""
+"""The part (one in two) for a compact view. More batches would cost it more: each blend lists their tiles anew."""
 AHEAD_SHARE = 8
-"""Part of the limit (one in eight) that a second chunk which is loaded ahead leaves free: its memory is free again soon."""
+"""A third chunk loads ahead only if this part of the limit (one in eight) stays free. The view's end frees it again."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How a scene and its views share memory. Pictures and sums are the same to the bit with any of it.
+    """How a scene and its views share memory. Pictures and sums have the same bits with any values.
 
     Parameters
     ----------
     chunk_rows : int
-        Most rows of a chunk: 60 MB of planes at SH degree 3, large enough that launches cost nothing.
+        Most rows of a chunk: 60 MB of planes at SH degree 3, large enough to hide the cost of a launch.
     least_rows : int
-        Rows of the smallest chunk of a scene that is streamed.
+        Rows of the smallest chunk of a streamed scene.
     compact_rows : int
-        Rows of a chunk of a scene whose views are compact: 33 MB with all that projecting it takes.
+        Rows of a chunk if views are compact: 33 MB, with all that projecting it takes.
     pairs : int
-        Pairs of a batch when memory allows: 40 MiB, one batch for most views.
+        Most pairs of a batch: 40 MiB, enough to draw most views in one batch.
     capacity_step : int
-        Compact views make room for multiples of so many rows: views of about one size then share their buffers.
+        Compact views make room for multiples of so many rows, so that views of about one size share their buffers.
     first_share : int
-        Part of a scene's rows (one in so many) that a compact view has room for until one shows more.
+        A compact view first gets room for one in so many of the scene's rows.
     spare_share : int
-        Part of the limit (one in so many) that chunks of a compact scene which stay leave free; at 1 none stays.
+        Chunks of a compact scene stay on the backend only if one in so many bytes of the limit is free. At 1, none stays.
     ahead : int
-        Views that are projected with the one whose turn it is.
+        Views that are projected together with the current one.
     resident : bool
-        A scene that fits stays on the backend; else it is streamed.
+        Keep a scene that fits on the backend; if False, always stream it.
     whole_views : bool
-        A view has room for all rows of its scene where memory allows; else it is compact.
+        Give a view room for all rows of its scene if memory allows; if False, all views are compact.
     """
 
     chunk_rows: int = 1 << 18
@@ -75,24 +75,24 @@ class Fit:
     whole_views: bool = True
 
     def capacity(self, count: int, share: float) -> int:
-        """Rows that a compact view of a `share` of a scene's `count` rows gets room for."""
+        """Rows that a compact view gets room for if it is to show a `share` of the scene's `count` rows."""
         return min((int(share * count) // self.capacity_step + 1) * self.capacity_step, count)
 
 
 DEFAULT = Fit()
-"""What a `Renderer` takes that is given none."""
+"""The fit of a `Renderer` that is given none."""
 
 
 @dataclass(frozen=True)
 class ViewSize:
-    """What the bytes of a view's buffers depend on, besides its rows.
+    """The size of a view's buffers, apart from their rows.
 
     Parameters
     ----------
     width, height : int
         Pixels.
     sort_blocks, tile_blocks : int
-        Work-items of the backend that sort, and that list tiles.
+        Work-items of the backend for the depth sort and for the tile lists.
     """
 
     width: int
@@ -102,27 +102,27 @@ class ViewSize:
 
     @property
     def tiles_x(self) -> int:
-        """Tiles side by side."""
+        """Tiles from left to right."""
         return -(-self.width // TILE)
 
     @property
     def tiles_y(self) -> int:
-        """Tiles one below the other."""
+        """Tiles from top to bottom."""
         return -(-self.height // TILE)
 
     @property
     def tiles(self) -> int:
-        """All tiles."""
+        """Tiles in the whole view."""
         return self.tiles_x * self.tiles_y
 
     @property
     def pixels(self) -> int:
-        """Pixels of all tiles."""
+        """Pixels of all tiles; the last row and column of tiles may reach beyond the picture."""
         return self.tiles * TILE * TILE
 
 
 class SceneSize(Protocol):
-    """What the policy asks of a scene on a backend: rows and bytes."""
+    """The rows and bytes of a scene on a backend, as this module needs them."""
 
     count: int
     sum_bytes: int
@@ -130,50 +130,50 @@ class SceneSize(Protocol):
 
     @property
     def later_bytes(self) -> int:
-        """Bytes that sums over views will take."""
+        """Bytes that sums over views will take, and that are not taken yet."""
 
     @property
     def shown_bytes(self) -> int:
-        """Bytes that each row which a compact view shows takes of the sums of one view."""
+        """Bytes of one view's sums for each row that a compact view shows."""
 
     @property
     def whole_bytes(self) -> int:
-        """Bytes of all chunks, loaded."""
+        """Bytes of all chunks when loaded."""
 
     @property
     def held_bytes(self) -> int:
-        """Bytes that the loaded scene takes."""
+        """Bytes that the loaded chunks take now."""
 
     @property
     def least_chunk_bytes(self) -> int:
-        """Bytes of the smallest chunk."""
+        """Bytes of the smallest chunk of the streamed scene."""
 
     @property
     def compact_rows(self) -> int:
-        """Rows that a chunk of it has room for once it is compact."""
+        """Rows of a chunk once the scene's views are compact."""
 
     @property
     def compact_chunk_bytes(self) -> int:
-        """Bytes of such a chunk."""
+        """Bytes of a chunk once the scene's views are compact."""
 
 
 def plane_bytes(sh_degree: int) -> int:
-    """Bytes a row of an activated chunk: means, covariance (or its factor), log2 of the opacity, colour."""
+    """Bytes a row of an activated chunk: means, covariance (or its factor), log2 of the opacity, SH."""
     return 4 * (3 + 6 + 1 + 3 + FIELD["sh_rest"].width(sh_degree))
 
 
 def streamed_bytes(sh_degree: int) -> int:
-    """Bytes a row of a streamed chunk, and of the one that is loaded while it is drawn."""
+    """Bytes a row of a streamed chunk, together with the chunk that loads while it is drawn."""
     return 2 * (plane_bytes(sh_degree) + RAW_BYTES)
 
 
 def padded(count: int) -> int:
-    """Elements of a plane that holds `count` rows."""
+    """Elements of a plane that holds `count` rows: rounded up to whole vectors of `LANES`."""
     return -(-count // LANES) * LANES
 
 
 def sum_bytes(planes: int) -> int:
-    """Bytes a row of so many planes of 64-bit sums, and of the hits that go with a single one."""
+    """Bytes a row of so many planes of 64-bit sums; a single plane has a hit counter beside it."""
     return 8 * planes + 4 * (planes == 1)
 
 
@@ -181,7 +181,7 @@ SUM_BYTES = sum_bytes(1)
 
 
 def view_shapes(size: ViewSize, count: int) -> Shapes:
-    """The buffers of a view of `count` rows; the lists of pairs take what is left."""
+    """Buffers of a view of `count` rows, without the tile lists: they take a part of the memory that is left."""
     return {
         "camera": ((32,), np.float32),
         "records": ((count, 16), np.float32),
@@ -201,7 +201,7 @@ def view_shapes(size: ViewSize, count: int) -> Shapes:
 
 
 def chunk_shapes(rows: int) -> Shapes:
-    """The same of what one chunk of a compact view is projected to."""
+    """Buffers that a chunk of a compact view is projected into."""
     return {
         "chunk_records": ((rows, 16), np.float32),
         "chunk_keys": ((rows,), np.uint32),
@@ -210,24 +210,24 @@ def chunk_shapes(rows: int) -> Shapes:
 
 
 def shapes_bytes(shapes: Shapes) -> int:
-    """Bytes of all of them."""
+    """Bytes of all arrays together."""
     return sum(int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
 
 
 def view_bytes(size: ViewSize, count: int) -> int:
-    """Bytes of the buffers of a view of so many rows, with the shortest lists of pairs."""
+    """Bytes of a view's buffers for `count` rows, with the shortest tile lists that work."""
     return shapes_bytes(view_shapes(size, count)) + PAIR_BYTES * size.tiles
 
 
 def target_bytes(size: ViewSize) -> int:
-    """Bytes of a target of a view, and of the residual against it."""
+    """Bytes of a view's target and of the residual against it."""
     return TARGET_BYTES * 3 * size.pixels
 
 
 def saves_bytes(scene: SceneSize, size: ViewSize, shown: int) -> bool:
-    """Whether a compact view that shows `shown` rows takes less memory than one of all rows, both held in memory.
+    """Whether a compact view of `shown` rows takes less memory than a view of all rows, if sums over views lie in memory.
 
-    Sums that take more than a view's own statistics need a file: then it is not worth it.
+    Sums wider than hits and weights would need a scratch file with compact views. Then they do not save anything.
     """
     saved = view_bytes(size, scene.count) - view_bytes(size, shown)
     saved += scene.later_bytes - scene.shown_bytes * shown
@@ -236,13 +236,13 @@ def saves_bytes(scene: SceneSize, size: ViewSize, shown: int) -> bool:
 
 
 def fits_whole(scene: SceneSize, size: ViewSize, free: int, spills: bool) -> bool:
-    """Whether `free` bytes have room for a view of all rows of the scene, beside what sums over views will take.
+    """Whether `free` bytes hold a view of all rows of the scene, and the sums over views.
 
-    Where large arrays lie in files (`spills`), half of the memory is left for their pages.
+    If large arrays lie in files (`spills`), half of the memory is left for the kernel's cache of their pages.
     """
     view = view_bytes(size, scene.count) + scene.targets * target_bytes(size) + scene.later_bytes
     free += scene.held_bytes
     if spills:
-        # Without pages that stay, a run under a tight limit reads the same rows again and again.
+        # Without cached pages, a run under a tight limit reads the same rows again and again.
         return view + scene.whole_bytes <= free // 2
     return view + scene.least_chunk_bytes <= free

@@ -1,4 +1,4 @@
-"""A view of a scene: projection, depth order, tile lists, blending, in depth-ordered batches of a bounded size."""
+"""Draw one view of a scene: project, sort by depth, list tiles and blend. Long lists are split into depth-ordered batches."""
 
 from __future__ import annotations
 
@@ -36,25 +36,25 @@ from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
 from flexgs_edge.scene.source import SceneSource
 
 SUM_ROWS = 1 << 18
-"""Rows of sums that are on the host at a time."""
+"""Rows of sums that are copied to the host at a time."""
 GRADIENT_SUMS = 9
-"""Planes of `Renderer.gradient_sums`."""
+"""Number of planes of `Renderer.gradient_sums`."""
 EXTENTS = ("exact", "inria")
 
 
 @dataclass
 class _View:
-    """A view whose splats are projected and ordered."""
+    """A view whose splats are projected and sorted by depth."""
 
     buffers: ViewBuffers
     camera: Camera
     batches: list[tuple[int, int]]
     count: int
-    """Rows of its sums."""
+    """Rows of the view's sums."""
 
 
 class Renderer:
-    """Renders views and sums statistics on a backend.
+    """Renders views and sums what each Gaussian contributes, on a backend.
 
     Parameters
     ----------
@@ -64,20 +64,21 @@ class Renderer:
     near : float
         Near plane, scene units.
     background : sequence of float
-        Red, green, blue in [0, 1].
+        Red, green, blue in [0, 1]; black by default.
     extent : {"exact", "inria"}
-        Pixels that a splat may reach: the ellipse of alpha >= 1/255, or the reference rasteriser's tiles of ceil(3 sigma).
+        Pixels that a splat may reach: the ellipse of alpha >= 1/255 (default), or the tiles of ceil(3 sigma) that the
+        reference rasteriser uses.
     antialiased : bool
-        Multiply opacities by sqrt(det before / det after) the dilation of the 2D covariance, as the model was trained.
+        Multiply opacities by sqrt(det before / det after) of the 2D covariance's dilation. Set it if the model was trained so.
     fit : Fit, optional
         How scenes and views share memory.
 
     Attributes
     ----------
     storage : Storage
-        Where sums over views go when memory cannot hold them beside a view.
+        Takes the sums over views if memory cannot hold them beside a view.
     largest : Camera or None
-        The largest view that is to come, where that is known: whether views have room for all rows is decided for it.
+        The largest view to come, if it is known. Its size decides whether views have room for all rows.
     """
 
     def __init__(
@@ -103,78 +104,85 @@ class Renderer:
         self.largest: Camera | None = None
         self.splats_shown = 0
         self.view_rows: np.ndarray | None = None
-        """[m] u32, rows of the scene that the sums of the view drawn last belong to; None: all of them."""
+        """[m] u32, the rows of the scene that the last view's sums belong to; None if they are all rows."""
         self._share = 0.0
-        """Largest part of its rows that a compact view has shown of a scene so far."""
+        """Largest share of its rows that a scene has shown in a compact view so far."""
         self._ahead = ViewsAhead(backend, self.fit.ahead)
         self._buffers: ViewBuffers | None = None
         self._aimed: Any = None
         self._words = np.empty(0, np.uint32)
 
     def aim(self, camera: Camera, origin: np.ndarray) -> None:
-        """Put the record of a view into `camera_array`."""
+        """Write a camera's record into `camera_array` without drawing."""
         self.backend.write(self.camera_array, camera_record(camera, origin, self.near))
 
     @property
     def camera_array(self) -> Any:
-        """The record of the view drawn or aimed at last, in the backend's memory."""
+        """The camera record of the last drawn or aimed view, on the backend."""
         if self._buffers is not None:
             return self._buffers.camera
-        if self._aimed is None:  # views drawn elsewhere need no buffers here
+        if self._aimed is None:  # a view drawn elsewhere allocates no buffers here
             self._aimed = self.backend.array((32,), np.float32)
         return self._aimed
 
     @property
     def records_array(self) -> Any:
-        """The splats of the view drawn last ([N, 16]), in the backend's memory; rows that it does not show hold anything."""
+        """[N, 16], the splat records of the last view, on the backend; rows that it does not show are undefined."""
         assert self._buffers is not None
         return self._buffers.records
 
     def load(
         self, source: SceneSource, sum_bytes: int = SUM_BYTES, targets: bool = False, view_sums: int = MOST_SUMS
     ) -> DeviceScene:
-        """Bring a scene to the backend (all of it, or chunk by chunk for each view when it does not fit).
+        """Bring a scene to the backend: all of it, or chunk by chunk for each view if it does not fit.
 
-        `sum_bytes` a row, and room for `targets`, are left free for what is added up over the views, each of which has
-        `view_sums` planes at most.
+        Parameters
+        ----------
+        source : SceneSource
+        sum_bytes : int
+            Bytes a row to leave free for sums over views.
+        targets : bool
+            Leave room to compare views with targets.
+        view_sums : int
+            Most planes of sums that a view has.
         """
         self.release()
         planes = SourcePlanes(self.backend, source)
         return DeviceScene(self.backend, planes, self.budget, self.antialiased, sum_bytes, targets, view_sums, self.fit)
 
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
-        """Bring a quantized scene to the backend, dequantized there."""
+        """Bring a quantized scene to the backend, where each chunk is dequantized."""
         self.release()
         planes = QuantizedPlanes(self.backend, quantized)
         return DeviceScene(self.backend, planes, self.budget, self.antialiased, fit=self.fit)
 
     def render(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
-        """The image of `scene` from `camera` (world coordinates).
+        """Draw `scene` from `camera` (world coordinates).
 
         Returns
         -------
         np.ndarray
-            [H, W, 3] f32, linear in the model's own colour space, not clamped.
+            [H, W, 3] f32 in the model's own colour space, not clamped.
         """
         return self.render_planes(scene, camera)[:, : camera.height, : camera.width].transpose(1, 2, 0)
 
     def in_turn(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[Camera]:
-        """The cameras, each when its view is to be drawn: what is known of those that come next saves reading the scene again."""
+        """Yield each camera when its view is to be drawn; a scene in scratch files is then read once for several views."""
         return self._ahead.in_turn(scene, cameras)
 
     def render_planes(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
-        """`render` as the kernels leave it: [3, H, W] f32, both sides rounded up to whole tiles."""
+        """Draw a view, in the layout of the kernels: [3, H, W] f32, both sides rounded up to whole tiles."""
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         return self.backend.read(view.buffers.image)
 
     def drawn_planes(self) -> np.ndarray:
-        """The view that was drawn last, for an image or for sums, as `render_planes` would give it."""
+        """The last drawn view, also if it was drawn for sums, in the layout of `render_planes`."""
         assert self._buffers is not None
         return self.backend.read(self._buffers.image)
 
     def add_statistics(self, scene: DeviceScene, camera: Camera, statistics: Statistics) -> None:
-        """Add one view to `statistics` (hits and weights of every row)."""
+        """Add the hits and weights of every row in one view to `statistics`."""
         view = self._prepare(scene, camera)
         hits, sums = self._sum_arrays(scene, view, 1)
         self._blend(view, "blend_stats", (hits, sums))
@@ -188,7 +196,7 @@ class Renderer:
         Returns
         -------
         array of the backend
-            [N, 2, 2] u32, low and high words in units of 1 / `FIXED_ERROR`; valid until the next sums.
+            [N, 2, 2] u32, low and high words in units of 1 / `FIXED_ERROR`; valid until the next sums are drawn.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
@@ -197,18 +205,18 @@ class Renderer:
         return sums
 
     def residual_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
-        """Weights of each row in one view, and what it sees of `target` minus the view.
+        """Weights of each row in one view, and the weighted residual (`target` minus the view) at its pixels.
 
         Parameters
         ----------
         target : np.ndarray
-            [3, H, W] f16, as `render_planes` lays it out.
+            [3, H, W] f16, in the layout of `render_planes`.
 
         Returns
         -------
         array of the backend
             [N, 4, 2] u32, low and high words of sum(alpha T) and sum(alpha T r) for red, green, blue, in units of
-            1 / `FIXED_WEIGHT`; valid until the next sums.
+            1 / `FIXED_WEIGHT`; valid until the next sums are drawn.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
@@ -217,12 +225,12 @@ class Renderer:
         return sums
 
     def residual_and_removal_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
-        """Both sums of one view, for less than either alone and a half.
+        """The sums of `residual_sums` and `removal_sums` in one view, cheaper than two calls.
 
         Returns
         -------
         array of the backend
-            [N, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums.
+            [N, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums are drawn.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
@@ -232,16 +240,17 @@ class Renderer:
         return sums
 
     def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
-        """What the squared error of one view against `target` changes by when splats change, summed over pixels.
+        """Gradients of the squared error of one view against `target`, for each splat, summed over pixels.
 
-        Of residuals r (target minus view) and the light e that alpha adds when it grows by its own size: sum(alpha T r) for
-        red, green, blue, then sum(r e), and its first and second moments about the splat's centre: x, y, xx, xy, yy.
+        Let r be the residual (target minus view), and e the light that a splat adds when its alpha grows by its own size.
+        The sums are sum(alpha T r) for red, green, blue, then sum(r e), then its moments about the splat's centre:
+        x, y, xx, xy, yy.
 
         Returns
         -------
         array of the backend
-            [N, 9, 2] u32, low and high words in units of 1 / `FIXED_WEIGHT`, the moments of 1 / `FIXED_MOMENT`; valid until
-            the next sums.
+            [N, 9, 2] u32, low and high words in units of 1 / `FIXED_WEIGHT`, the moments in units of 1 / `FIXED_MOMENT`;
+            valid until the next sums are drawn.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
@@ -257,12 +266,12 @@ class Renderer:
         return residual
 
     def read_sums(self, sums: Any, channels: int, count: int, first: int = 0, start: int = 0) -> np.ndarray:
-        """[channels, N] i64 from the words of sums, from plane `first` and row `start` on."""
+        """Copy planes of sums to the host, from plane `first` and row `start` on: [channels, count] i64."""
         values = np.empty((channels, count), np.int64)
         planes = sums.shape[1]
         size = min(SUM_ROWS, count) * planes * 2
         if self._words.size < size:
-            # Kept from view to view: fresh pages for each took as long as the copy.
+            # Kept from view to view: fresh pages for each one take as long as the copy.
             self._words = np.empty(size, np.uint32)
         for base in range(0, count, SUM_ROWS):
             rows = min(SUM_ROWS, count - base)
@@ -277,7 +286,7 @@ class Renderer:
             scene.drop_statistics()
             held = []
         if not held:
-            # Hits are counted with weights alone; the other blends leave them out.
+            # Only the blend of weights counts hits; the other blends leave this array alone.
             shapes = (((count if channels == 1 else 1,), np.uint32), ((count, channels, 2), np.uint32))
             held = scene.statistics = [self.backend.array(shape, dtype) for shape, dtype in shapes]
         for array in held:
@@ -285,7 +294,7 @@ class Renderer:
         return held[0], held[1]
 
     def _prepare(self, scene: DeviceScene, camera: Camera) -> _View:
-        """Project and order the splats of a view, and split them into batches whose pairs fit."""
+        """Project the splats of a view, sort them by depth, and split them into batches whose pairs fit."""
         buffers = self._view_buffers(scene, camera)
         self.view_rows = None
         if buffers.rows is not None:
@@ -309,10 +318,10 @@ class Renderer:
     def _project_compact(
         self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers
     ) -> tuple[ViewBuffers, np.ndarray]:
-        """Project, and keep what is shown: in order of rows, so that all that follows gives the same bits.
+        """Project and keep only the splats that the view shows, in row order, so that the image has the same bits.
 
-        When a view shows more than there is room for, the buffers are made anew: for as many as were counted, or as its first
-        part lets expect.
+        If the view shows more splats than its buffers hold, they are allocated anew. Their size comes from the count, or from
+        an estimate by the part of the scene that was projected.
         """
         while True:
             count, seen, rows = self._ahead.fill(scene, camera, buffers, self.storage, self.near, self.inria_extent)
@@ -326,7 +335,7 @@ class Renderer:
             self._buffers = buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
 
     def _blend(self, view: _View, blend: str, extra: tuple[Any, ...] = (), again: bool = False) -> None:
-        """Blend all batches; `again`: the lists of a single batch are still there."""
+        """Blend all batches. With `again`, a single batch reuses the tile lists that are still there."""
         backend, buffers, camera = self.backend, view.buffers, view.camera
         for index, (start, stop) in enumerate(view.batches):
             if not (again and len(view.batches) == 1):
@@ -348,26 +357,26 @@ class Renderer:
             except BudgetError:
                 if scene.shown is not None:
                     scene.shown = self.fit.capacity(scene.count, 1 / self.fit.first_share)
-                # A larger view than before: the scene gives up its place and is streamed from now on if need be.
+                # A larger view than before needs memory: free the scene, which is streamed from now on if need be.
                 scene.evict()
                 self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
         return self._buffers
 
     def _may_be_compact(self, scene: DeviceScene, camera: Camera, shown: int) -> bool:
-        """Whether there is a place for sums over views that hold `shown` rows; all stay where the first view put them."""
+        """Whether sums over compact views of `shown` rows have a place. Sums that exist already stay where they are."""
         if scene.statistics or self.storage.spills:
             return not scene.statistics
         return saves_bytes(scene, view_size(self.backend, camera), shown)
 
     def _fits(self, scene: DeviceScene, camera: Camera) -> bool:
-        """Whether a view has room for all rows of the scene: this one, or the largest that is to come."""
+        """Whether all rows of the scene fit into this view, or into the largest one to come."""
         if self.largest is not None and self.largest.width * self.largest.height > camera.width * camera.height:
             camera = self.largest
         size = view_size(self.backend, camera)
         return self.fit.whole_views and fits_whole(scene, size, self.budget.free, self.storage.spills)
 
     def _sort(self, count: int, buffers: ViewBuffers) -> tuple[int, int]:
-        """Depth order of the shown splats into `buffers.sorted[0]`; how many there are, and a bound on their pairs."""
+        """Sort the shown splats by depth into `buffers.sorted[0]`; return their number and a bound on their pairs."""
         backend, blocks = self.backend, self.backend.sort_blocks
         (keys_a, ids_a), (keys_b, ids_b) = buffers.sorted
         cells = SORT_DIGITS * blocks
@@ -386,7 +395,7 @@ class Renderer:
         return shown, pairs
 
     def _batches(self, buffers: ViewBuffers, shown: int) -> list[tuple[int, int]]:
-        """Splits of the depth order whose pairs fit the buffer."""
+        """Split the depth order into batches whose pairs fit the buffer."""
         order = self.backend.read(buffers.sorted[0][1], np.empty(shown, np.uint32))
         ends = np.cumsum(self.backend.read(buffers.bounds)[order], dtype=np.int64)
         batches, start, done = [], 0, 0
@@ -410,7 +419,7 @@ class Renderer:
         )
 
     def release(self) -> None:
-        """Free the view's buffers (they come back with the next view)."""
+        """Free the view's buffers; the next view allocates them again."""
         self._words = np.empty(0, np.uint32)
         if self._buffers is not None:
             self._buffers.release()

@@ -1,4 +1,4 @@
-"""The buffers of a view on a backend, and how many bytes they are."""
+"""Allocate the buffers of a view on a backend, within the memory budget."""
 
 from __future__ import annotations
 
@@ -23,20 +23,19 @@ from flexgs_edge.render.fit import (
 
 
 def view_size(backend: Backend, camera: Camera) -> ViewSize:
-    """What the bytes of a view's buffers depend on, besides its rows."""
+    """The size of a view's buffers, apart from their rows."""
     return ViewSize(camera.width, camera.height, backend.sort_blocks, backend.tile_blocks)
 
 
 def view_key(scene: DeviceScene, camera: Camera) -> tuple[int, int, int]:
-    """What the sizes of a view's buffers depend on."""
+    """The key by which buffers are reused: rows of the scene, width and height."""
     return scene.count, camera.width, camera.height
 
 
 class ViewBuffers:
-    """Buffers that live as long as the views have one size and one number of rows.
+    """Buffers for views of one size and one number of rows; reused until either changes.
 
-    With `rows`, there is room for as many splats only, those that a view shows: the buffers of a compact view, and one chunk's
-    for what `project` writes.
+    With `rows`, they are the buffers of a compact view: room for that many splats, and for one projected chunk.
     """
 
     def __init__(
@@ -53,8 +52,8 @@ class ViewBuffers:
         self._targets: tuple[Any, Any] | None = None
         shapes = view_shapes(self.size, count)
         size = shapes_bytes(shapes)
-        # One splat may touch every tile, so no batch can be smaller than that. What the scene and the sums of a scoring pass
-        # need at the least is checked with the view, so that one message names a limit that does.
+        # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the sums
+        # need is checked here too, so that one error message names a limit that is large enough.
         later = (
             PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + scene.targets * target_bytes(self.size)
         )
@@ -74,7 +73,7 @@ class ViewBuffers:
             share, most = PAIR_SHARE, max(scene.fit.pairs, self.tiles)
             if rows is not None:
                 share = COMPACT_PAIR_SHARE
-                # Chunks that stay take what is left, and the buffers of views that show more come after them.
+                # Chunks that stay use what the tile lists leave. Buffers for views that show more rows need their room.
                 scene.give_way(later + share * most * PAIR_BYTES - budget.free)
             spare = max(budget.free - later, 0) // (share * PAIR_BYTES)
             self.capacity = min(self.tiles + spare, most)
@@ -96,14 +95,14 @@ class ViewBuffers:
         return made
 
     def target_arrays(self) -> tuple[Any, Any]:
-        """A target image in half precision and the residual against it, made when first asked for."""
+        """The target image (f16) and the residual against it (f32), allocated at the first call."""
         if self._targets is None:
             pixels = 3 * self.size.pixels
             self._targets = (self._array((pixels,), np.float16), self._array((pixels,), np.float32))
         return self._targets
 
     def release(self) -> None:
-        """Free them."""
+        """Free all buffers."""
         for array in self.arrays:
             array.release()
         self.arrays = []

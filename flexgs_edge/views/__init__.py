@@ -1,1 +1,1 @@
-"""Many views: references, sums over views, the workers of a cluster."""
+"""Draw many views: reference renders, sums over views, and the workers of a cluster."""

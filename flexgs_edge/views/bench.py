@@ -1,4 +1,4 @@
-"""What draws: a renderer here, and a cluster where there is one."""
+"""The renderer and the optional cluster that draw the views of a run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flexgs_edge.views.cluster import Cluster
 
 @dataclass
 class Bench:
-    """What draws the views of a run; a context manager that closes the cluster and the backend.
+    """Draws the views of a run; a context manager that closes the cluster and the backend.
 
     Parameters
     ----------
@@ -30,11 +30,11 @@ class Bench:
 
     @property
     def ready_cluster(self) -> Cluster | None:
-        """The cluster, once it has workers."""
+        """The cluster if its workers are there, else None."""
         return self.cluster if self.cluster is not None and self.cluster.ready else None
 
     def images(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
-        """`Renderer.render` of each view, in their order: here, or on the cluster."""
+        """Draw each view as `Renderer.render` does, in their order, here or on the cluster."""
         renderer, cluster = self.renderer, self.ready_cluster
         if cluster is None or scene.source is None:
             for camera in renderer.in_turn(scene, cameras):

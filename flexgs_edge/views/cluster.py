@@ -1,7 +1,7 @@
-"""Views drawn by the workers of a Dask cluster; sums and pictures come back in the order of the views.
+"""Draw views on the workers of a Dask cluster; sums and pictures come back in the order of the views.
 
-What is added up, and in which order, is the same as on one machine, so a file does not depend on who drew what. Dask runs
-everything, and what a lost worker was drawing is drawn again by another.
+The same numbers are added in the same order as on one machine, so the file does not depend on which worker drew a view.
+Dask schedules the views. If a worker is lost, another one draws its views again.
 """
 
 from __future__ import annotations
@@ -31,30 +31,32 @@ from flexgs_edge.views.worker import Drawing, draw_planes, draw_sums, warm_up, w
 LOG = logging.getLogger("flexgs_edge")
 
 AHEAD = 2
-"""Views for each worker that are asked for before the first of them is taken: their sums wait in the workers' memory."""
+"""Views asked for ahead, for each worker; their sums wait in the memory of the workers."""
 SENDINGS = 3
-"""Times that a scene is sent when all workers that held it were lost."""
+"""How many times a scene is sent before we give up, if all workers that held it were lost."""
 CONNECT_SECONDS = 30
 NICE = 10
-"""Niceness of worker processes that we start here, so that they leave the main process its core:
+"""Niceness of the worker processes that we start on this machine, so that the main process keeps a core:
 docs/results/tuning.md#nice"""
 
 
 class Cluster:
-    """Workers that draw; a context manager.
+    """Workers that draw views; a context manager.
 
-    Processes of this machine take seconds to start, meanwhile whoever asks draws himself.
+    Worker processes on this machine take seconds to start. Until then, the caller draws the views itself.
 
     Parameters
     ----------
     address : str
-        Of a Dask scheduler, such as `tcp://10.0.0.5:8786`, or `local:N` for N processes of one thread each on this machine.
+        Address of a Dask scheduler, such as `tcp://10.0.0.5:8786`, or `local:N` for N single-threaded processes on this
+        machine.
     drawing : Drawing
+        How workers draw.
 
     Raises
     ------
     InputError
-        When the package is missing, the address is wrong or nobody answers, or workers have another version of this program.
+        If the package is missing, the address is wrong, nobody answers, or workers run another version of this program.
     """
 
     _starting: Future[None] | None = None
@@ -76,18 +78,18 @@ class Cluster:
         starter.shutdown(wait=False)
 
     def _connect(self, address: str, processes: int | None) -> None:
-        """Connect to the cluster, or start one of so many processes here."""
+        """Connect to the cluster, or start one with so many processes on this machine."""
         if processes is not None and hasattr(os, "setpriority"):
-            # Of this thread and all that it starts: views are drawn meanwhile, and whoever waits for workers leaves them a core.
+            # Niceness of this thread is inherited by the processes it starts; the main process keeps its own.
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
-        import distributed  # takes a second
+        import distributed  # slow to import
 
         self._lost = distributed.KilledWorker
         if processes is not None:
             self._local = distributed.LocalCluster(
                 n_workers=processes,
                 threads_per_worker=1,
-                memory_limit=0,  # what draws has a limit of its own
+                memory_limit=0,  # the renderer of each worker has a limit of its own
                 dashboard_address=None,
                 silence_logs=logging.CRITICAL,
                 env={"POCL_MAX_PTHREAD_COUNT": "1"},
@@ -116,7 +118,7 @@ class Cluster:
 
     @property
     def ready(self) -> bool:
-        """Whether there are workers yet; raises `InputError` when they cannot be started."""
+        """Whether there are workers; raises `InputError` if they could not be started."""
         if self._starting is not None:
             if not self._starting.done():
                 return False
@@ -126,7 +128,7 @@ class Cluster:
     def close(self) -> None:
         """Leave the cluster; a local one ends."""
         if self._starting is not None:
-            self._starting.exception()  # waits; what went wrong was said where it was asked for, or does not matter any more
+            self._starting.exception()  # waits only: `ready` reports an error, and at the end it does not matter any more
         self._leave()
 
     def _leave(self) -> None:
@@ -141,7 +143,7 @@ class Cluster:
         self.close()
 
     def planes(self, source: SceneSource, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
-        """`Renderer.render_planes` of each view, in their order."""
+        """Draw each view as `Renderer.render_planes` does, in their order."""
         return self._drawn(draw_planes, source, [partial(_words, camera) for camera in cameras])
 
     def sums(
@@ -152,7 +154,7 @@ class Cluster:
         targets: Callable[[int], np.ndarray] | None,
         pictures: bool,
     ) -> Iterator[Drawn]:
-        """What rows got in each view, in their order: see `ViewSums.draw`."""
+        """Draw each view and yield its sums, in their order; see `ViewSums.draw`."""
 
         def words(view: int) -> tuple[Any, ...]:
             return kind, cameras[view], None if targets is None else targets(view), pictures
@@ -182,14 +184,14 @@ class Cluster:
     def _ask(
         self, draw: Callable[..., Any], source: MemorySource, views: Sequence[Callable[[], tuple[Any, ...]]]
     ) -> Iterator[Any]:
-        """Results in order; few at a time are under way."""
+        """Yield the results in order; only a few views are under way at a time."""
         client = self._client
         held = client.scatter([(uuid.uuid4().hex, source)], broadcast=True, hash=False)[0]
         most, asked = AHEAD * max(len(client.nthreads()), 1), deque[Any]()
         try:
             for view in views:
                 with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # targets of large views make "large graphs"
+                    warnings.simplefilter("ignore")  # Dask warns of a "large graph" for targets of large views
                     asked.append(client.submit(draw, held, self._drawing, *view(), pure=False))
                 if len(asked) == most:
                     yield asked.popleft().result()

@@ -1,4 +1,4 @@
-"""How far away what cameras look at is."""
+"""Distance of each camera to what it looks at, by the scene's Gaussians."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.source import SceneSource
 
 MIDDLE = 3
-"""What a pose looks at is in the middle one of so many parts of its frame, across and down."""
+"""A camera looks at the middle one of so many parts of its frame, across and down."""
 
 
 def middle_of(camera: Camera) -> Camera:
-    """The middle of a camera's frame, as a camera of its own: the same pixels."""
+    """The middle part of a camera's frame, as a camera of its own with the same pixels."""
     left, top = (pixels // 2 - pixels // (2 * MIDDLE) for pixels in (camera.width, camera.height))
     return replace(
         camera,
@@ -29,9 +29,14 @@ def middle_of(camera: Camera) -> Camera:
 
 
 def visible_depths(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera]) -> list[float]:
-    """Distance of each camera to what it looks at, scene units: the median depth of the light in the middle of its frame.
+    """Distance of each camera to what it looks at: the median depth of the light in the middle of its frame.
 
-    A camera that sees nothing there gets the median of the others, and 1 where none sees anything.
+    A camera that sees nothing there gets the median of the others. If no camera sees anything, all get 1.
+
+    Returns
+    -------
+    list of float
+        Scene units, one for each camera.
     """
     means = source.read(slice(0, source.count), ["means"])["means"]
     depths = []

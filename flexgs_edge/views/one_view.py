@@ -1,4 +1,4 @@
-"""The sums of one view, in the parts that a worker or a chunk can hold."""
+"""The sums of one view, split into parts that a worker can send and a scratch file can take."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.views.references import to_half
 
 SPOOL_ROWS = 1 << 16
-"""Rows of a view that are read from the backend and written at a time."""
+"""Rows of a view that are copied from the backend at a time."""
 Part = tuple[np.ndarray, np.ndarray]
-"""Rows of a scene [m] u32, ascending, and what each got [m, planes] i64."""
+"""Rows of a scene ([m] u32, ascending) and their sums ([m, planes] i64)."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A view that was drawn elsewhere."""
+    """Sums and picture of a view that a worker drew."""
 
     parts: list[Part]
     picture: np.ndarray | None
-    """[3, H, W] f16, as `References` keeps it: half the bytes to be sent."""
+    """[3, H, W] f16, in the layout of `References`: half the bytes to send."""
 
 
 def view_sums(renderer: Renderer, scene: DeviceScene, kind: str, camera: Camera, target: np.ndarray | None) -> Any:
-    """The sums of one view, by the method of `Renderer` that is called `kind`; a target where that wants one."""
+    """The sums of one view by the method of `Renderer` with the name `kind`; some methods need a target."""
     draw: Callable[..., Any] = getattr(renderer, kind)
     return draw(scene, camera) if target is None else draw(scene, camera, target)
 
 
 def view_parts(renderer: Renderer, scene: DeviceScene, sums: Any) -> Iterator[Part]:
-    """Rows that got something in the view drawn last, in their order, some at a time."""
+    """Yield the rows with a sum other than zero in the last view, in row order, part by part."""
     of_view, planes = renderer.view_rows, sums.shape[1]
     count = scene.count if of_view is None else len(of_view)
     for at in range(0, count, SPOOL_ROWS):
         words = np.empty((min(SPOOL_ROWS, count - at), planes, 2), np.uint32)
         values = renderer.backend.read(sums, words, 2 * planes * at).view(np.int64)[..., 0]
         got = values[:, 0].copy()
-        for plane in range(1, planes):  # a twentieth to a fourth of the time of `values.any(axis=1)`
+        for plane in range(1, planes):  # much faster than `values.any(axis=1)`
             got |= values[:, plane]
         some = np.flatnonzero(got)
         rows = at + some if of_view is None else of_view[at + some]
@@ -52,6 +52,6 @@ def view_parts(renderer: Renderer, scene: DeviceScene, sums: Any) -> Iterator[Pa
 def drawn_sums(
     renderer: Renderer, scene: DeviceScene, kind: str, camera: Camera, target: np.ndarray | None, picture: bool
 ) -> Drawn:
-    """What a worker sends back of one view."""
+    """Draw a view on a worker: its sums, and its picture if asked for."""
     parts = list(view_parts(renderer, scene, view_sums(renderer, scene, kind, camera, target)))
     return Drawn(parts, to_half(renderer.drawn_planes()) if picture else None)

@@ -1,4 +1,4 @@
-"""The original model's own renders, kept in half precision in a scratch file: targets of refits, and no photos needed."""
+"""Renders of the original model, the targets of fine-tuning in place of photos. A scratch file holds them in half precision."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ HALF_LARGEST = float(np.finfo(np.float16).max)
 
 
 def to_half(values: np.ndarray) -> np.ndarray:
-    """Half precision, at the ends of its range where a value lies beyond: infinity would become NaN in every sum."""
+    """Round to half precision, clipped to its range: an infinity would become NaN in every sum."""
     return np.clip(values, -HALF_LARGEST, HALF_LARGEST).astype(np.float16)
 
 
 class References:
-    """Renders of one scene from some cameras, as `Renderer.residual_sums` wants them.
+    """Renders of one scene from some cameras, in the layout that `Renderer.residual_sums` takes.
 
-    Half precision (11 bits) is finer than the 8 bits that any viewer shows. The file is read with plain reads: a mapped file
-    would count as memory of the process.
+    Half precision (11 bits) is finer than the 8 bits that viewers show. We read the file with plain reads, since the pages of
+    a mapped file would count as memory of the process.
 
     Parameters
     ----------
     scratch : path, optional
-        Folder of the scratch file; the system's default otherwise.
+        Folder of the scratch file; by default the system's folder for temporary files.
     """
 
     def __init__(self, scratch: str | Path | None = None) -> None:
@@ -47,7 +47,7 @@ class References:
         scratch: str | Path | None = None,
         progress: Progress = SILENT,
     ) -> References:
-        """All views of `scene` from `cameras`."""
+        """Render `scene` from each camera and keep the views."""
         views = cls(scratch)
         try:
             for view, camera in enumerate(
@@ -68,7 +68,7 @@ class References:
         self._end += half.nbytes
 
     def __getitem__(self, view: int) -> np.ndarray:
-        """[3, H, W] f16, both sides rounded up to whole tiles."""
+        """[3, H, W] f16, a kept view; both sides are rounded up to whole tiles."""
         offset, shape = self._places[view]
         planes = np.empty(shape, np.float16)
         self._file.seek(offset)

@@ -1,4 +1,4 @@
-"""Where sums over views wait: in memory as a whole, or in a scratch file by chunk."""
+"""Keep the sums of single views in a scratch file until they are added up, chunk by chunk."""
 
 from __future__ import annotations
 
@@ -18,16 +18,22 @@ from flexgs_edge.views.one_view import Part
 
 
 class DenseSums:
-    """Sums of one view of all rows of a chunk, on the backend."""
+    """The sums of one view for all rows of a chunk, on the backend."""
 
     def __init__(self, backend: Backend, shape: tuple[int, ...]) -> None:
         self._backend, self.shape = backend, shape
         self._array = backend.array((*shape, 2), np.uint32)
 
     def of(self, parts: Iterable[Part], base: int) -> Any:
-        """[stride, planes, 2] u32, valid until the next; the chunk begins at row `base`, and rows not listed got nothing."""
+        """Spread listed sums over all rows of the chunk that begins at row `base`; rows not listed get zero.
+
+        Returns
+        -------
+        array of the backend
+            [stride, planes, 2] u32, valid until the next call.
+        """
         self._backend.mark()()
-        # A row as one element: less than half of the time.
+        # Copying a row as one element is faster than plane by plane.
         row = np.dtype((np.void, 8 * self.shape[1]))
         with self._backend.mapped(self._array) as words:
             dense = words.view(np.int64)[..., 0]
@@ -37,21 +43,21 @@ class DenseSums:
         return self._array
 
     def release(self) -> None:
-        """Free it."""
+        """Free the array."""
         self._array.release()
 
 
 class Spool:
-    """What the rows of a scene got in some views, in a scratch file: view by view, rows ascending."""
+    """A scratch file with the sums of each view: view by view, rows ascending."""
 
     def __init__(self, storage: Storage, starts: np.ndarray) -> None:
         self._storage, self._starts = storage, starts
         self._record: np.dtype[Any] | None = None
         self._file: BinaryIO = storage.file()
         self._disk = ThreadPoolExecutor(1, "sums")
-        """Writes and reads it, one block at a time, while the next is gathered or the one before is added."""
+        """Reads or writes one block at a time, while this thread gathers the next block or adds the one before."""
         self._end = self._counted = 0
-        # For each view: its camera, where it begins, and how many of its rows come before each chunk.
+        # For each view: its camera, its first byte, and how many of its rows come before each chunk.
         self._views: list[tuple[Camera, int, np.ndarray]] = []
 
     def add(self, parts: Iterable[Part], camera: Camera) -> None:
@@ -76,7 +82,7 @@ class Spool:
         self._views.append((camera, start, before))
 
     def replay(self, renderer: Renderer, scene: DeviceScene, chunk: Chunk) -> Iterator[Any]:
-        """For each view in which a row of the chunk got something: its sums, [stride, planes, 2] u32 on the backend."""
+        """Yield the sums of each view that shows a row of the chunk: [stride, planes, 2] u32 on the backend."""
         backend, place = renderer.backend, int(np.searchsorted(self._starts, chunk.base))
         if self._record is None:  # no view showed anything
             return
@@ -106,7 +112,7 @@ class Spool:
         return block
 
     def close(self) -> None:
-        """Remove the file."""
+        """Remove the scratch file."""
         self._disk.shutdown()
         self._file.close()
         self._storage.count(-self._counted)

@@ -1,8 +1,8 @@
-"""Sums over views, chunk by chunk of the scene: added up view by view where memory holds them, else chunk by chunk.
+"""Sums over views for each Gaussian, added up in memory if it has room, else through a scratch file.
 
-In memory every view is added to the sums of all chunks as soon as it is drawn. Where these do not fit, what each row got in
-each view is written to a file (only the rows that got something, 52 bytes at most), and read again chunk by chunk: then the sums
-of one chunk are held at a time. Both add up the same numbers in the same order.
+In memory, each view is added to the sums of all chunks as soon as it is drawn. If they do not fit, we write each view's sums
+to a file: only rows with a sum other than zero, at most 52 bytes each. Later we read the file chunk by chunk, and hold the
+sums of one chunk at a time. Both ways add the same numbers in the same order.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from flexgs_edge.views.spool import DenseSums, Spool
 
 
 class ChunkSums(Protocol):
-    """Sums over views of the rows of one chunk."""
+    """Sums over views for the rows of one chunk."""
 
     def add(self, chunk: Chunk, sums: Any, base: int) -> None:
-        """Add the view that `Renderer.camera_array` tells of; the chunk's rows begin at row `base` of its `sums`."""
+        """Add the view of `Renderer.camera_array`; the chunk's rows begin at row `base` of its `sums`."""
 
     def release(self) -> None:
-        """Free what is held on the backend."""
+        """Free the arrays on the backend."""
 
 
 Maker = Callable[[Chunk], ChunkSums]
@@ -41,7 +41,7 @@ class ViewSums:
     Parameters
     ----------
     bench : Bench
-        Draws.
+        Draws the views.
     scene : DeviceScene
     makers : sequence of callable
         Each makes one kind of sums for a chunk.
@@ -60,21 +60,21 @@ class ViewSums:
         targets: Callable[[int], np.ndarray] | None = None,
         pictures: bool = False,
     ) -> Iterator[Callable[[], np.ndarray]]:
-        """Draw views and add them, one for each step of the iterator, in their order: here, or on the cluster.
+        """Draw views and add their sums, one view for each step of the iterator, in order, here or on the cluster.
 
         Parameters
         ----------
         kind : str
-            Method of `Renderer` that gives a view's sums.
+            Name of the method of `Renderer` that gives a view's sums.
         targets : callable, optional
-            The target of a view by its place among `cameras`, where that method wants one.
+            Gives the target of a view by its place among `cameras`, if that method takes one.
         pictures : bool
-            Whether what is yielded will be asked for.
+            Whether the caller will use the yielded callables.
 
         Yields
         ------
         callable
-            Gives the view for `References.add`; valid until the next step.
+            Gives the view's picture for `References.add`; valid until the next step.
         """
         renderer, scene, cluster = self._renderer, self._scene, self._bench.ready_cluster
         if cluster is None or scene.source is None:
@@ -88,7 +88,7 @@ class ViewSums:
             yield partial(_picture, drawn)
 
     def add_view(self, sums: Any, camera: Camera) -> None:
-        """Add the view drawn last, from `camera`. The order of views is part of the result."""
+        """Add the sums of the last view, from `camera`. The order of views is part of the result."""
         if self._renderer.view_rows is not None:
             self._add_parts(view_parts(self._renderer, self._scene, sums), camera)
             return
@@ -97,19 +97,19 @@ class ViewSums:
                 part.add(chunk, sums, chunk.base)
 
     def _chunks(self) -> Iterator[tuple[Chunk, list[ChunkSums]]]:
-        """Chunks of the scene, and their sums in memory."""
+        """Yield each chunk of the scene with its sums in memory, allocated at the first call."""
         for chunk in self._scene.chunks():
             if chunk.base not in self._held:
                 self._held[chunk.base] = (chunk.count, [make(chunk) for make in self._makers])
             yield chunk, self._held[chunk.base][1]
 
     def _add_drawn(self, parts: Sequence[Part], camera: Camera) -> None:
-        """Add a view that was drawn elsewhere."""
+        """Add a view that a worker drew."""
         renderer, scene = self._renderer, self._scene
         if renderer.storage.spills:
             self._add_parts(parts, camera)
             return
-        if not parts:  # a compact view of nothing
+        if not parts:  # a compact view that shows nothing
             return
         renderer.aim(camera, scene.origin)
         for chunk, held in self._chunks():
@@ -134,7 +134,7 @@ class ViewSums:
         self._spool.add(parts, camera)
 
     def parts(self) -> Iterator[tuple[slice, list[Any]]]:
-        """Rows of the scene and their sums over the views added, one of each kind, chunk by chunk; valid until the next."""
+        """Yield rows of the scene and their sums over all views, one of each kind, chunk by chunk; valid until the next step."""
         if self._held:
             for base, (count, parts) in self._held.items():
                 yield slice(base, base + count), parts
@@ -143,7 +143,7 @@ class ViewSums:
         for chunk in self._scene.chunks():
             parts = [make(chunk) for make in self._makers]
             try:
-                # Without a spool there was no view, and the sums are those of nothing.
+                # No spool means that no view was added: the sums stay zero.
                 for sums in self._spool.replay(self._renderer, self._scene, chunk) if self._spool else ():
                     for part in parts:
                         part.add(chunk, sums, 0)
@@ -153,7 +153,7 @@ class ViewSums:
                     part.release()
 
     def _make_room(self) -> None:
-        """Give up the buffers of the last view where the sums of a chunk have no place beside them."""
+        """Free the buffers of the last view if the sums of a chunk do not fit beside them."""
         renderer, scene = self._renderer, self._scene
         rows = padded(int(np.diff(scene.starts).max(initial=0)))
         if renderer.budget.free < scene.least_chunk_bytes + rows * scene.sum_bytes:
@@ -161,7 +161,7 @@ class ViewSums:
             renderer.release()
 
     def release(self) -> None:
-        """Free what is held."""
+        """Free the sums and the scratch file."""
         for _, parts in self._held.values():
             for part in parts:
                 part.release()

@@ -1,4 +1,4 @@
-"""What a worker of the cluster does: hold a scene, draw views of it, and send back sums or pictures."""
+"""A worker of the cluster: it holds a scene, draws views of it, and sends back sums or pictures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from flexgs_edge.views.one_view import Drawn, drawn_sums
 
 @dataclass(frozen=True)
 class Drawing:
-    """How workers draw, by the words of `Renderer`; `memory_limit` is each one's own."""
+    """Settings of a worker's `Renderer`; `memory_limit` (bytes) holds for each worker."""
 
     device: str | None
     memory_limit: int | None
@@ -32,7 +32,7 @@ class Drawing:
 
 
 class _Desk:
-    """What a worker process keeps from view to view: a renderer, and the scene sent last."""
+    """State of a worker process between views: a renderer, and the last scene that was sent."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -42,7 +42,7 @@ class _Desk:
         self._scene: DeviceScene | None = None
 
     def ready(self, held: tuple[str, MemorySource], drawing: Drawing) -> tuple[Renderer, DeviceScene]:
-        """The renderer, and the scene loaded."""
+        """The renderer and the loaded scene; both are reused until `drawing` or the scene changes."""
         if self._drawing != drawing or self._renderer is None:
             self._key, self._scene = "", None
             budget = MemoryBudget.from_limit(drawing.memory_limit)
@@ -63,7 +63,7 @@ _DESK = _Desk()
 
 
 def draw_planes(held: tuple[str, MemorySource], drawing: Drawing, camera: Camera) -> np.ndarray:
-    """A view, as `Renderer.render_planes` gives it."""
+    """Draw a view in the layout of `Renderer.render_planes`."""
     with _DESK.lock:
         renderer, scene = _DESK.ready(held, drawing)
         return renderer.render_planes(scene, camera)
@@ -77,14 +77,14 @@ def draw_sums(
     target: np.ndarray | None,
     picture: bool,
 ) -> Drawn:
-    """The sums of a view: see `drawn_sums`."""
+    """Draw the sums of a view; see `drawn_sums`."""
     with _DESK.lock:
         renderer, scene = _DESK.ready(held, drawing)
         return drawn_sums(renderer, scene, kind, camera, target, picture)
 
 
 def warm_up(drawing: Drawing) -> None:
-    """Draw one Gaussian as views will be: a worker's first view is slow, since its kernels are loaded then."""
+    """Draw one Gaussian, so that a worker loads its kernels before the first view."""
     planes = {name: np.zeros((field.width(0), 1), np.float32) for name, field in FIELD.items()}
     planes["quats"][0] = 1
     camera = Camera("", TILE, TILE, np.eye(3), np.array([0.0, 0.0, 1.0]), TILE, TILE, TILE / 2, TILE / 2)
