@@ -1,1 +1,1 @@
-"""Our own files: the `.fgs` container, bytes only (docs/format.md)."""
+"""The `.fgs` container format, versions 1 and 2: bytes in and out, no rendering (docs/format.md)."""

@@ -1,4 +1,4 @@
-"""What the headers of both container versions share: the preamble, strict JSON and its checks."""
+"""Header parts that both container versions share: strict JSON, checks of its values, and the wording of errors."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ MAX_COUNT = 2**32 - 1
 
 
 class HeaderError(ValueError):
-    """A header that breaks the format: what was wanted and what was found."""
+    """A header that breaks the format; the message tells what was wanted and what was found."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the file that has a checksum of its own."""
+    """A part of the file with its own checksum."""
 
     name: str
     offset: int
@@ -28,7 +28,7 @@ class Section:
 
 
 def canonical_json(value: object) -> bytes:
-    """JSON with sorted keys, no spaces, ASCII only, and no NaN or infinity."""
+    """Encode a value as JSON with sorted keys, without spaces, in ASCII, and without NaN or infinity."""
     try:
         text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True)
     except (TypeError, ValueError, RecursionError) as error:
@@ -37,14 +37,14 @@ def canonical_json(value: object) -> bytes:
 
 
 def parse_json(block: bytes) -> object:
-    """JSON without repeated keys, NaN or infinity."""
+    """Decode JSON without repeated keys, NaN or infinity; raises `HeaderError`."""
     try:
         return json.loads(block.decode("ascii"), object_pairs_hook=_unique, parse_constant=_no_constant)
     except HeaderError:
         raise
     except RecursionError:
         raise HeaderError("wanted JSON, got values nested too deep") from None
-    except ValueError as error:  # also bytes that are not ASCII, and numbers of absurd length
+    except ValueError as error:  # also for bytes beyond ASCII, and for numbers of absurd length
         raise HeaderError(f"wanted JSON in ASCII, got {error}") from None
 
 
@@ -62,25 +62,25 @@ def _no_constant(text: str) -> NoReturn:
 
 
 def checked_integer(name: str, value: object, lowest: int, highest: int) -> int:
-    """An integer from a header, within bounds; raises `HeaderError`."""
-    # bool is a subclass of int: true is not 1 here.
+    """Check an integer of a header against its bounds; raises `HeaderError`."""
+    # bool is a subclass of int, and `true` must not pass as 1.
     if type(value) is not int or not lowest <= value <= highest:
         raise HeaderError(f"{name}: wanted an integer from {lowest} to {highest}, got {shown(value)}")
     return value
 
 
 def checked_origin(value: object) -> tuple[float, float, float]:
-    """Three finite numbers from a header; raises `HeaderError`."""
+    """Check three finite numbers of a header; raises `HeaderError`."""
     if isinstance(value, list) and len(value) == 3 and all(type(v) is float and math.isfinite(v) for v in value):
         return (value[0], value[1], value[2])
     raise HeaderError(f"origin: wanted three finite numbers with a decimal point, got {shown(value)}")
 
 
 def shown(value: object) -> str:
-    """A value in an error text: short, however long it is."""
+    """A value for an error message, shortened."""
     return "an integer of more than 40 digits" if isinstance(value, int) and abs(value) >= 10**40 else brief(value)
 
 
 def format_error(path: object, offset: int, message: str) -> FormatError:
-    """The one wording of all errors about a file's bytes."""
+    """The error for wrong bytes in a file; all such messages begin with the file and the byte."""
     return FormatError(f"{path}: byte {offset}: {message}")

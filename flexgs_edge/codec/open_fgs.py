@@ -1,4 +1,4 @@
-"""One door for `.fgs` files of every version."""
+"""Open, read or verify a `.fgs` file, whatever its version."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flexgs_edge.errors import InputError
 
 
 def file_version(path: str | os.PathLike[str]) -> int:
-    """2 for files of version 2; anything else counts as 1, whose reader explains what is wrong with it."""
+    """2 for files of version 2, else 1: the reader of version 1 then says what is wrong with other files."""
     try:
         with open(path, "rb") as file:
             start = file.read(10)
@@ -27,16 +27,16 @@ def file_version(path: str | os.PathLike[str]) -> int:
 
 
 def open_fgs(path: str | os.PathLike[str]) -> FgsSource | GridSource:
-    """A `.fgs` file as a source."""
+    """Open a `.fgs` file as a scene source."""
     return GridSource(path) if file_version(path) == 2 else FgsSource(path)
 
 
 def read_header(path: str | os.PathLike[str]) -> Header | GridHeader:
-    """The checked header of a file; no values are read."""
+    """Read and check the header of a file; no values are read."""
     return v2.GridContainer(path).header if file_version(path) == 2 else v1.read_header(path)
 
 
 def verify(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Section]:
-    """Check every byte of a file: see `v1.verify`."""
+    """Check every byte of a file; see `flexgs_edge.codec.v1.container.verify`."""
     check = v2.verify_grid if file_version(path) == 2 else v1.verify
     return check(path, raise_errors)

@@ -1,7 +1,7 @@
-"""What files of both versions share: a preamble, sections that end in their checksum, and chunks that a table describes.
+"""The frame of `.fgs` files of both versions: a preamble, sections that end in a checksum, and chunks listed in a table.
 
-Every byte lies under a checksum, or is compared with the one value it may have. Nothing is allocated on the word of
-the header before the sizes that it implies fit the size of the file.
+Every byte lies under a checksum, or has only one allowed value. We allocate nothing for sizes in a header before they agree
+with the size of the file.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from flexgs_edge.codec.header import PREAMBLE_BYTES, HeaderError, Section, forma
 from flexgs_edge.errors import FormatError, InputError
 
 MAGIC = b"\x93FGS\r\n\x1a\n"
-"""A byte above 127, both line ends and a text stop: transfers that alter text break it at once (the idea of PNG)."""
+"""First bytes of a file: a byte above 127, both line ends and a text stop (the idea of PNG). A transfer as text breaks them."""
 _PREAMBLE = struct.Struct("<8sHHIQII")
 _U32 = struct.Struct("<I")
 _PIECE = 1 << 20
-"""Bytes read at a time when only a checksum is wanted."""
+"""Bytes read at a time to compute a checksum."""
 
 _Header = TypeVar("_Header")
 
 
 @dataclass(frozen=True)
 class ChunkEntry:
-    """Where a chunk lies and its checksum."""
+    """The place and checksum of a chunk."""
 
     section: Section
     checksum: int
 
 
 def checked(data: bytes) -> bytes:
-    """Data with its checksum behind it."""
+    """Append the checksum to data."""
     return data + _U32.pack(zlib.crc32(data))
 
 
 def preamble(version: int, size: int, block: bytes) -> bytes:
-    """The preamble of a file of `size` bytes whose header is `block`."""
+    """The preamble of a file of `size` bytes with the header `block`."""
     return checked(_PREAMBLE.pack(MAGIC, version, 0, 0, size, len(block), zlib.crc32(block)))
 
 
@@ -53,7 +53,7 @@ class SectionFile:
     Parameters
     ----------
     path : path
-        The file; opened for each read, never held.
+        The file is opened for each read, and never held open.
     """
 
     version: int
@@ -63,7 +63,7 @@ class SectionFile:
 
     @contextmanager
     def open(self) -> Iterator[BinaryIO]:
-        """The file for reading."""
+        """Open the file for reading; raises `InputError`."""
         with ExitStack() as stack:
             try:
                 file = stack.enter_context(open(self.path, "rb"))
@@ -72,14 +72,14 @@ class SectionFile:
             yield file
 
     def read_section(self, file: BinaryIO, section: Section) -> bytes:
-        """A section's bytes without the checksum at its end, which is compared."""
+        """Read a section and check it; returns its bytes without the checksum at the end."""
         file.seek(section.offset)
         data = self._read(file, section.length, section.name)
         self._compare(section, _U32.unpack_from(data, section.length - 4)[0], zlib.crc32(memoryview(data)[:-4]))
         return data[:-4]
 
     def read_chunk(self, entry: ChunkEntry) -> bytes:
-        """The bytes of a chunk, checked."""
+        """Read and check a chunk."""
         section = entry.section
         with self.open() as file:
             file.seek(section.offset)
@@ -88,12 +88,12 @@ class SectionFile:
         return data
 
     def check_chunk(self, entry: ChunkEntry) -> None:
-        """Check a chunk in pieces, without keeping it."""
+        """Check a chunk in pieces, without holding it in memory."""
         with self.open() as file:
             self.copy_chunk(file, entry, None)
 
     def copy_chunk(self, file: BinaryIO, entry: ChunkEntry, out: BinaryIO | None) -> None:
-        """Copy a chunk in pieces, checking it."""
+        """Copy a chunk in pieces, and check it."""
         left, checksum = entry.section.length, 0
         file.seek(entry.section.offset)
         while left:
@@ -112,16 +112,16 @@ class SectionFile:
         decode: Callable[[bytes], _Header],
         wrong_size: Callable[[_Header], str],
     ) -> _Header:
-        """The checked header of a file of `size` bytes.
+        """Read and check the header of a file of `size` bytes.
 
         Parameters
         ----------
         wrong_length : callable
-            What is wrong with a header's length, given the room for it ("" for nothing).
+            The fault of a header's length, given the room for it; "" if there is none.
         decode : callable
-            Header from its bytes; raises `HeaderError`.
+            Makes a header from its bytes; raises `HeaderError`.
         wrong_size : callable
-            What size the header makes, where it is not the file's ("" where it is).
+            The size that the header implies, in words, if the file has another size; else "".
         """
         start = self._read(file, PREAMBLE_BYTES, "preamble")
         magic, version, required, _, claimed, block_bytes, block_sum = _PREAMBLE.unpack_from(start)
@@ -168,14 +168,14 @@ class SectionFile:
 
 
 class Verification:
-    """Sections of a file, each tested in turn.
+    """Collects the sections of a file, each with the result of its check.
 
     Parameters
     ----------
     block : int
         Bytes of the header, which has been read.
     raise_errors : bool
-        False: damage is reported as `ok=False`.
+        If False, report damage as `ok=False` instead of raising an error.
     """
 
     def __init__(self, block: int, raise_errors: bool) -> None:
@@ -183,7 +183,7 @@ class Verification:
         self._sections = [Section("preamble", 0, PREAMBLE_BYTES), Section("header", PREAMBLE_BYTES, block)]
 
     def check(self, section: Section, test: Callable[[], object]) -> bool:
-        """Note a section, and whether `test` passes."""
+        """Add a section, and return whether `test` passes."""
         try:
             test()
         except FormatError:
@@ -197,7 +197,7 @@ class Verification:
     def check_chunks(
         self, file: SectionFile, table: Section, read: Callable[[], list[ChunkEntry]], unknown: Iterable[Section]
     ) -> list[Section]:
-        """Test the chunk table and the chunks (`unknown` without it); returns all sections in the order of the file."""
+        """Check the chunk table and the chunks; returns all sections in file order, with `unknown` if the table is damaged."""
         if self.check(table, read):
             for entry in read():
                 self.check(entry.section, partial(file.check_chunk, entry))

@@ -1,1 +1,1 @@
-"""Integers of the method `best`: a value is an integer times a step size."""
+"""Scenes on a grid: integer codes, each of which stands for a multiple of a step size. The method `best` codes these."""

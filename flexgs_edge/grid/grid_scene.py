@@ -1,4 +1,4 @@
-"""A scene of integers: codes on the grids that its step sizes span."""
+"""A scene in integer codes, which a container codes and every decoder turns into values."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 
 @dataclass(frozen=True, eq=False)
 class GridScene:
-    """A scene in integers, rows sorted by layer, then along the Morton curve of the position cells.
+    """A scene in integer codes. Rows are sorted by layer, then along the Morton curve of their position cells.
 
     Parameters
     ----------
     count : int
         Rows n.
     sh_degree : int
-        D; 0 when no row has SH.
+        D; 0 if no row has SH.
     origin : np.ndarray
         [3] f64, world: positions are relative to it.
     steps : StepSizes
-        Value = code * step.
+        A value is its code times the step size.
     position : np.ndarray
         [3, n] i32.
     scale : np.ndarray
@@ -39,7 +39,7 @@ class GridScene:
     sh : tuple of np.ndarray
         For each degree l from 1 to D: [3 * (2l + 1), rows with a degree >= l] i32: all Y, all Co, all Cg.
     layer : np.ndarray
-        [n] u8, ascending; all 0 when there are no layers.
+        [n] u8, ascending; all 0 if there are no layers.
     """
 
     count: int
@@ -57,11 +57,11 @@ class GridScene:
 
     @property
     def sh_count(self) -> int:
-        """Rows with SH above degree 0."""
+        """Number of rows with SH above degree 0."""
         return int(np.count_nonzero(self.sh_degrees))
 
     def take(self, rows: np.ndarray, storage: Storage = IN_MEMORY) -> GridScene:
-        """The rows `rows` in their order, with the SH degree that is left."""
+        """A new scene of the given rows, in their order, with the highest SH degree that is left."""
         rows = np.arange(self.count)[rows]
         degrees = self.sh_degrees[rows]
         top = int(degrees.max(initial=0))
@@ -83,7 +83,7 @@ class GridScene:
 
 
 def row_places(degrees: np.ndarray, rows: np.ndarray, degree: int) -> np.ndarray:
-    """Where the SH of those `rows` that have `degree` lie in the arrays of that degree."""
+    """Columns of some rows in the SH arrays of a degree; rows below that degree have none."""
     places = np.cumsum(degrees >= degree) - 1
     chosen: np.ndarray = places[rows[degrees[rows] >= degree]]
     return chosen

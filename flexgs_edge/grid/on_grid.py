@@ -1,4 +1,4 @@
-"""Scenes whose values lie on a grid of ours already, and the comment in a PLY that says which."""
+"""Find out whether a scene's values lie on a known grid already. A comment in our PLY files names its step sizes."""
 
 from __future__ import annotations
 
@@ -22,34 +22,39 @@ _COMMENT = "flexgs-edge grid "
 
 
 def grid_comment(steps: StepSizes) -> str:
-    """What a PLY says of the grid that its values lie on."""
+    """The comment in a PLY that names the grid of its values."""
     return f"{_COMMENT}{json.dumps(steps.to_json())}"
 
 
 def steps_of(comments: Sequence[str]) -> StepSizes | None:
-    """The steps that such a comment holds; None without one that can be read."""
+    """The step sizes in such a comment; None if there is none that can be read."""
     for words in comments:
         if words.startswith(_COMMENT):
             try:
-                with np.errstate(over="ignore"):  # a step beyond float32 is infinite, and refused
+                with np.errstate(over="ignore"):  # a step beyond float32 becomes infinite, and is refused
                     return StepSizes.from_json(json.loads(words.removeprefix(_COMMENT)))
-            # Anybody may have written it: lists a thousand deep, integers beyond floats.
+            # Anybody may have written the comment: lists a thousand deep, integers too large for a float.
             except (InputError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError):
                 return None
     return None
 
 
 def on_grid(planes: Planes, steps: StepSizes, origin: np.ndarray) -> GridScene | None:
-    """The grid that values lie on, if every one of them lies on it to the bit: nothing is lost by taking it.
+    """Put values on a grid, but only if each of them lies on it to the bit; the grid then loses nothing.
 
     Parameters
     ----------
     planes : mapping
         {field: [width, n] f32}, finite.
     steps : StepSizes
-        What a comment says: it may be of other values.
+        From a comment, which may not belong to these values.
     origin : np.ndarray
         [3] f64.
+
+    Returns
+    -------
+    GridScene or None
+        None if a value does not lie on the grid.
     """
     rest = planes["sh_rest"]
     bands = rest.reshape(3, len(rest) // 3, rest.shape[1])
@@ -62,7 +67,7 @@ def on_grid(planes: Planes, steps: StepSizes, origin: np.ndarray) -> GridScene |
         return None
     for name, values in from_grid(grid).items():
         given = planes[name][:, order]
-        # Coefficients are channel by channel: those of degrees that no row has are zero, and left out.
+        # Coefficients are stored channel by channel. Degrees that no row has are all zero, and left out.
         if name == "sh_rest":
             given = bands[:, : sh_rest_count(grid.sh_degree), order].reshape(values.shape)
         if not np.array_equal(values, given):
@@ -71,9 +76,9 @@ def on_grid(planes: Planes, steps: StepSizes, origin: np.ndarray) -> GridScene |
 
 
 def lowered(grid: GridScene, storage: Storage = IN_MEMORY) -> GridScene:
-    """The same values with each row's SH degree as low as its codes allow: what decodes to zero is not in the file.
+    """Lower the SH degree of each row as far as its codes are zero; the values stay the same, and zeros are not stored.
 
-    So the grid of a file is the one that is found again in the values that it decodes to (`on_grid`), to the byte.
+    The grid of a file then equals, to the byte, the grid that `on_grid` finds in the decoded values.
     """
     degrees, bands = grid.sh_degrees.copy(), list(grid.sh)
     for degree in range(grid.sh_degree, 0, -1):
@@ -82,7 +87,7 @@ def lowered(grid: GridScene, storage: Storage = IN_MEMORY) -> GridScene:
         zero = np.empty(len(rows), bool)
         for part in blocks(len(rows)):
             zero[part] = ~read_rows(codes, part).any(axis=0)
-        # A row that keeps a higher degree keeps this one.
+        # A row with a higher degree also needs this one.
         zero &= degrees[rows] == degree
         degrees[rows[zero]] = degree - 1
         if zero.any():

@@ -1,4 +1,4 @@
-"""Quantization step sizes: one for each kind of value, one for each degree of SH."""
+"""Step sizes of a grid: one for each kind of value, and one for each SH degree."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 
 POSITION_BITS = 21
-"""Cells along an axis of a scene as a power of two: three of them fill a 63-bit curve index."""
+"""A scene is at most 2^21 cells wide on each axis; three coordinates fill a Morton index of 63 bits."""
 
 Planes = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
 class StepSizes:
-    """Grid steps, rounded to float32 once.
+    """Step sizes of a grid; each is rounded to float32 once.
 
     Parameters
     ----------
     position : float
-        Scene units.
+        In scene units.
     scale : float
-        Natural logarithm.
+        Of the natural logarithm of a scale.
     rotation : float
-        Component x, y or z of a unit quaternion.
+        Of x, y and z of a unit quaternion.
     opacity : float
-        Logit.
+        Of the logit.
     dc : float
-        Luma of the SH coefficient of degree 0.
+        Of the luma of the SH coefficient of degree 0.
     sh : tuple of float
-        Luma of SH coefficients, one step for each degree from 1.
+        Of the luma of SH coefficients, one for each degree from 1.
     chroma : float, optional
-        Factor of the steps of the two chroma planes.
+        Factor by which the steps of the two chroma planes are larger.
     """
 
     position: float
@@ -50,9 +50,9 @@ class StepSizes:
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             numbers = value if name == "sh" else (value,)
-            with np.errstate(over="ignore"):  # a file may say 1e300
+            with np.errstate(over="ignore"):  # a file may contain 1e300
                 rounded = tuple(float(np.float32(number)) for number in numbers)
-            # Beyond this, codes of 24 bits times a step times the chroma factor leave float32's normal numbers.
+            # Beyond these bounds, 24-bit codes times a step times the chroma factor leave float32's normal numbers.
             most = 16 if name == "chroma" else 80
             if not all(2.0**-most <= number <= 2.0**most for number in rounded):
                 raise InputError(f"step of {name}: expected positive numbers from 2^-{most} to 2^{most}, got {value}")
@@ -70,6 +70,6 @@ class StepSizes:
         return cls(**{**record, "sh": tuple(record["sh"])})
 
     def colour(self, luma: float) -> np.ndarray:
-        """[3] f32: the steps of Y, Co and Cg for a step of luma."""
+        """[3] f32, the steps of Y, Co and Cg, given the step of luma."""
         chroma = np.float32(luma) * np.float32(self.chroma)
         return np.array([luma, chroma, chroma], np.float32)

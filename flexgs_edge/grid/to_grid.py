@@ -1,4 +1,4 @@
-"""From values to grid codes: positions on a curve, quaternions, opacities, colours and SH."""
+"""Quantize a scene to grid codes: sort it along the Morton curve, and round each value to its step size."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def to_grid(
     storage: Storage = IN_MEMORY,
     rename: bool = True,
 ) -> tuple[GridScene, np.ndarray]:
-    """Put a scene on its grid.
+    """Put a scene on a grid.
 
-    Every Gaussian is written in that one of its 24 equal forms (its axes can be renamed and turned round) whose rotation
-    is smallest: 1.4 bits less a Gaussian than the form that training left.
+    A Gaussian has 24 equal forms, since its axes can be permuted and reversed. By default we write the form with the
+    smallest rotation, which needs the fewest bits.
 
     Parameters
     ----------
     planes : mapping
         {field: [width, n] f32}, finite; `means` relative to `origin`.
     sh_degrees : np.ndarray
-        [n], the SH degree kept for each row; coefficients above it are left out.
+        [n], the SH degree to keep for each row; higher coefficients are left out.
     steps : StepSizes
         Needs one SH step for each degree kept.
     origin : array_like
@@ -46,9 +46,9 @@ def to_grid(
     layer : np.ndarray, optional
         [n], 0 to 255.
     storage : Storage, optional
-        Where the grid goes.
+        Holds the grid.
     rename : bool
-        Look for that form; False leaves rotations and scales as they are.
+        Take the form with the smallest rotation; False keeps rotations and scales as they are.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def to_grid(
     Raises
     ------
     InputError
-        When a value is not finite or its code is out of range: nothing is clipped.
+        If a value is not finite, or its code is out of range; nothing is clipped.
     """
     count = planes["means"].shape[1]
     degrees = _bytes("sh_degrees", sh_degrees, count, MAX_SH_DEGREE)
@@ -101,7 +101,7 @@ def to_grid(
 def _along_curve(
     means: np.ndarray, step: float, layer: np.ndarray | None, storage: Storage
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Position codes [3, n] i32 in their order, and that order ([n] i64): by layer, then along the Morton curve."""
+    """Position codes [3, n] i32 in their new order, and that order [n] i64: by layer, then along the Morton curve."""
     count = means.shape[1]
     codes = storage.empty((3, count), np.int32)
     low, high = np.full((3, 1), CODE_LIMIT), np.full((3, 1), -CODE_LIMIT)
@@ -126,7 +126,7 @@ def _along_curve(
 
 
 def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray, storage: Storage = IN_MEMORY) -> GridScene:
-    """The same rows with other colours ([3, n] and [3 * K, n] f32, in the grid's row order) put on the same steps."""
+    """Replace the colours of a scene: [3, n] and [3 * K, n] f32 in the grid's row order, on the same steps."""
     dc = storage.empty((3, grid.count), np.int32)
     for part in blocks(grid.count):
         rows, some = np.arange(part.start, part.stop), read_rows(sh_dc, part)[:, None]
@@ -148,7 +148,7 @@ def _bytes(name: str, values: np.ndarray, count: int, highest: int) -> np.ndarra
 
 
 def _codes(name: str, values: np.ndarray, step: float | np.ndarray, order: np.ndarray | None = None) -> np.ndarray:
-    """rint(value / step) in float64 as i32; `order` gives input rows for the message."""
+    """rint(value / step) in float64, as i32; `order` gives the input rows for error messages."""
     codes = np.rint(np.asarray(values, np.float64) / step)
     bad = ~(np.abs(codes) <= CODE_LIMIT)  # NaN compares false
     if bad.any():
@@ -162,7 +162,7 @@ def _codes(name: str, values: np.ndarray, step: float | np.ndarray, order: np.nd
 
 
 def _colour_codes(name: str, rgb: np.ndarray, steps: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Codes of Y = (R + 2G + B) / 4, Co = R - B, Cg = (2G - R - B) / 2 of [3, m, n] values."""
+    """Codes of Y = (R + 2G + B) / 4, Co = R - B, Cg = (2G - R - B) / 2, from [3, m, n] values."""
     red, green, blue = np.asarray(rgb, np.float64)
     both = red + blue
     colour = np.stack([(both + 2 * green) / 4, red - blue, (2 * green - both) / 2])
@@ -177,7 +177,7 @@ def _band_codes(
     storage: Storage,
     order: np.ndarray | None = None,
 ) -> np.ndarray:
-    """[3 * (2l + 1), n] codes of the coefficients of one SH degree; `order` gives input rows for the message."""
+    """[3 * (2l + 1), n] codes of the coefficients of one SH degree l; `order` gives the input rows for error messages."""
     codes = storage.empty((3, 2 * degree + 1, len(rows)), np.int32)
     for part in blocks(len(rows)):
         chosen = rows[part]

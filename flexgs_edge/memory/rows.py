@@ -255,7 +255,7 @@ class _Listed:
 
 
 def read_ahead(count: int, *arrays: np.ndarray) -> Iterator[tuple[slice, list[np.ndarray]]]:
-    """Yield `blocks(count)` with these rows of each array ([..., count]), read-only; the next rows of mapped arrays load ahead."""
+    """Yield `blocks(count)` with these rows of each array ([..., count]), read-only; mapped arrays are read ahead."""
     if all(map_of(values) is None for values in arrays):
         for part in blocks(count):
             yield part, [values[..., part] for values in arrays]

@@ -1,1 +1,1 @@
-"""Two images are compared: PSNR, SSIM, LPIPS."""
+"""Compare two images by PSNR, SSIM and LPIPS, and collect the figures over views."""

@@ -1,4 +1,4 @@
-"""LPIPS, the perceptual distance of Zhang et al. (CVPR 2018), by the `lpips` package: loaded only when asked for."""
+"""LPIPS, the perceptual distance of Zhang et al. (CVPR 2018). The package `lpips` is loaded only if it is asked for."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.process import current_rss
 
 LPIPS_SIDE = 31
-"""The smallest side that AlexNet's five layers leave a pixel of."""
+"""Smallest side of an image: AlexNet's five layers then leave one pixel."""
 LOAD_BYTES = 1100 * 2**20
-"""Bound on what loading takes at its peak: the libraries, and the file of weights twice.
+"""Bound on the memory that loading takes at its peak: the libraries, and two copies of the weights.
 docs/results/tuning.md#memory"""
 WORK_BYTES = 300
-"""Bound on the bytes a pixel that comparing two pictures holds for a moment: docs/results/tuning.md#memory"""
+"""Bound on the bytes a pixel that a comparison takes for a moment: docs/results/tuning.md#memory"""
 BACKBONE = "alexnet-owt-7be5be79.pth"
-"""torchvision's file of AlexNet's weights, 244 MB; those that `lpips` adds are in the package."""
+"""torchvision's file of AlexNet's weights, 244 MB; the package `lpips` holds its own weights."""
 BACKBONE_URL = f"https://download.pytorch.org/models/{BACKBONE}"
 
 
 class Lpips:
-    """Distance of two pictures as people see it: 0 for identical ones, smaller is better (AlexNet, version 0.1, on the CPU).
+    """Perceptual distance of two images: 0 for identical ones, smaller is better (AlexNet, version 0.1, on the CPU).
 
     Parameters
     ----------
     budget : MemoryBudget
-        What the libraries and `pixels` pixels need is taken from it, and given back by `close`.
+        Memory for the libraries and for images of `pixels` pixels is taken from it until `close`.
     pixels : int
-        The largest picture.
+        Pixels of the largest image.
 
     Raises
     ------
     InputError
-        When a package or the weights of AlexNet are missing; says what to install or where to put the file.
+        If a package or the weights of AlexNet are missing; the message tells what to install, or where to put the file.
     BudgetError
-        When the limit has no room for them.
+        If they do not fit into the memory limit.
     """
 
     def __init__(self, budget: MemoryBudget, pixels: int) -> None:
@@ -51,7 +51,7 @@ class Lpips:
         budget.take("LPIPS", self._taken)
 
     def __call__(self, image: np.ndarray, reference: np.ndarray) -> float | None:
-        """LPIPS of two [H, W, 3] images, clamped to [0, 1] first; `None` below 31 pixels a side."""
+        """LPIPS of two [H, W, 3] images, clamped to [0, 1] first; `None` if a side is shorter than 31 pixels."""
         if image.shape != reference.shape:
             raise InputError(f"LPIPS: images of shape {reference.shape} and {image.shape} cannot be compared")
         if min(image.shape[:2]) < LPIPS_SIDE:
@@ -68,14 +68,14 @@ class Lpips:
         return self._torch.from_numpy(planes)
 
     def close(self) -> None:
-        """Give the memory back."""
+        """Free the network, and give its memory back to the budget."""
         self._model = None
         self._budget.give(self._taken)
         self._taken = 0
 
 
 def _load() -> tuple[Any, Any]:
-    """The torch module and the network."""
+    """Load the torch module and the network."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -85,11 +85,11 @@ def _load() -> tuple[Any, Any]:
         raise InputError(
             f"--lpips needs the packages lpips, torch and torchvision ({error}): pip install 'flexgs-edge[lpips]'"
         ) from error
-    except RuntimeError as error:  # a torchvision that was built for another torch
+    except RuntimeError as error:  # torchvision was built for another version of torch
         raise InputError(f"--lpips: torch and torchvision do not fit each other: {_first(error)}") from error
     place = Path(torch.hub.get_dir()) / "checkpoints" / BACKBONE
     try:
-        with warnings.catch_warnings():  # the package calls torchvision in a way that is deprecated there
+        with warnings.catch_warnings():  # the package calls torchvision in a deprecated way
             warnings.simplefilter("ignore")
             model = lpips.LPIPS(net="alex", version="0.1", verbose=False, eval_mode=True)
     except (OSError, RuntimeError, ValueError, KeyError, EOFError, pickle.UnpicklingError) as error:

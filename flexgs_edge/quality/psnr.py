@@ -1,7 +1,7 @@
-"""Mean squared error and the decibels made of it: PSNR, drop, fidelity and the modelled drop.
+"""Mean squared error (MSE) of images, and the decibels from it: PSNR, drop, fidelity and modelled drop.
 
-Images are clamped to [0, 1] and compared as floats, over all pixels and channels. Identical images have
-no PSNR: it is `None` here and null in JSON, never infinity.
+Images are clamped to [0, 1] and compared as floats, over all pixels and channels. Identical images have no PSNR: it is `None`
+here and null in JSON, never infinity.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
 
 ROWS, BANDS = 128, 2
-"""Image rows per step of the squared error, and steps side by side: bounds the float64 copies to a few MB whatever the
-picture's height."""
+"""Image rows of one step of the squared error, and steps that run in parallel. They bound the f64 copies to a few MB for
+pictures of any height."""
 MSE_FLOOR = 1e-12
-"""Errors below this (120 dB, beyond float32 renders) count as this much where two PSNRs are subtracted."""
+"""Smallest MSE in a difference of two PSNRs; smaller ones (120 dB) are beyond the precision of float32 renders."""
 
 
 def mse(image: np.ndarray, reference: np.ndarray) -> float:
@@ -32,13 +32,13 @@ def mse(image: np.ndarray, reference: np.ndarray) -> float:
         a -= np.clip(reference[top : top + ROWS], 0.0, 1.0)
         return float(np.square(a, out=a).sum())
 
-    # NumPy lets other threads run: half the time. Bands are added in their order, so the sum does not depend on it.
+    # NumPy releases the interpreter's lock. Bands are added in their order, so the sum does not depend on the threads.
     with ThreadPoolExecutor(BANDS) as pool:
         return sum(pool.map(band, range(0, image.shape[0], ROWS))) / max(image.size, 1)
 
 
 def psnr(error: float) -> float | None:
-    """PSNR in dB of a mean squared error on a data range of 1; `None` for identical images.
+    """PSNR in dB, for a data range of 1, from a mean squared error; `None` for identical images.
 
     >>> psnr(1e-3), psnr(0.0)
     (30.0, None)
@@ -47,7 +47,7 @@ def psnr(error: float) -> float | None:
 
 
 def mse_of_psnr(decibel: float) -> float:
-    """Mean squared error behind a PSNR in dB.
+    """Mean squared error of images with this PSNR in dB.
 
     >>> mse_of_psnr(30.0)
     0.001
@@ -56,16 +56,16 @@ def mse_of_psnr(decibel: float) -> float:
 
 
 def mean_psnr(values: Sequence[float | None]) -> float | None:
-    """Mean of per-view PSNRs in dB over the views that differ; `None` when all are identical (or there are none).
+    """Mean PSNR in dB over the views that are not identical; `None` if all are identical, or there is no view.
 
-    Identical views would lift the mean to infinity; leaving them out can only make the figure worse.
+    An identical view would lift the mean to infinity. Leaving it out can only make the figure worse.
     """
     known = [value for value in values if value is not None]
     return math.fsum(known) / len(known) if known else None
 
 
 def drop(original_error: float, error: float) -> float:
-    """Drop in dB: PSNR(photo, original render) - PSNR(photo, this render), from the two mean squared errors.
+    """Drop in dB, PSNR(photo, original render) - PSNR(photo, this render), from both mean squared errors.
 
     >>> round(drop(0.001, 0.002), 2), drop(0.001, 0.001)
     (3.01, 0.0)
@@ -74,14 +74,16 @@ def drop(original_error: float, error: float) -> float:
 
 
 def modelled_drop(error: float, base_psnr: float = DEFAULT_BASE_PSNR) -> float:
-    """Drop in dB that an error against the original's renders costs if it is independent of the original's own error.
+    """Drop in dB against photos that are not there, from the error against the original's renders.
+
+    The model assumes that this error is independent of the original's own error.
 
     Parameters
     ----------
     error : float
         Mean squared error against the original's renders.
     base_psnr : float
-        PSNR of the original against its photos, dB.
+        Assumed PSNR of the original against its photos, dB.
 
     >>> round(modelled_drop(mse_of_psnr(41.87), 36.0), 2)
     1.0
@@ -90,12 +92,12 @@ def modelled_drop(error: float, base_psnr: float = DEFAULT_BASE_PSNR) -> float:
 
 
 def error_for_drop(decibel: float, base_psnr: float = DEFAULT_BASE_PSNR) -> float:
-    """Mean squared error against the original's renders that makes a modelled drop of `decibel`."""
+    """Mean squared error against the original's renders at a modelled drop of `decibel`."""
     return mse_of_psnr(base_psnr) * (10.0 ** (decibel / 10.0) - 1.0)
 
 
 def fidelity_for_drop(decibel: float, base_psnr: float = DEFAULT_BASE_PSNR) -> float | None:
-    """Fidelity in dB at which the modelled drop is `decibel`; `None` when only identical renders would do.
+    """Fidelity in dB at a modelled drop of `decibel`; `None` if only identical renders have it.
 
     >>> round(fidelity_for_drop(1.0), 1)
     39.9

@@ -1,4 +1,4 @@
-"""SSIM of images on a backend: scikit-image's with a Gaussian window."""
+"""SSIM of images, computed on a backend; it equals scikit-image's SSIM with a Gaussian window."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flexgs_edge.kernels.backend import Backend
 
 
 def window() -> np.ndarray:
-    """[SSIM_WINDOW] f32: the taps, their sum 1."""
+    """[SSIM_WINDOW] f32, the weights of the Gaussian window, with the sum 1."""
     away = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
     taps = np.exp(-0.5 * np.square(away / SSIM_SIGMA))
     return (taps / taps.sum()).astype(np.float32)
@@ -23,20 +23,20 @@ def ssim_bytes(width: int, height: int) -> int:
 
 
 def ssims(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
-    """SSIM of pairs of images of one size, mean over pixels and channels.
+    """SSIM of pairs of images of one size, mean over pixels and channels (Wang et al. 2004).
 
-    Gaussian window of sigma 1.5, population covariance, data range 1, windows inside the image only (Wang et al. 2004):
-    what scikit-image gives with `gaussian_weights=True, use_sample_covariance=False, data_range=1`.
+    It takes a Gaussian window of sigma 1.5, population covariance, a data range of 1, and only windows inside the image.
+    scikit-image gives the same with `gaussian_weights=True, use_sample_covariance=False, data_range=1`.
 
     Parameters
     ----------
     pairs : sequence of two arrays
-        [H, W, 3] f32, clamped to [0, 1] here.
+        [H, W, 3] f32; clamped to [0, 1] here.
 
     Returns
     -------
     list of float or None
-        `None` below 11 pixels a side.
+        `None` for images with a side below 11 pixels.
     """
     if not pairs or min(pairs[0][0].shape[:2]) < SSIM_WINDOW:
         return [None] * len(pairs)
@@ -51,7 +51,7 @@ def ssims(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> l
             arrays.append(backend.array(shape, np.float32))
         taps, *images, moments, similar = arrays
         backend.write(taps, window())
-        backend.fill(moments, 0)  # what lies behind the last row is read, and not used
+        backend.fill(moments, 0)  # the kernel reads beyond the last row, but does not use it
         padded = np.zeros((height, stride), np.float32)
         found: list[float | None] = []
         for pair in pairs:

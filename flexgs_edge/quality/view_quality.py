@@ -1,4 +1,4 @@
-"""The figures of one view and their means over views."""
+"""Quality of one view, and its means over all evaluated views."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.quality.psnr import drop, mean_psnr, modelled_drop, mse, psnr
 
 Distance = Callable[[np.ndarray, np.ndarray], float | None]
-"""A distance of two [H, W, 3] images; `None` where there is none."""
+"""Distance of two [H, W, 3] images; `None` if it is not defined for them."""
 Similarities = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | None]]
-"""Similarities of several pairs of [H, W, 3] images of one size."""
+"""Similarities of pairs of [H, W, 3] images, all of one size."""
 
 
 @dataclass(frozen=True)
 class ViewQuality:
-    """Figures of one view; PSNRs in dB, `None` where images are identical or there is nothing to compare with.
+    """Quality of one view. PSNRs are in dB, and `None` if images are identical or one of them is missing.
 
     Parameters
     ----------
     name : str
-        The view's name.
+        Name of the view.
     error : float
         Mean squared error against the original's render.
     photo_error, original_error : float or None
-        Mean squared error of this render and of the original's render against the photo; `None` without a photo.
+        Mean squared error of this render, and of the original's render, against the photo; `None` without a photo.
     ssim_original, ssim_photo, original_ssim : float or None
         SSIM against the original's render, against the photo, and of the original against the photo.
     lpips_original, lpips_photo, original_lpips : float or None
@@ -71,14 +71,14 @@ class ViewQuality:
 
 @dataclass(frozen=True)
 class Quality:
-    """Figures of a scene over its evaluation views: means of the per-view figures, and the worst view.
+    """Quality of a scene over its evaluation views: means over the views, and the worst view.
 
     Parameters
     ----------
     views : tuple of ViewQuality
-        One record a view, in order of name.
+        One record for each view, sorted by name.
     base_psnr : float
-        PSNR of the original that the modelled drop starts from, dB.
+        Assumed PSNR of the original against photos, for the modelled drop, dB.
     """
 
     views: tuple[ViewQuality, ...]
@@ -94,7 +94,7 @@ class Quality:
 
     @property
     def fidelity(self) -> float | None:
-        """Mean PSNR against the original's renders, dB; `None` when every view is identical."""
+        """Mean PSNR against the original's renders, dB; `None` if every view is identical."""
         return self._mean("fidelity")
 
     @property
@@ -114,12 +114,12 @@ class Quality:
 
     @property
     def modelled_drop(self) -> float:
-        """Drop in dB that the mean squared error against the original's renders would cost."""
+        """Modelled drop in dB, from the mean squared error against the original's renders."""
         return modelled_drop(self.error, self.base_psnr)
 
     @property
     def identical(self) -> int:
-        """Views whose render is the original's, pixel for pixel."""
+        """Number of views with a render identical to the original's."""
         return sum(view.error == 0.0 for view in self.views)
 
     @property

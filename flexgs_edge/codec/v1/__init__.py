@@ -1,1 +1,1 @@
-"""Container version 1: bit-packed codes of the method `paper`."""
+"""Container version 1: bit-packed quantized scenes, which the method `paper` makes."""

@@ -1,4 +1,4 @@
-"""Writing, opening and verifying `.fgs` files, version 1 (docs/format.md)."""
+"""Write, open and verify `.fgs` files of version 1 (docs/format.md)."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ __all__ = ["Container", "Section", "container_size", "read_header", "verify", "w
 VERSION = 1
 
 Ranges = dict[str, tuple[np.ndarray, np.ndarray]]
-"""(low, step) by field, each [channels, G] f32."""
+"""(low, step) of each field, [channels, G] f32 both."""
 
 
 def write_container(
     path: str | os.PathLike[str], quantized: QuantizedScene, settings: Mapping[str, Any], *, force: bool = False
 ) -> int:
-    """Write a quantized scene; the file appears under its name only when it is complete.
+    """Write a quantized scene into a file, which gets its name only when it is complete.
 
     Parameters
     ----------
@@ -45,14 +45,14 @@ def write_container(
     quantized : QuantizedScene
         From `quantize_scene`.
     settings : mapping
-        JSON values that say how the file was made: nothing that differs between runs or machines.
+        JSON values that tell how the file was made; nothing that differs between runs or machines.
     force : bool, optional
-        Replace a file that exists.
+        Replace an existing file.
 
     Returns
     -------
     int
-        Bytes of the file, as `container_size` predicts.
+        Bytes of the file, equal to `container_size`.
     """
     header = Header.of_scene(quantized, settings)
     block = encode_header(header)
@@ -81,24 +81,24 @@ def write_container(
 
 
 def read_header(path: str | os.PathLike[str]) -> Header:
-    """The checked header of a file; neither ranges nor chunks are read."""
+    """Read and check the header of a file; neither ranges nor chunks are read."""
     return Container(path).header
 
 
 class Container(SectionFile):
-    """A `.fgs` file whose header has been checked against the file's size.
+    """A file of version 1; its header is checked against the size of the file.
 
     Parameters
     ----------
     path : path
-        The file; opened for each read, never held.
+        The file is opened for each read, and never held open.
 
     Raises
     ------
     FormatError
-        When anything differs from the format; names the byte, what was wanted and what was found.
+        If anything differs from the format; the message names the byte, the expected and the found value.
     InputError
-        When the file cannot be read at all.
+        If the file cannot be read at all.
     """
 
     version = VERSION
@@ -115,7 +115,7 @@ class Container(SectionFile):
             self.header = self._read_header(file, size, _wrong_length, decode_header, wrong_size)
 
     def read_ranges(self) -> Ranges:
-        """The range tables of all fields, checked."""
+        """Read and check the range tables of all fields."""
         with self.open() as file:
             table = self.read_section(file, self.header.tables)
         numbers = np.frombuffer(table, "<f4").astype(np.float32, copy=False)
@@ -131,7 +131,7 @@ class Container(SectionFile):
         return ranges
 
     def read_chunk_table(self) -> list[ChunkEntry]:
-        """Place and checksum of every chunk, checked."""
+        """Read and check the place and checksum of every chunk."""
         section = self.header.chunk_table
         with self.open() as file:
             table = np.frombuffer(self.read_section(file, section), "<u4").reshape(-1, 2)
@@ -145,7 +145,7 @@ class Container(SectionFile):
         return entries
 
     def _check_ranges(self, field: str, low: np.ndarray, step: np.ndarray, offset: int) -> None:
-        """Every value that can come out must be finite; steps are zero or normal numbers."""
+        """Raise `FormatError` unless all values that codes can give are finite, and steps are zero or normal numbers."""
         codes = np.float32(2 ** self.header.bits.of(field) - 1)
         with np.errstate(over="ignore", invalid="ignore"):
             good = np.isfinite(low) & np.isfinite(low + codes * step) & ((step == 0) | (step >= SMALLEST_STEP))
@@ -160,14 +160,14 @@ class Container(SectionFile):
 
 
 def verify(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Section]:
-    """Check every byte of a file, reading it in pieces.
+    """Check every byte of a file, which is read in pieces.
 
     Parameters
     ----------
     path : path
         The file.
     raise_errors : bool, optional
-        False: damage after the header is reported as `ok=False` instead.
+        If False, report damage after the header as `ok=False` instead of raising an error.
 
     Returns
     -------
@@ -178,7 +178,7 @@ def verify(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Sect
     header = container.header
     found = Verification(header.block, raise_errors)
     found.check(header.tables, container.read_ranges)
-    # Without the table there is nothing to compare the chunks with: they count as damaged.
+    # Without a valid table the chunks cannot be compared with anything: they count as damaged.
     return found.check_chunks(container, header.chunk_table, container.read_chunk_table, header.chunks())
 
 

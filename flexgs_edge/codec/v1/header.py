@@ -1,4 +1,4 @@
-"""Where everything lies in a `.fgs` file of version 1: the header, its checks, and the arithmetic of sizes (docs/format.md)."""
+"""The header of a version 1 `.fgs` file: its fields, its checks, and the places and sizes of all sections (docs/format.md)."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from flexgs_edge.packed.quantize import QuantizedScene, group_count
 from flexgs_edge.scene.fields import FIELD, FIELDS
 
 CHUNK_ROWS = 65536
-"""Rows of a chunk: a multiple of 8, so that every plane is cut at a byte whatever its bits."""
+"""Rows of a chunk: a multiple of 8, so that each plane ends at a whole byte for any number of bits."""
 HEADER_STEP = 1024
 """Headers are padded to a multiple of this many bytes."""
 HEADER_MIN = 2048
-"""A normal header fits in this, so that the file's size does not depend on the digits of the figures in it."""
+"""Least bytes of a header; normal ones fit, so that the size of a file does not depend on the digits of its numbers."""
 HEADER_MAX = 1 << 20
 HEADER_OWN = 512
-"""Bytes that the header needs at most beside the settings (counts of 10 digits, numbers of 24)."""
+"""Most bytes of the header without the settings (counts of 10 digits, numbers of 24)."""
 _KEYS = ("bits", "count", "groups", "origin", "settings", "sh_count", "sh_degree")
 
 
 @dataclass(frozen=True)
 class Header:
-    """What the header of a container says.
+    """The header of a version 1 file.
 
     Parameters
     ----------
@@ -67,51 +67,51 @@ class Header:
 
     @classmethod
     def of_scene(cls, scene: QuantizedScene, settings: Mapping[str, Any]) -> Header:
-        """The header of a quantized scene; raises `InputError` for settings that JSON cannot hold."""
+        """Make the header of a quantized scene; raises `InputError` for settings that JSON cannot hold."""
         groups = {FIELD[name].bits: array.groups for name, array in scene.arrays.items()}
         x, y, z = (float(value) for value in scene.origin)
         counts = (scene.count, scene.sh_count, scene.sh_degree)
         return cls(*counts, (x, y, z), scene.bits, groups, dict(settings), header_block(settings))
 
     def rows(self, field: str) -> int:
-        """Rows that the array of `field` covers."""
+        """Rows of the array of `field`."""
         return self.sh_count if field == "sh_rest" else self.count
 
     def width(self, field: str) -> int:
-        """Channels of `field`."""
+        """Number of channels of `field`."""
         return FIELD[field].width(self.sh_degree)
 
     @property
     def tables(self) -> Section:
-        """The range tables (checksum included)."""
+        """Section of the range tables, with their checksum."""
         pairs = sum(self.width(field.name) * self.groups[field.bits] for field in FIELDS)
         return Section("ranges", PREAMBLE_BYTES + self.block, 8 * pairs + 4)
 
     @property
     def chunk_count(self) -> int:
-        """Row chunks."""
+        """Number of chunks."""
         return -(-self.count // CHUNK_ROWS)
 
     def chunk_rows(self, chunk: int, field: str) -> int:
-        """Rows of `field` in a chunk."""
+        """Rows of `field` in a chunk; SH cover fewer rows."""
         return min(max(self.rows(field) - chunk * CHUNK_ROWS, 0), CHUNK_ROWS)
 
     def chunk_bytes(self, chunk: int) -> int:
-        """Bytes of a chunk's planes."""
+        """Bytes of a chunk: all its planes."""
         return sum(
             self.width(field.name) * plane_bytes(self.chunk_rows(chunk, field.name), self.bits.of(field.name))
             for field in FIELDS
         )
 
     def planes(self, chunk: int) -> Iterator[tuple[str, int, int]]:
-        """(field, channel, bytes) of every plane of a chunk in the order of the file."""
+        """Yield (field, channel, bytes) of each plane of a chunk, in the order of the file."""
         for field in FIELDS:
             length = plane_bytes(self.chunk_rows(chunk, field.name), self.bits.of(field.name))
             for channel in range(self.width(field.name)):
                 yield field.name, channel, length
 
     def chunks(self) -> Iterator[Section]:
-        """The row chunks in order."""
+        """Yield the sections of the chunks in order."""
         offset = self.tables.offset + self.tables.length
         for chunk in range(self.chunk_count):
             length = self.chunk_bytes(chunk)
@@ -120,18 +120,18 @@ class Header:
 
     @property
     def payload(self) -> int:
-        """Bytes of all chunks: a sum over fields, no walk over the chunks (a claimed count may be absurd)."""
+        """Bytes of all chunks. A sum over fields: a loop over chunks could be endless if a claimed count is absurd."""
         return sum(self.width(f.name) * plane_bytes(self.rows(f.name), self.bits.of(f.name)) for f in FIELDS)
 
     @property
     def chunk_table(self) -> Section:
-        """Lengths and checksums of the chunks (own checksum included)."""
+        """Section of the chunk table (lengths and checksums of chunks), with its own checksum."""
         offset = self.tables.offset + self.tables.length + self.payload
         return Section("chunk table", offset, 8 * self.chunk_count + 4)
 
     @property
     def file_size(self) -> int:
-        """Bytes of the whole file."""
+        """Bytes of the whole file, from the header alone."""
         return self.chunk_table.offset + self.chunk_table.length
 
 
@@ -150,13 +150,13 @@ def container_size(
     count, sh_count : int
         Rows, and rows with SH.
     sh_degree : int
-        The scene's; counts as 0 when `sh_count` is 0.
+        Degree of the scene; counts as 0 if `sh_count` is 0.
     bits : BitSpec
         Bits per code.
     groups : int, optional
         As for `quantize_scene`.
     settings : mapping, optional
-        Only needed when their JSON is longer than `HEADER_MIN - HEADER_OWN` bytes.
+        Needed only if their JSON is longer than `HEADER_MIN - HEADER_OWN` bytes.
     """
     if sh_degree == 0 or sh_count == 0:
         sh_degree = sh_count = 0
@@ -166,7 +166,7 @@ def container_size(
 
 
 def header_block(settings: Mapping[str, Any]) -> int:
-    """Bytes of the padded header: it depends on the length of the settings alone."""
+    """Bytes of the padded header; they depend only on the length of the settings."""
     wanted = len(canonical_json(dict(settings))) + HEADER_OWN
     block = max(HEADER_MIN, -(-wanted // HEADER_STEP) * HEADER_STEP)
     if block > HEADER_MAX:
@@ -175,14 +175,14 @@ def header_block(settings: Mapping[str, Any]) -> int:
 
 
 def encode_header(header: Header) -> bytes:
-    """The padded header of the file."""
+    """The bytes of a header, padded."""
     record = asdict(header)
     del record["block"]  # known from the preamble
     return canonical_json(record).ljust(header.block)
 
 
 def decode_header(block: bytes) -> Header:
-    """Read and check a padded header; raises `HeaderError` for anything but what `encode_header` can write."""
+    """Read and check a padded header; raises `HeaderError` for everything that `encode_header` does not write."""
     record = parse_json(block)
     if not isinstance(record, dict) or tuple(sorted(record)) != _KEYS:
         raise HeaderError(f"wanted an object with the keys {', '.join(_KEYS)}, got {shown(record)}")

@@ -1,4 +1,4 @@
-"""Quantized scenes as sources: from memory, and from a `.fgs` file by row range."""
+"""Read quantized scenes as sources, from memory or from a version 1 file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 
 
 class CodedSource(SceneSource):
-    """A scene whose values are dequantized where they are read."""
+    """A scene whose codes are dequantized when they are read."""
 
     @abstractmethod
     def quantized(self) -> QuantizedScene:
@@ -26,10 +26,10 @@ class CodedSource(SceneSource):
 
     @abstractmethod
     def _chunk(self, chunk: int) -> tuple[int, dict[str, QuantizedArray]]:
-        """The arrays that hold a chunk's rows, and the row at which their planes start."""
+        """The arrays with the rows of a chunk, and the row at which their planes start."""
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`; a chunk whose rows are sparse is dequantized from the first to the last of them."""
+        """See `SceneSource.read`; a chunk is dequantized from the first to the last of its rows, also if they are sparse."""
         rows, planes = self.begin_read(rows, fields, out)
         for chunk, wanted, place in by_chunk(rows, np.arange(0, self.count, CHUNK_ROWS)):
             first, arrays = self._chunk(chunk)
@@ -39,14 +39,14 @@ class CodedSource(SceneSource):
 
 
 class QuantizedSource(CodedSource):
-    """A quantized scene in memory.
+    """A quantized scene in memory, as a scene source.
 
     Parameters
     ----------
     scene : QuantizedScene
         Not copied.
     name : str, optional
-        For messages.
+        Name of the scene in messages.
     """
 
     def __init__(self, scene: QuantizedScene, name: str = "quantized scene") -> None:
@@ -56,7 +56,7 @@ class QuantizedSource(CodedSource):
         self._scene = scene
 
     def quantized(self) -> QuantizedScene:
-        """See `CodedSource.quantized`: the scene given."""
+        """See `CodedSource.quantized`; returns the given scene."""
         return self._scene
 
     def _chunk(self, chunk: int) -> tuple[int, dict[str, QuantizedArray]]:
@@ -64,7 +64,7 @@ class QuantizedSource(CodedSource):
 
 
 class FgsSource(CodedSource):
-    """A `.fgs` file as a scene. The ranges are held; chunks are read when touched, checked, and the last one is kept.
+    """A version 1 file as a scene. Memory holds the ranges and the last chunk; a chunk is read and checked when needed.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class FgsSource(CodedSource):
     Raises
     ------
     FormatError
-        When the file differs from the format, here or when a damaged chunk is read.
+        If the file differs from the format; a damaged chunk raises it when it is read.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -94,7 +94,7 @@ class FgsSource(CodedSource):
         self._last: tuple[int, dict[str, QuantizedArray]] | None = None
 
     def quantized(self) -> QuantizedScene:
-        """See `CodedSource.quantized`; reads and checks every chunk of the file."""
+        """See `CodedSource.quantized`; this reads and checks every chunk of the file."""
         header = self.container.header
         arrays = {
             field.name: self._array(
@@ -113,12 +113,12 @@ class FgsSource(CodedSource):
 
     def _chunk(self, chunk: int) -> tuple[int, dict[str, QuantizedArray]]:
         if self._last is None or self._last[0] != chunk:
-            self._last = None  # before the next one is read, not after: one chunk in memory, not two
+            self._last = None  # freed before the next chunk is read, so that memory holds one chunk
             self._last = (chunk, self._cut(chunk, self.container.read_chunk(self._table[chunk])))
         return chunk * CHUNK_ROWS, self._last[1]
 
     def _cut(self, chunk: int, data: bytes) -> dict[str, QuantizedArray]:
-        """The six arrays of a chunk's bytes (views, not copies)."""
+        """Split the bytes of a chunk into its six arrays (views, not copies)."""
         header = self.container.header
         packed = np.frombuffer(data, np.uint8)
         arrays = {}
@@ -138,7 +138,7 @@ class FgsSource(CodedSource):
 
 
 def _fill(array: QuantizedArray, first: int, rows: Rows, out: np.ndarray) -> None:
-    """Dequantize `rows` into `out` [c, n]; rows beyond the array (SH of rows that have none) are zero."""
+    """Dequantize `rows` into `out` [c, n]; rows beyond the array (rows without SH) become zero."""
     if isinstance(rows, slice):
         here = slice(min(rows.start, array.count), min(rows.stop, array.count))
         dequantize_part(array, first, here, out[:, : here.stop - here.start])

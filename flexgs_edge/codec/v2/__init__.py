@@ -1,1 +1,1 @@
-"""Container version 2: entropy-coded grids of the method `best`."""
+"""Container version 2: entropy-coded grid scenes, which the method `best` makes."""

@@ -1,4 +1,4 @@
-"""What each kind of value takes in a version 2 file: counted when it is written, so that nobody has to decode it to know."""
+"""Bytes of each kind of value in a version 2 file. The header stores them, so that `info` need not decode the chunks."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 COUNT_MOST = 2**53 - 1
-"""Bytes and rows at most: what every reader of JSON keeps exactly."""
+"""Largest number of bytes or rows: every JSON reader keeps integers up to here exactly."""
 
 
 @dataclass(frozen=True)
 class Channels:
-    """Bytes of the kinds of `channel_parts`, rounded, and the rows with SH of degree 1 or more, 2 or more, and so on."""
+    """Bytes of each kind in `channel_parts`, rounded, and the number of rows with SH of at least degree 1, 2 and so on."""
 
     bytes: tuple[int, ...]
     rows: tuple[int, ...]
 
     @classmethod
     def of(cls, taken: Mapping[str, float], rows: Sequence[int]) -> Channels:
-        """From the bytes of every alphabet by name, as `channel_bytes` gives them, and the rows of every degree from 1 on."""
+        """Make the record from the bytes of each alphabet (as in `channel_bytes`) and the rows of each degree from 1 on."""
         parts = channel_parts(len(rows)).values()
         return cls(tuple(round(sum(taken[part] for part in some)) for some in parts), tuple(map(int, rows)))
 
 
 def channel_parts(sh_degree: int) -> dict[str, tuple[str, ...]]:
-    """Kinds of value of version 2, and the alphabets that make them up."""
+    """The kinds of value in version 2, and the alphabets of each."""
     parts: dict[str, tuple[str, ...]] = {"position": ("position", "repeats")}
     parts |= {name: tuple(f"{name} {axis}" for axis in "xyz") for name in ("scale", "rotation")}
     parts |= {"opacity": ("opacity",), "dc": ("dc Y", "dc Co", "dc Cg"), "sh degree": ("sh degree",)}

@@ -1,4 +1,4 @@
-"""Where the chunks of a coded scene begin and end."""
+"""Split a coded scene into chunks of rows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CHUNK_ROWS = 65536
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """Rows [start, stop) of a scene, all of one layer."""
+    """Rows [start, stop) of a scene, all in one layer."""
 
     layer: int
     start: int
@@ -19,7 +19,7 @@ class Chunk:
 
 
 def plan_chunks(layers: list[int], chunk_rows: int = CHUNK_ROWS) -> list[Chunk]:
-    """The chunks of a scene whose layers have these numbers of rows."""
+    """The chunks of a scene, from the number of rows in each layer."""
     chunks, at = [], 0
     for layer, count in enumerate(layers):
         for start in range(at, at + count, chunk_rows):
@@ -29,11 +29,11 @@ def plan_chunks(layers: list[int], chunk_rows: int = CHUNK_ROWS) -> list[Chunk]:
 
 
 def least_bytes(rows: int) -> int:
-    """Smallest size of the chunk of so many rows: even, and a bit a row."""
+    """Least bytes of a chunk of so many rows: a bit a row, rounded up to an even number."""
     return -(-rows // 16) * 2
 
 
 def check_end(data: bytes, rows: int, used: int) -> None:
-    """Raise `StreamError` unless `used` bytes are the whole stream, or zeros fill it up to the least bytes of a chunk."""
+    """Raise `StreamError` unless `used` bytes are the whole stream, or only zeros pad it to the least size of a chunk."""
     if any(data[used:]) or (len(data) > used and len(data) != least_bytes(rows)):
         raise StreamError(f"stream: wanted {used} bytes, got {len(data)}")

@@ -1,4 +1,4 @@
-"""Writing, opening, cutting and verifying `.fgs` files, version 2 (docs/format.md)."""
+"""Write, open, cut and verify `.fgs` files of version 2 (docs/format.md)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def write_grid(
     encoded: Encoded | None = None,
     storage: Storage = IN_MEMORY,
 ) -> int:
-    """Encode a grid scene into a file, which appears under its name only when it is complete.
+    """Encode a grid scene into a file, which gets its name only when it is complete.
 
     Parameters
     ----------
@@ -51,22 +51,22 @@ def write_grid(
     grid : GridScene
         From `to_grid`.
     settings : mapping
-        JSON values that say how the file was made: nothing that differs between runs or machines.
+        JSON values that tell how the file was made; nothing that differs between runs or machines.
     force : bool, optional
-        Replace a file that exists.
+        Replace an existing file.
     chunk_rows : int, optional
-        Rows of a chunk, at most 65536.
+        Rows of a chunk, at most 65536 (default).
     device : Device, optional
-        Counts symbols, with the same result.
+        Counts and codes the symbols; the bytes are the same. NumPy by default.
     encoded : Encoded, optional
-        `encode_grid(grid, chunk_rows)`, where it is known already.
+        The result of `encode_grid(grid, chunk_rows)`, if the caller has it already.
     storage : Storage, optional
-        Where symbols lie until they are written.
+        Holds the symbols until they are written.
 
     Returns
     -------
     int
-        Bytes of the file, as `coded_size` predicts.
+        Bytes of the file, equal to `coded_size`.
     """
     encoded = encoded or encode_grid(grid, chunk_rows, device, storage)
     model = encoded.model.to_bytes()
@@ -90,7 +90,7 @@ def coded_size(
     encoded: Encoded | None = None,
     storage: Storage = IN_MEMORY,
 ) -> int:
-    """Exact bytes of the file that `write_grid` makes of these arguments."""
+    """Exact bytes of the file that `write_grid` makes of these arguments; as slow as writing it."""
     encoded = encoded or encode_grid(grid, chunk_rows, device, storage)
     header = _header(grid, encoded, len(encoded.model.to_bytes()), settings, chunk_rows)
     return header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes
@@ -99,12 +99,12 @@ def coded_size(
 def trim_container(
     source: str | os.PathLike[str], path: str | os.PathLike[str], max_size: int, force: bool = False
 ) -> int:
-    """Copy as many whole layers as fit into `max_size` bytes; returns the bytes of the new file.
+    """Copy as many whole layers as fit into `max_size` bytes, and return the bytes of the new file.
 
     Raises
     ------
     TargetError
-        When not even the first layer fits.
+        If not even the first layer fits.
     """
     container = GridContainer(source)
     if os.path.realpath(source) == os.path.realpath(path):
@@ -141,13 +141,13 @@ def _header(
 
 
 def _by_alphabet(model: Model, bits: np.ndarray) -> dict[str, float]:
-    """Bytes by the names of alphabets."""
+    """Bytes of each alphabet, by its name."""
     names = ["position", "repeats", *(group.kind.name for group in model.groups)]
     return dict(zip(names, (bits / 8).tolist(), strict=True))
 
 
 def _finish(file: BinaryIO, header: GridHeader, entries: Sequence[tuple[int, int]]) -> int:
-    """Write the chunk table and, last, the preamble; returns the size of the file."""
+    """Write the chunk table and, last, the preamble; return the size of the file."""
     file.write(checked(np.array(entries, "<u4").tobytes()))
     size = file.tell()
     block = encode_header(header)
@@ -157,19 +157,19 @@ def _finish(file: BinaryIO, header: GridHeader, entries: Sequence[tuple[int, int
 
 
 class GridContainer(SectionFile):
-    """A version 2 file whose header has been checked against the file's size.
+    """A file of version 2; its header is checked against the size of the file.
 
     Parameters
     ----------
     path : path
-        The file; opened for each read, never held.
+        The file is opened for each read, and never held open.
 
     Raises
     ------
     FormatError
-        When anything differs from the format; names the byte, what was wanted and what was found.
+        If anything differs from the format; the message names the byte, the expected and the found value.
     InputError
-        When the file cannot be read at all.
+        If the file cannot be read at all.
     """
 
     version = VERSION
@@ -186,7 +186,7 @@ class GridContainer(SectionFile):
             self.header = self._read_header(file, size, _wrong_length, decode_header, wrong_size)
 
     def read_model(self) -> Model:
-        """The model, checked."""
+        """Read and check the model."""
         header = self.header
         with self.open() as file:
             data = self.read_section(file, header.model)
@@ -196,7 +196,7 @@ class GridContainer(SectionFile):
             raise format_error(self.path, header.model.offset, f"model: {error}") from None
 
     def read_table(self) -> list[ChunkEntry]:
-        """Place and checksum of every chunk, checked: they must fill the file."""
+        """Read the place and checksum of every chunk, and check that the chunks fill the file."""
         section = self.header.table(self.size)
         with self.open() as file:
             table = np.frombuffer(self.read_section(file, section), "<u4").reshape(-1, 2)
@@ -219,7 +219,7 @@ class GridContainer(SectionFile):
         return entries
 
     def decode(self, model: Model, chunk: Chunk, entry: ChunkEntry, base_only: bool = False) -> ChunkCodes:
-        """The codes of a chunk, checked."""
+        """Decode and check the codes of a chunk; with `base_only`, stop before the SH."""
         return self._decode(model, chunk, entry, base_only, None)
 
     def decode_on(
@@ -227,7 +227,7 @@ class GridContainer(SectionFile):
         decode: Callable[[list[tuple[int, bytes]]], Sequence[Result | ValueError]],
         chunks: Sequence[tuple[Chunk, ChunkEntry]],
     ) -> list[Result]:
-        """What `decode` makes of the rows and bytes of some chunks; an error of a chunk is raised in its name."""
+        """Let `decode` work on the rows and bytes of some chunks; raise the error of a chunk with its name and place."""
         jobs = [(chunk.stop - chunk.start, self.read_chunk(entry)) for chunk, entry in chunks]
         results: list[Result] = []
         for (_, entry), result in zip(chunks, decode(jobs), strict=True):
@@ -237,7 +237,7 @@ class GridContainer(SectionFile):
         return results
 
     def cost(self, model: Model, chunk: Chunk, entry: ChunkEntry, cost: np.ndarray) -> ChunkCodes:
-        """Decode a chunk, and add the bits of every alphabet in it to `cost`."""
+        """Decode a chunk, and add the bits of each of its alphabets to `cost` ([alphabets] f64)."""
         return self._decode(model, chunk, entry, False, cost)
 
     def _decode(
@@ -252,12 +252,12 @@ class GridContainer(SectionFile):
 
 
 def verify_grid(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Section]:
-    """Check every byte of a version 2 file, reading it in pieces; see `container.verify`."""
+    """Check every byte of a version 2 file, which is read in pieces; see `flexgs_edge.codec.v1.container.verify`."""
     container = GridContainer(path)
     header = container.header
     found = Verification(header.block, raise_errors)
     found.check(header.model, container.read_model)
-    # Without the table nothing says where a chunk ends.
+    # The end of a chunk stands only in the table.
     table = header.table(container.size)
     start = header.model.offset + header.model.length
     chunks = [Section("chunks", start, table.offset - start)]
@@ -272,9 +272,9 @@ def _wrong_length(length: int, left: int) -> str:
 def channel_bytes(
     path: str | os.PathLike[str], look: Callable[[Chunk, ChunkEntry, ChunkCodes], None] | None = None
 ) -> dict[str, float]:
-    """Bytes that each channel costs in a version 2 file, by name; the rest of the file by section.
+    """Bytes that each channel takes in a version 2 file, by name; the bytes of the other sections, by section.
 
-    All chunks are decoded for this; `look` sees each in turn.
+    This decodes all chunks. `look` is called with each decoded chunk.
     """
     container = GridContainer(path)
     model = container.read_model()

@@ -1,9 +1,9 @@
-"""What is known of a row before it is decoded: rows near it on the curve, and its own earlier channels.
+"""Predict a row from rows decoded before: its neighbours on the Morton curve, and its own earlier channels.
 
-Rows are coded in dyadic passes: first those at multiples of 2^top, then the odd multiples of 2^(top-1), and so on; every
-row has decoded rows on both sides, and a pass is one vector operation. All numbers are integers that float32 (features
-of one row) or float64 (weighted sums) hold exactly, so that decoders agree to the bit; neighbour weights take single
-float32 operations in a written order.
+Rows are coded in dyadic passes: first the multiples of 2^top, then the odd multiples of 2^(top-1), and so on. Each row of a
+pass thus has decoded rows on both sides, and each pass is one vector operation. All numbers are integers that float32
+(features of one row) or float64 (weighted sums) hold exactly, so that all decoders agree to the bit. Neighbour weights are
+computed by single float32 operations in a fixed order.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from flexgs_edge.codec.v2.features import Features
 from flexgs_edge.constants import COARSE_ROWS, VALUE_LIMIT
 
 REACH = (4, 2)
-"""Neighbours on each side for the base channels, and for SH. SH are many, so half the reach saves time there and costs
-few bits: docs/results/tuning.md#codec"""
+"""Neighbours on each side: for base channels, then for SH. SH have many channels, so they take fewer neighbours, which saves
+time and costs few bits: docs/results/tuning.md#codec"""
 ONE = 256
-"""Features count in 1/256 of a code."""
+"""Features are integers in units of 1/256 of a code."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """Some rows of one pass and where their neighbours lie.
+    """Rows of one pass, and their neighbours.
 
     Parameters
     ----------
@@ -33,9 +33,9 @@ class Pass:
     known : slice
         The rows decoded before.
     weights : np.ndarray or None
-        [2 * reach, m] f32 weights of the neighbours, about 256 in all; None for the first pass.
+        [2 * reach, m] f32 weights of the neighbours, with a sum of about 256; None for the first pass.
     stride : int
-        1, or so many rows of the pass for each one of `rows`.
+        `rows` holds one in so many rows of the pass; 1 for all.
     """
 
     rows: slice
@@ -46,23 +46,23 @@ class Pass:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """All passes, and for each row 256 * bits of the squared distance to its nearest neighbour (0 in the first pass)."""
+    """All passes, and a feature of each row: 256 * bits of the squared distance to the nearest neighbour (0 in the first)."""
 
     passes: list[Pass]
     near: Features
 
 
 def plan_passes(position: np.ndarray, reach: int, stride: int = 1) -> Plan:
-    """The passes over rows at `position` ([3, n] integer cells).
+    """Plan the passes over the rows of a chunk.
 
     Parameters
     ----------
     position : np.ndarray
-        [3, n].
+        [3, n], integer cells.
     reach : int
         Neighbours on each side.
     stride : int, optional
-        One row in so many of every pass is wanted: a sample.
+        Take a sample of one in so many rows of each pass; 1 by default, for all rows.
     """
     count = position.shape[1]
     near = Features(1, count)
@@ -93,20 +93,20 @@ def plan_passes(position: np.ndarray, reach: int, stride: int = 1) -> Plan:
 
 
 def _neighbours(known: np.ndarray, count: int, reach: int, stride: int) -> np.ndarray:
-    """[2 * reach, count] of both sides of `count` rows: row j lies between `known` j and j + 1; ends are repeated."""
+    """[2 * reach, count], the neighbours of `count` rows: row j lies between `known` j and j + 1. The ends are repeated."""
     padded = np.concatenate([np.repeat(known[:1], reach - 1), known, np.repeat(known[-1:], reach)])
-    # Overlapping views of one array. as_strided makes the same, but slowly.
+    # Overlapping views of one array; as_strided does the same, but slowly.
     step = padded.itemsize
     return np.ndarray((2 * reach, count), padded.dtype, padded, 0, (step, stride * step))
 
 
 def neighbour_features(values: np.ndarray, step: Pass) -> tuple[np.ndarray, ...]:
-    """Weighted mean and spread of the neighbours of a pass, each [m] f32 in 1/256; nothing in the first pass.
+    """Weighted mean and spread of the neighbours in a pass, each [m] f32 in 1/256; an empty tuple in the first pass.
 
     Parameters
     ----------
     values : np.ndarray
-        [n] f32 values of the channel, of which those at `step.known` are decoded.
+        [n] f32 values of the channel; those at `step.known` are decoded.
     step : Pass
         The pass.
     """
@@ -114,7 +114,7 @@ def neighbour_features(values: np.ndarray, step: Pass) -> tuple[np.ndarray, ...]
         return ()
     reach, count = len(step.weights) // 2, step.weights.shape[1]
     there = _neighbours(values[step.known], count, reach, step.stride)
-    # All products and sums are integers that float32 holds: their order does not matter.
+    # All products and sums are integers that float32 holds, so their order does not matter.
     parts = step.weights * there
     mean = np.add.reduce(parts, axis=0)
     middle = mean * np.float32(1 / ONE)
@@ -127,6 +127,6 @@ def neighbour_features(values: np.ndarray, step: Pass) -> tuple[np.ndarray, ...]
 
 
 def limited(values: np.ndarray) -> np.ndarray:
-    """Values [n] as f32 that predictions may use."""
+    """Clip values [n] to the range that predictions use, as f32."""
     kept: np.ndarray = values.astype(np.float32)
     return np.clip(kept, np.float32(-VALUE_LIMIT), np.float32(VALUE_LIMIT), out=kept)

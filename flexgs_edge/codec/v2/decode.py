@@ -1,4 +1,4 @@
-"""Decode a chunk of a coded scene with NumPy."""
+"""Decode a chunk of a version 2 file with NumPy: the specification of the decoding kernel."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from flexgs_edge.codec.v2.walk import ChunkCodes, walk_chunk
 def decode_chunk(
     model: Model, rows: int, data: bytes, base_only: bool = False, cost: np.ndarray | None = None
 ) -> ChunkCodes:
-    """The codes of a chunk; raises `StreamError` for bytes that no encoder wrote.
+    """Decode the codes of a chunk; raises `StreamError` for bytes that no encoder writes.
 
     Parameters
     ----------
     model : Model
-        Of the file.
+        The model of the file.
     rows : int
         Rows of the chunk.
     data : bytes
-        All of the chunk.
+        The whole chunk.
     base_only : bool, optional
-        Leave out the SH.
+        Stop before the SH; False by default.
     cost : np.ndarray, optional
-        [alphabets] f64: bits of each alphabet are added to it.
+        [alphabets] f64, to which the bits of each alphabet are added.
     """
     stream = Decoder(data, lane_count(rows))
     codes = walk_chunk(rows, model.depth, model.sh_degree, DecodePort(model, stream, cost), None, base_only)

@@ -26,14 +26,14 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.curve import morton
 
 SAMPLE_CHUNKS = 2
-"""Chunks that the predictions are fitted to; tables count all of them."""
+"""Chunks that the predictions are fitted to; the tables count the symbols of all chunks."""
 SAMPLE_ROWS = 16384
-"""Predictions are fitted to about as many rows of each of them. All rows would take longer and gain hardly a bit:
+"""Rows of each such chunk that the fit uses, about. All rows would take longer and save hardly a bit:
 docs/results/tuning.md#codec"""
 
 
 def cells_of(grid: GridScene, storage: Storage = IN_MEMORY) -> tuple[np.ndarray, np.ndarray, int]:
-    """[n] u64 Morton indices, the lowest cell [3] i64, and the depth of the cube that holds the scene."""
+    """Morton indices of the rows ([n] u64), the lowest cell ([3] i64), and the depth of the cube that holds the scene."""
     if grid.count == 0:
         return np.zeros(0, np.uint64), np.zeros(3, np.int64), 0
     low = grid.position.min(axis=1).astype(np.int64)
@@ -54,7 +54,7 @@ def cells_of(grid: GridScene, storage: Storage = IN_MEMORY) -> tuple[np.ndarray,
 
 
 def chunk_codes(grid: GridScene, cells: np.ndarray, chunk: Chunk) -> ChunkCodes:
-    """The codes of one chunk."""
+    """Cut the codes of one chunk out of the scene."""
     rows = slice(chunk.start, chunk.stop)
     scale, opacity, dc, rotation = (
         read_rows(values, rows) for values in (grid.scale, grid.opacity, grid.dc, grid.rotation)
@@ -70,7 +70,7 @@ def chunk_codes(grid: GridScene, cells: np.ndarray, chunk: Chunk) -> ChunkCodes:
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """A grid scene in memory as it will lie in a file; `bits` is the information in the symbols of each alphabet."""
+    """A fitted model, and the symbols of a scene for its file; `bits` is the information in the symbols of each alphabet."""
 
     model: Model
     low: np.ndarray
@@ -79,20 +79,20 @@ class Encoded:
     batches: list[list[Batch]]
     bits: np.ndarray
     device: Device | None = None
-    """What writes the streams; None: NumPy."""
+    """The device that codes the streams; None for NumPy."""
     written: tuple[bytes, ...] | None = None
-    """The streams, if they are there already."""
+    """The coded streams, if they are made already."""
 
     @property
     def information(self) -> float:
-        """Bytes of the model and of all symbols. The streams take a little more."""
+        """Bytes of the model and the information in all symbols, a lower bound: the streams take a little more."""
         return float(self.bits.sum()) / 8 + len(self.model.to_bytes())
 
     @property
     def sh_bytes(self) -> float:
-        """What the SH cost: the information in their symbols (the rows' degrees among them), and their part of the model.
+        """Bytes of the SH: the information in their symbols and in the rows' SH degrees, and their part of the model.
 
-        Coding the scene again without them would save this, but for the header's and the lanes' bytes.
+        A file without SH would be smaller by this, apart from a few bytes of the header and of the lanes.
         """
         if self.model.sh_degree == 0:
             return 0.0
@@ -100,7 +100,7 @@ class Encoded:
         return bits / 8 + len(self.model.to_bytes()) - len(self.model.to_bytes(with_sh=False))
 
     def streams(self) -> Iterator[bytes]:
-        """The bytes of every chunk in order, each made when it is asked for or one before."""
+        """Yield the stream of each chunk in order; each one is coded when it is asked for, or one step earlier."""
         if self.written is not None:
             yield from self.written
             return
@@ -112,17 +112,24 @@ class Encoded:
         yield from in_order(lambda pair: encode_chunk(self.model, *pair), pairs, thread_count(len(pairs)))
 
     def finished(self) -> Encoded:
-        """The same with its streams, the bytes of a file, in place of its symbols, which are several times as many."""
+        """A copy that holds the coded streams in place of the symbols, which are several times larger."""
         return replace(self, written=tuple(self.streams()), batches=[])
 
 
 def encode_grid(
     grid: GridScene, chunk_rows: int = CHUNK_ROWS, device: Device | None = None, storage: Storage = IN_MEMORY
 ) -> Encoded:
-    """Fit a model to a scene and count its symbols; `Encoded.streams` gives the chunks.
+    """Fit a model to a scene and count its symbols; `Encoded.streams` then codes the chunks.
 
-    Holds two or three bytes a coded number beside the grid itself; with a device, which gives the same result, a kilobyte
-    a row of as many chunks as it works on at once. The bytes for each number lie in `storage`.
+    Parameters
+    ----------
+    grid : GridScene
+    chunk_rows : int
+        Most rows of a chunk.
+    device : Device, optional
+        Counts the symbols, with the same result. It takes a kilobyte for each row of the chunks in work.
+    storage : Storage
+        Holds the symbols: two or three bytes a code beside the grid.
     """
     cells, low, depth = cells_of(grid, storage)
     layers = np.bincount(grid.layer, minlength=1).tolist()
@@ -157,7 +164,7 @@ def encode_grid(
     model = Model(
         grid.sh_degree, depth, groups, [mapping for mapping, _ in merged], levels, list(map(tables_of, levels))
     )
-    # Zero frequencies belong to zero counts.
+    # A frequency is zero only if the count is zero.
     costs = (
         float((n * (PRECISION - np.log2(np.maximum(t.freqs, 1)))).sum()) for (_, n), t in zip(merged, model.tables)
     )
@@ -165,7 +172,7 @@ def encode_grid(
 
 
 def _put_away(batches: list[Batch], storage: Storage) -> list[Batch]:
-    """The batches of a chunk in one array of `storage`."""
+    """Move the batches of a chunk to one array of `storage`."""
     if not storage.spills:
         return batches
     size = sum(len(c) + len(s) + sum(len(values) for _, values in raw) for _, c, s, raw in batches)
@@ -186,7 +193,7 @@ def _put_away(batches: list[Batch], storage: Storage) -> list[Batch]:
 def _counted_on(
     device: Device, grid: GridScene, cells: np.ndarray, chunks: list[Chunk], depth: int, groups: list[Group]
 ) -> Iterator[CountPort]:
-    """Ports of all chunks, their channels counted by a device."""
+    """Yield the ports of all chunks; a device counts their channels."""
     at_once = thread_count(len(chunks))
     rows = max((chunk.stop - chunk.start for chunk in chunks), default=0)
     kernel = CountKernel(device, groups, grid.sh_degree, rows, at_once)
@@ -216,7 +223,7 @@ def _walk(grid: GridScene, cells: np.ndarray, chunk: Chunk, depth: int, port: Fi
 
 
 def encode_chunk(model: Model, rows: int, batches: list[Batch]) -> bytes:
-    """The stream of a chunk: at least a bit a row, so that a file's size bounds the rows that it can claim."""
+    """The stream of a chunk. It has at least a bit a row, so that the size of a file bounds the rows it can claim."""
     return _fill_encoder(model, rows, batches).finish().ljust(least_bytes(rows), b"\0")
 
 
@@ -230,7 +237,7 @@ def _fill_encoder(model: Model, rows: int, batches: list[Batch]) -> Encoder:
 
 
 def _streams_on(device: Device, model: Model, pairs: list[tuple[int, list[Batch]]]) -> Iterator[bytes]:
-    """`encode_chunk` of all chunks (rows and batches of each) by a device."""
+    """`encode_chunk` of all chunks (rows and batches of each) on a device."""
     at_once = thread_count(len(pairs))
     groups = [pairs[first : first + at_once] for first in range(0, len(pairs), at_once)]
 

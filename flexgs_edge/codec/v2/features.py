@@ -1,7 +1,7 @@
-"""What a prediction is made of: numbers known for all rows of a channel at once, and their weighted sums.
+"""Features of rows and their weighted sums, from which a channel is predicted.
 
-All features, weights and sums are integers. Where a bound on the sum says that float32 holds it exactly, it is added up
-in float32, else in float64: the same numbers, at half the cost.
+All features, weights and sums are integers. We add them up in float32 if a bound shows that it holds the sum exactly, else
+in float64. Both give the same numbers; float32 takes half the time.
 """
 
 from __future__ import annotations
@@ -12,25 +12,25 @@ from dataclasses import dataclass
 import numpy as np
 
 EXACT = float(1 << 23)
-"""Sums below this, and halves of 2^16 added to them, are exact in float32."""
+"""Sums below this bound are exact in float32, also with halves of 2^16 added."""
 _PRODUCT = 1 << 17
-"""Products of a matrix product at a time: below twice this many OpenBLAS starts no threads, which cost more than they do."""
+"""Products of one matrix product. From twice as many, OpenBLAS starts threads, which cost more than they save."""
 
 
 class Features:
-    """Rows of numbers, and the largest of each.
+    """Features of all rows, and a bound on each feature.
 
     Parameters
     ----------
     width, count : int
-        Features and rows.
+        Number of features and of rows.
 
     Attributes
     ----------
     values : np.ndarray
         [width, count] f32, integers in 1/256.
     largest : np.ndarray
-        [width] f64: no value is larger, in magnitude.
+        [width] f64, the largest magnitude of each feature.
     """
 
     def __init__(self, width: int, count: int) -> None:
@@ -38,7 +38,7 @@ class Features:
         self.largest = np.zeros(width)
 
     def seal(self, first: int = 0, stop: int | None = None) -> Features:
-        """Note the largest values after features [first, stop) were written."""
+        """Update `largest` after features [first, stop) were written."""
         part = self.values[first:stop]
         if part.shape[1]:
             self.largest[first:stop] = np.maximum(part.max(axis=1), -part.min(axis=1))
@@ -47,7 +47,7 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """Features [first, first + len(places)) of a matrix, and which weight of the group each takes."""
+    """Features [first, first + len(places)) of a matrix, and the places of their weights in a group."""
 
     places: Sequence[int]
     features: Features
@@ -55,25 +55,25 @@ class Term:
 
     @property
     def values(self) -> np.ndarray:
-        """[features, n] f32."""
+        """[features, n] f32, the values of these features."""
         return self.features.values[self.first : self.first + len(self.places)]
 
     @property
     def largest(self) -> np.ndarray:
-        """[features] f64."""
+        """[features] f64, the largest magnitudes of these features."""
         return self.features.largest[self.first : self.first + len(self.places)]
 
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Weighted sums over some features: [2, n], f32 or f64, and a bound on their magnitudes."""
+    """Two weighted sums for each row ([2, n], f32 or f64), and a bound on their magnitudes."""
 
     values: np.ndarray
     bound: float
 
 
 def constant(values: np.ndarray, count: int) -> Sums:
-    """The same two numbers in every row."""
+    """Sums that have the same two numbers in every row."""
     bound = float(np.abs(values).max())
     sums = np.empty((2, count), _kind(bound))
     sums[:] = values[:, None]
@@ -81,7 +81,7 @@ def constant(values: np.ndarray, count: int) -> Sums:
 
 
 def add_terms(before: Sums, weights: np.ndarray, terms: Sequence[Term]) -> Sums:
-    """Sums with further features ([2, f] f64 weights) in new arrays."""
+    """Add features with their weights ([2, f] f64) to sums, in new arrays."""
     bound = before.bound + sum(float((np.abs(weights[:, t.places]) @ t.largest).max()) for t in terms)
     sums = before.values.astype(_kind(bound))
     for term in terms:
@@ -97,7 +97,7 @@ def add_terms(before: Sums, weights: np.ndarray, terms: Sequence[Term]) -> Sums:
 
 
 def add_own(sums: Sums, rows: slice, weights: np.ndarray, own: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Two sums of `rows`, [m] each, with the features of their own neighbours ([2, 2] weights)."""
+    """Add the features of the rows' own neighbours ([2, 2] weights); returns both sums of `rows`, [m] each."""
     bound = sums.bound
     for weight, feature in zip(weights.T, own, strict=False):
         bound += float(np.abs(weight).max() * max(feature.max(), -feature.min()))

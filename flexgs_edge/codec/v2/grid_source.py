@@ -1,4 +1,4 @@
-"""Version 2 files as sources: chunks are decoded when touched, the last one is kept."""
+"""Read a version 2 file as a scene; chunks are decoded when they are read, and the last one is kept."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from flexgs_edge.scene.check import SH_LARGEST
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 
 _ROTATION_STEP_MOST = 2.0**38
-"""Three squares of this times 2^24 are finite in float32."""
+"""Bound up to which three squares of a rotation code (24 bits) times its step stay finite in float32."""
 
 
 class GridSource(SceneSource):
@@ -43,7 +43,7 @@ class GridSource(SceneSource):
     Raises
     ------
     FormatError
-        When the file differs from the format, here or when a damaged chunk is read.
+        If the file differs from the format; a damaged chunk raises it when it is read.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -53,8 +53,8 @@ class GridSource(SceneSource):
         self.count, self.sh_degree = header.count, header.sh_degree
         self.sh_count = self.count if self.sh_degree else 0
         self.origin = np.array(header.origin, np.float64)
-        # Codes times steps are finite; only the squares of absurdly large rotations and colours could leave float32. Checking
-        # the values would decode the file twice more.
+        # A code times a step is finite. Only squares of absurd rotations and colours could leave float32, so the steps tell
+        # enough. A check of the values would decode the file twice more.
         steps = header.grid_steps
         colour = CODE_LIMIT * max(steps.dc, *steps.sh, 0.0) * (1 + steps.chroma)
         self.valid = steps.rotation <= _ROTATION_STEP_MOST and colour <= SH_LARGEST
@@ -72,11 +72,11 @@ class GridSource(SceneSource):
 
     @property
     def threads(self) -> int:
-        """Chunks that this machine can decode at once."""
+        """Number of chunks that this machine decodes at once."""
         return thread_count(len(self._chunks))
 
     def grid(self) -> GridScene:
-        """The codes of the whole scene; decodes every chunk."""
+        """Decode every chunk, and return the codes of the whole scene."""
         count = len(self._chunks)
         if self._kernel is None:
             parts = list(in_order(lambda i: self._decode(i, False), range(count), self.threads))
@@ -104,7 +104,7 @@ class GridSource(SceneSource):
         )
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`; a chunk is decoded as a whole, without its SH where they are not asked for."""
+        """See `SceneSource.read`; a chunk is decoded as a whole, but without its SH if they are not asked for."""
         rows, planes = self.begin_read(rows, fields, out)
         base_only = "sh_rest" not in planes
         for chunk, wanted, place in by_chunk(rows, self._starts):
@@ -116,7 +116,7 @@ class GridSource(SceneSource):
         return planes
 
     def read_table(self, rows: slice, out: np.ndarray) -> np.ndarray:
-        """See `SceneSource.read_table`; a device makes the values of whole chunks."""
+        """See `SceneSource.read_table`; within `on_device`, the device computes the values of whole chunks."""
         if self._kernel is None:
             return super().read_table(rows, out)
         for chunk, wanted, place in by_chunk(rows, self._starts):
@@ -130,14 +130,14 @@ class GridSource(SceneSource):
 
     @contextmanager
     def on_device(self, device: Device, chunks: int) -> Iterator[None]:
-        """While this lasts, a device decodes: as many chunks at once as are given; the results are the same.
+        """Decode on a device inside this context, several chunks at once; the results are the same.
 
         Parameters
         ----------
         device : Device
-            A kernel backend whose work-items run as threads of a processor do.
+            A kernel backend whose work-items run as threads of a processor.
         chunks : int
-            See `device_bytes`.
+            Chunks decoded at once; see `device_bytes` for their memory.
         """
         longest = max((entry.section.length for entry in self._entries), default=0)
         self._kernel = ChunkKernel(device, self._model, self._most_rows, longest, chunks)
@@ -149,7 +149,7 @@ class GridSource(SceneSource):
             self._ready.clear()
 
     def device_bytes(self, chunks: int) -> int:
-        """Bytes that decoding so many chunks at once to a PLY takes on a device, and for their rows in host memory."""
+        """Bytes, on the device and in host memory, for decoding so many chunks at once to rows of a PLY."""
         table = 4 * self._most_rows * (17 + self.width("sh_rest"))
         longest = max((entry.section.length for entry in self._entries), default=0)
         each = ChunkKernel.bytes_of(self._most_rows, self.sh_degree) + 3 * table + longest + (1 << 14)
@@ -162,12 +162,12 @@ class GridSource(SceneSource):
 
     @contextmanager
     def whole_in_order(self, threads: int) -> Iterator[None]:
-        """While this lasts, all fields of all rows are read from the first to the last: chunks are decoded ahead.
+        """Decode chunks ahead inside this context, in which all fields of all rows are read from first to last.
 
         Parameters
         ----------
         threads : int
-            As many chunks are held beside the one that is read; 1: none. A device decodes as many ahead as it does at once.
+            Chunks that are held beside the current one; 1 decodes none ahead. A device decodes one group ahead.
         """
         if self._kernel is not None:
             self._tables = in_order(self._tables_of, self._groups(), 1, always=True)
@@ -189,12 +189,12 @@ class GridSource(SceneSource):
                     self._last = (chunk, False, part)
                     break
         if self._last is None or self._last[0] != chunk or (self._last[1] and not base_only):
-            self._last = None  # before the next one is decoded, not after: one chunk in memory, not two
+            self._last = None  # freed before the next chunk is decoded, so that memory holds one chunk
             self._last = (chunk, base_only, self._decode(chunk, base_only))
         return self._last[2]
 
     def _groups(self) -> list[range]:
-        """Chunks that the device decodes at once."""
+        """Groups of chunks that the device decodes at once."""
         assert self._kernel is not None
         count, size = len(self._chunks), self._kernel.chunks
         return [range(start, min(start + size, count)) for start in range(0, count, size)]
@@ -217,7 +217,7 @@ class GridSource(SceneSource):
 
     def _table(self, chunk: int) -> np.ndarray:
         if chunk not in self._ready:
-            # Kept no longer than it takes: the next ones are in work.
+            # Freed before the next group is taken: that one is decoded already.
             self._ready.clear()
             while self._tables is not None and chunk not in self._ready:
                 coming = next(self._tables, None)
@@ -256,7 +256,7 @@ class GridSource(SceneSource):
 
 
 def _nothing(sh_degree: int) -> ChunkCodes:
-    """The codes of no rows."""
+    """The codes of a scene without rows."""
     base = {kind.name: np.zeros(0, np.int32) for kind in base_kinds()}
     return ChunkCodes(
         np.zeros(0, np.uint64),

@@ -1,4 +1,4 @@
-"""Groups of channels that share one prediction and one set of tables: the fitted half of the format."""
+"""Groups of channels: each group shares one fitted prediction, one alphabet and one set of tables, all stored in the file."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from flexgs_edge.codec.v2.tables import CONTEXTS_MOST, SYMBOLS_MOST
 _HEAD = struct.Struct("<iBiHBBB")
 MEAN_BUCKETS = 12
 SPREAD_BUCKETS = 5
-"""Contexts of symbols that are values: 12 times 5. More contexts gain less than their tables cost:
-docs/results/tuning.md#codec"""
+"""Contexts of a group of values: 12 of the predicted value times 5 of the predicted error. More contexts gain less than
+their tables cost: docs/results/tuning.md#codec"""
 RESIDUAL_BUCKETS = 12
-"""Contexts of symbols that are residuals: 12 times the side of the rounding."""
+"""Contexts of a group of residuals: 12 of the predicted error times 2, the side that the prediction is rounded to."""
 SYMBOL_ROOM = 192
-"""Symbols of an alphabet that are fitted to the values: a finer step gives raw low bits, not a longer table."""
+"""Most symbols of a fitted alphabet. For more values, the low bits are coded raw, and the alphabet stays short."""
 _RARE = 2000
-"""One in so many values may lie outside the alphabet at either end: an escape costs 32 bits more."""
+"""One in so many values may lie outside the alphabet at either end; such an escape costs 32 more bits."""
 _RARE_FEW = 8
-"""And as many as this (in 50 each) where values are few, so that one outlier does not stretch the alphabet."""
+"""If values are few, up to 8 of them, but at most one in 50, may lie outside: one outlier must not widen the alphabet."""
 _FAR = 4
-"""Samples with a number beyond so many times all but the rare ones are not fitted to: one would outweigh the rest."""
+"""The fit leaves out samples with a number so many times beyond the usual ones: one of them would outweigh the rest."""
 
 
 @dataclass(frozen=True)
 class GroupKind:
-    """What the format fixes for a group.
+    """The properties of a group that the format fixes.
 
     Parameters
     ----------
     name : str
-        For reports.
+        For reports and error messages.
     features : int
-        Numbers that its prediction takes.
+        Number of features of its prediction.
     residual : bool
-        Whether symbols are differences from the prediction, or values.
+        Symbols are differences from the prediction; if False, they are the values.
     sh : bool
-        Whether a scene without SH has none of it.
+        A scene without SH does not have this group.
     """
 
     name: str
@@ -53,7 +53,7 @@ class GroupKind:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """The fitted numbers of a group.
+    """A group with its fitted numbers.
 
     Parameters
     ----------
@@ -62,14 +62,14 @@ class Group:
     low : int
         Code of symbol 0.
     shift : int
-        Low bits that are coded raw.
+        Number of low bits that are coded raw.
     symbols : int
-        Size of the alphabet; the last symbol is the escape, unless nothing was escaped.
+        Size of the alphabet. The last symbol is the escape, unless nothing was escaped.
     weights : np.ndarray
-        [2, features + 1] i16, in 1/256: of the value, and of the size of the error; the constant last.
+        [2, features + 1] i16, in 1/256: weights of the value, then of the size of the error; the constant comes last.
     cuts : tuple of np.ndarray
-        Thresholds [<= 15] i32, ascending: of the predicted value in 1/16 (residual groups: none, the side of the
-        rounding is taken), and of the predicted error in 1/64.
+        Two lists of thresholds, [<= 15] i32 each, ascending: of the predicted value in 1/16, and of the predicted error in
+        1/64. The first list is empty for residuals: the side of the rounding takes its place.
     """
 
     kind: GroupKind
@@ -82,34 +82,39 @@ class Group:
 
     @property
     def contexts(self) -> int:
-        """Number of contexts."""
+        """Number of contexts of a symbol."""
         means = 2 if self.kind.residual else len(self.cuts[0]) + 1
         return means * (len(self.cuts[1]) + 1)
 
     @property
     def start(self) -> int:
-        """What is added to every symbol: the code of symbol 0, and in groups of residuals the centre."""
+        """Number added to every symbol: the code of symbol 0, plus the centre if symbols are residuals."""
         return self.centre * self.kind.residual + self.low
 
     def known(self, terms: Sequence[Term], count: int, before: Sums | None = None) -> Sums:
-        """The part of the prediction of `count` rows that features known for all of them make, added to a part before."""
+        """Add the features that are known for all `count` rows to the prediction; `before` holds what was added so far."""
         weights = self.weights.astype(np.float64)
         return add_terms(constant(256 * weights[:, -1], count) if before is None else before, weights, terms)
 
     def predict(self, known: Sums, rows: slice, own: Sequence[np.ndarray]) -> tuple[np.ndarray | float, np.ndarray]:
-        """What to subtract from the codes ([m] f32 or f64, or one number), and contexts [m] u8.
+        """Predict the codes of some rows.
 
         Parameters
         ----------
         known : Sums
-            From `known`, of all rows.
+            From `known`, for all rows.
         rows : slice
-            The rows.
+            The rows to predict.
         own : sequence of np.ndarray
-            Mean and spread of their neighbours, [m] f32 each; none in the first pass.
+            Mean and spread of the rows' neighbours, [m] f32 each; empty in the first pass.
+
+        Returns
+        -------
+        tuple
+            The base to subtract from the codes ([m] f32 or f64, or one number), and the contexts ([m] u8).
         """
         mean, error = add_own(known, rows, self.weights[:, :2].astype(np.float64), own)
-        # A threshold that float32 rounds lies beyond every sum that it holds.
+        # If float32 rounds a threshold, the threshold lies beyond every sum that float32 holds.
         spread = _bucket(error, [1024.0 * cut for cut in self.cuts[1].tolist()])
         levels = np.uint8(len(self.cuts[1]) + 1)
         start = float(self.start)
@@ -127,7 +132,7 @@ class Group:
         return whole.astype(np.float64) + start, side
 
     def to_bytes(self) -> bytes:
-        """The record of the file."""
+        """The group's record in the file."""
         head = _HEAD.pack(
             self.centre, self.shift, self.low, self.symbols, *(len(cut) for cut in self.cuts), bool(self.weights.any())
         )
@@ -136,7 +141,7 @@ class Group:
 
     @classmethod
     def read(cls, kind: GroupKind, data: bytes, at: int) -> tuple[Group, int]:
-        """A group's record at byte `at`, and the byte behind it."""
+        """Read a group's record at byte `at`; returns the group and the byte after the record."""
         if len(data) < at + _HEAD.size:
             raise StreamError(f"group {kind.name}: wanted {_HEAD.size} bytes, got {len(data) - at}")
         centre, shift, low, symbols, *lengths, weighted = _HEAD.unpack_from(data, at)
@@ -158,7 +163,7 @@ class Group:
 
 
 def _bucket(values: np.ndarray, cuts: Sequence[float]) -> np.ndarray:
-    """[m] u8: how many of the cuts are at most the value."""
+    """[m] u8, the number of cuts that are not larger than the value."""
     result, beyond = np.zeros(len(values), np.uint8), np.empty(len(values), bool)
     for cut in cuts:
         np.greater_equal(values, values.dtype.type(cut), beyond)
@@ -167,7 +172,7 @@ def _bucket(values: np.ndarray, cuts: Sequence[float]) -> np.ndarray:
 
 
 def fit_group(kind: GroupKind, batches: list[tuple[list[np.ndarray], np.ndarray]]) -> Group:
-    """Least-squares weights, thresholds at quantiles and the alphabet, from samples (features, codes)."""
+    """Fit a group to samples (features, codes): weights by least squares, thresholds at quantiles, and the alphabet."""
     empty = np.zeros(0, np.int32)
     codes = np.concatenate([code for _, code in batches]) if batches else np.zeros(0, np.int64)
     if codes.size == 0 or codes.min() == codes.max():
@@ -202,12 +207,12 @@ def fit_group(kind: GroupKind, batches: list[tuple[list[np.ndarray], np.ndarray]
 
 
 def _rare(count: int) -> int:
-    """How many of `count` numbers may be outliers, at either end."""
+    """Number of outliers among `count` values that each end of the alphabet leaves out."""
     return max(count // _RARE, min(_RARE_FEW, count // 50))
 
 
 def _usual(values: np.ndarray) -> np.ndarray:
-    """[m] bool: which values are no outliers."""
+    """[m] bool, False for outliers."""
     sizes = np.abs(values)
     last = len(sizes) - 1 - _rare(len(sizes))
     usual: np.ndarray = sizes <= _FAR * np.partition(sizes, last)[last] + _FAR * 256
@@ -215,12 +220,12 @@ def _usual(values: np.ndarray) -> np.ndarray:
 
 
 def _alphabet(symbols: np.ndarray) -> tuple[int, int, int]:
-    """Lowest code, raw low bits and size of an alphabet, with room for an escape at its end."""
+    """Lowest code, number of raw low bits, and size of the alphabet, with room for an escape at its end."""
     ordered = np.sort(symbols)
     rare = _rare(len(ordered))
     low, high = int(ordered[rare]), int(ordered[-1 - rare])
     span = high - low + 1
-    # A short range need not be cut: a symbol costs less than an escape.
+    # A short range is kept whole: a symbol costs less than an escape.
     if int(ordered[-1]) - int(ordered[0]) < SYMBOL_ROOM:
         low, span = int(ordered[0]), int(ordered[-1]) - int(ordered[0]) + 1
     shift = max((span - 1) // SYMBOL_ROOM, 0).bit_length()
@@ -236,16 +241,16 @@ def _quantiles(values: np.ndarray, count: int) -> np.ndarray:
 
 
 class _LeastSquares:
-    """[f] i16 weights in 1/256 for target ~ weights . features, all in 1/256.
+    """Least-squares weights ([f] i16 in 1/256) for target ~ weights . features, all in 1/256.
 
-    Features [f, m] are scaled to 13 bits, so that their products add up exactly and every machine finds the same weights.
+    Features [f, m] are scaled to 13 bits. Their products then add up exactly, so that every machine finds the same weights.
     """
 
     def __init__(self, features: np.ndarray) -> None:
         self.scales = np.array([_scale(row) for row in features])
         self.small = np.rint(features * self.scales[:, None])
         self.normal = self.small @ self.small.T
-        # A little of the mean square on the diagonal: constant and repeated features get small weights, not large ones.
+        # A small multiple of the identity keeps the weights of constant and repeated features small.
         self.normal[np.diag_indices_from(self.normal)] += features.shape[1]
 
     def __call__(self, target: np.ndarray) -> np.ndarray:
@@ -256,13 +261,13 @@ class _LeastSquares:
 
 
 def _scale(values: np.ndarray) -> float:
-    """The power of two that brings values to 13 bits."""
+    """The power of two that scales values to 13 bits."""
     largest: int = int(np.abs(values).max())
     return float(2.0 ** -max(largest.bit_length() - 13, 0))
 
 
 def _solve(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solution of a positive definite system by elimination in a fixed order (a library's order may differ)."""
+    """Solve a positive definite system by elimination in a fixed order; the order of a library may differ."""
     rows = np.append(normal, right[:, None], axis=1)
     size = len(right)
     for i in range(size):

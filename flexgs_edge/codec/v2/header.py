@@ -1,4 +1,4 @@
-"""The header of a `.fgs` file of version 2, its checks, and where everything lies (docs/format.md)."""
+"""The header of a version 2 `.fgs` file: its fields, its checks, and the places of all sections (docs/format.md)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
 
 HEADER_MOST = 1 << 20
 MODEL_MOST = 1 << 20
-"""Bytes of the model: 59 alphabets of 256 symbols and 64 tables stay below."""
+"""Most bytes of the model; 59 alphabets of 256 symbols and 64 tables need less."""
 LAYERS_MOST = 256
 
 _KEYS = (
@@ -48,7 +48,7 @@ _OPTIONAL = "channels"
 
 @dataclass(frozen=True)
 class GridHeader:
-    """What the header of a version 2 file says.
+    """The header of a version 2 file.
 
     Parameters
     ----------
@@ -57,11 +57,11 @@ class GridHeader:
     origin : tuple of float
         World position that positions are relative to.
     steps : dict
-        `StepSizes.to_json`.
+        The step sizes, from `StepSizes.to_json`.
     layers : tuple of int
         Rows of each layer.
     chunk_rows : int
-        Rows of a chunk; the last of a layer may have fewer.
+        Rows of a chunk; the last chunk of a layer may have fewer.
     depth : int
         Levels of the octrees.
     low : tuple of int
@@ -73,7 +73,7 @@ class GridHeader:
     cut_from : dict or None
         `bytes`, `count` and `layers` of the file that this one was cut from.
     channels : Channels or None
-        What is known without decoding; not of a file that was cut, nor of one that an early writer made.
+        Sizes that readers need not decode chunks for; None in files that were cut, and in files of early writers.
     """
 
     count: int
@@ -103,7 +103,7 @@ class GridHeader:
         settings: Mapping[str, Any],
         channels: Channels | None = None,
     ) -> GridHeader:
-        """The header of a scene; raises `InputError` for settings that JSON cannot hold."""
+        """Make the header of a scene; raises `InputError` for settings that JSON cannot hold."""
         x, y, z = (float(value) for value in grid.origin)
         a, b, c = (int(value) for value in low)
         header = cls(
@@ -122,54 +122,54 @@ class GridHeader:
         return header.sealed()
 
     def sealed(self) -> GridHeader:
-        """The header with its own length."""
+        """A copy with its own length filled in."""
         length = len(encode_header(self))
         if length > HEADER_MOST:
             raise InputError(f"settings: the header has {length} bytes of JSON, expected at most {HEADER_MOST}")
         return replace(self, block=length)
 
     def cut(self, layers: int, size: int) -> GridHeader:
-        """The header of the first `layers` layers of this file of `size` bytes."""
+        """The header for the first `layers` layers of this file, which has `size` bytes."""
         source = self.cut_from or {"bytes": size, "count": self.count, "layers": len(self.layers)}
         kept = self.layers[:layers]
         return replace(self, count=sum(kept), layers=kept, cut_from=source, channels=None).sealed()
 
     @property
     def grid_steps(self) -> StepSizes:
-        """The steps."""
+        """The step sizes."""
         return StepSizes.from_json(self.steps)
 
     @property
     def chunk_count(self) -> int:
-        """Chunks of all layers."""
+        """Number of chunks of all layers."""
         return sum(-(-rows // self.chunk_rows) for rows in self.layers)
 
     def chunks(self) -> list[Chunk]:
-        """The chunks in order."""
+        """The chunks in the order of the file."""
         return plan_chunks(list(self.layers), self.chunk_rows)
 
     @property
     def model(self) -> Section:
-        """The model (checksum included)."""
+        """Section of the model, with its checksum."""
         return Section("model", PREAMBLE_BYTES + self.block, self.model_bytes + 4)
 
     @property
     def table_bytes(self) -> int:
-        """Bytes of the chunk table (own checksum included)."""
+        """Bytes of the chunk table, with its checksum."""
         return 8 * self.chunk_count + 4
 
     def table(self, size: int) -> Section:
-        """The chunk table: the last part of a file of `size` bytes."""
+        """Section of the chunk table, at the end of a file of `size` bytes."""
         return Section("chunk table", size - self.table_bytes, self.table_bytes)
 
     @property
     def least_size(self) -> int:
-        """Bytes of the smallest file with this header: chunks have at least a bit a row."""
+        """Bytes of the smallest file with this header; a chunk has at least a bit a row."""
         return self.model.offset + self.model.length + self.table_bytes + self.count // 8
 
 
 def encode_header(header: GridHeader) -> bytes:
-    """The header's bytes."""
+    """The bytes of a header."""
     record = asdict(header)
     del record["block"], record["version"]  # known from the preamble
     if header.channels is None:
@@ -178,7 +178,7 @@ def encode_header(header: GridHeader) -> bytes:
 
 
 def decode_header(block: bytes) -> GridHeader:
-    """Read and check a header; raises `HeaderError` for anything but what `encode_header` can write."""
+    """Read and check a header; raises `HeaderError` for everything that `encode_header` does not write."""
     record = parse_json(block)
     if not isinstance(record, dict) or tuple(sorted(record.keys() - {_OPTIONAL})) != _KEYS:
         raise HeaderError(

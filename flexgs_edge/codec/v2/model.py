@@ -1,4 +1,4 @@
-"""Everything that chunks are decoded with, as the file's model section holds it."""
+"""The fitted model of a file, stored in its model section: predictions, contexts and frequency tables for all chunks."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from flexgs_edge.codec.v2.walk import base_kinds, sh_kinds
 from flexgs_edge.constants import RANS_PRECISION as PRECISION
 
 REPEATS_MOST = 16
-"""Symbols of the repeats; the last is the escape."""
+"""Symbols of the alphabet of repeats; the last one is the escape."""
 SHARED = 2
-"""Alphabets before those of the groups: of the octree, and of the repeats."""
+"""Alphabets that come before those of the groups: the octree's and that of the repeats."""
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Everything that chunks are decoded with.
+    """Everything that a decoder needs besides the stream of a chunk.
 
     Parameters
     ----------
     sh_degree, depth : int
-        Of the scene and of its octree.
+        SH degree of the scene, and depth of its octree.
     groups : list of Group
         Base channels, then SH.
     mappings : list of np.ndarray
-        The table of every context: of the octree, the repeats, then of the groups.
+        For each alphabet, [contexts] u8, the table of every context; alphabets are the octree, the repeats, the groups.
     levels : list of np.ndarray
-        Levels of the tables, in the same order.
+        For each alphabet, [tables, symbols] u8, the frequencies as the file stores them.
     tables : list of Tables
-        The tables.
+        For each alphabet, its frequency tables.
     """
 
     sh_degree: int
@@ -47,11 +47,11 @@ class Model:
 
     @cached_property
     def slots(self) -> list[np.ndarray]:
-        """First slot of the table of every context, as `Decoder.get_at` takes it."""
+        """For each alphabet, the first slot of every context's table, as `Decoder.get_at` takes it."""
         return [mapping.astype(np.intp) << PRECISION for mapping in self.mappings]
 
     def to_bytes(self, with_sh: bool = True) -> bytes:
-        """The model section of a file; without SH only to compare sizes."""
+        """The model section of a file; `with_sh=False` only serves to compare sizes."""
         chosen = [i for i, group in enumerate(self.groups) if with_sh or not group.kind.sh]
         records = b"".join(self.groups[i].to_bytes() for i in chosen)
         alphabets = [0, 1, *(i + SHARED for i in chosen)]
@@ -59,7 +59,7 @@ class Model:
 
     @classmethod
     def from_bytes(cls, data: bytes, sh_degree: int, depth: int) -> Model:
-        """Inverse of `to_bytes`; raises `StreamError`."""
+        """Inverse of `to_bytes`; raises `StreamError` for a damaged model."""
         groups, at = [], 0
         for kind in group_kinds(sh_degree):
             group, at = Group.read(kind, data, at)
@@ -71,12 +71,12 @@ class Model:
 
 
 def group_kinds(sh_degree: int) -> list[GroupKind]:
-    """All groups of a scene of this degree."""
+    """All groups of a scene with this SH degree."""
     return base_kinds() + sh_kinds(sh_degree)
 
 
 def tables_of(levels: np.ndarray) -> Tables:
-    """Tables of an alphabet; one that nothing was counted for gets its first symbol, which costs nothing."""
+    """Tables of an alphabet. If no symbol was counted, the first symbol gets all the frequency and costs nothing."""
     if not levels.any(axis=1).all():
         levels = levels.copy()
         levels[~levels.any(axis=1), 0] = 1

@@ -1,4 +1,4 @@
-"""Positions as the occupancy bytes of an octree, level by level from the root."""
+"""Code positions as an octree: one byte a node tells which of its children are occupied, level by level from the root."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ _CHILDREN = np.array([bin(byte).count("1") for byte in range(256)], np.uint8)
 _THREE = np.uint64(3)
 
 Code = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
-"""Codes one batch: contexts [m], and symbols [m] (None when decoding); gives the symbols."""
+"""Codes a batch: takes contexts [m] and symbols [m] (None to decode), and returns the symbols."""
 
 
 class TooManyNodes(ValueError):
-    """A level has more nodes than the chunk has rows."""
+    """A level of the octree has more nodes than the chunk has rows."""
 
 
 def walk_octree(depth: int, rows: int, code: Code, cells: np.ndarray | None = None) -> np.ndarray:
     """Code the set of occupied cells of a cube of 2^depth cells.
 
-    A node's byte has bit c set when child c is occupied; c is the next three bits of the Morton index. Nodes come in
-    Morton order; a batch a level.
+    Bit c of a node's byte is set if child c is occupied, where c is the next three bits of the Morton index. Nodes come in
+    Morton order, and each level is one batch.
 
     Parameters
     ----------
     depth : int
         0 to 21.
     rows : int
-        Limit of nodes in a level.
+        Most nodes of a level.
     code : callable
         Codes a batch.
     cells : np.ndarray, optional
-        [m] u64 Morton indices, ascending without repeats (None when decoding).
+        [m] u64 Morton indices, ascending without repeats; None to decode.
 
     Returns
     -------
@@ -46,7 +46,7 @@ def walk_octree(depth: int, rows: int, code: Code, cells: np.ndarray | None = No
         [m] u64 Morton indices of the occupied cells, ascending.
     """
     nodes = np.zeros(1, np.uint64)
-    children = np.zeros(1, np.uint8)  # of each node's parent
+    children = np.zeros(1, np.uint8)  # for each node, the number of its parent's children
     for level in range(depth - 1, -1, -1):
         context = min(level, LEVEL_CLASSES - 1) * CHILD_CLASSES + np.minimum(children, CHILD_CLASSES - 1)
         occupancy = code(context, None if cells is None else _occupancy(cells, level))
@@ -62,7 +62,7 @@ def walk_octree(depth: int, rows: int, code: Code, cells: np.ndarray | None = No
 
 
 def _occupancy(cells: np.ndarray, level: int) -> np.ndarray:
-    """[nodes] u8: bytes of the nodes that are 2^(level + 1) cells wide."""
+    """[nodes] u8, the bytes of the nodes that are 2^(level + 1) cells wide."""
     children = cells >> np.uint64(3 * level)
     children = children[np.flatnonzero(np.diff(children, prepend=~children[:1]))]
     parents = children >> _THREE
@@ -85,7 +85,7 @@ def unmorton(index: np.ndarray) -> np.ndarray:
 
 
 def _gather(bits: np.ndarray) -> np.ndarray:
-    """Every third bit, put together."""
+    """Keep every third bit, and move the kept bits together."""
     bits = bits & np.uint64(0x1249249249249249)
     for shift, mask in (
         (2, 0x10C30C30C30C30C3),

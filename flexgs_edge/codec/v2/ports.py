@@ -1,4 +1,4 @@
-"""The three ports of the walk over a chunk: one collects samples to fit to, one counts symbols, one decodes."""
+"""Three ports for the walk over a chunk (`walk_chunk`): one collects samples for the fit, one counts symbols, one decodes."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from flexgs_edge.constants import CODE_LIMIT
 from flexgs_edge.constants import RANS_TOTAL as TOTAL
 
 UNIFORM = [Tables(np.full((1, 1 << bits), TOTAL >> bits)) for bits in range(9)]
-"""Numbers of so many bits that are all equally likely."""
+"""Tables of raw numbers: for each number of bits, all values are equally likely."""
 
 Raw = tuple[int, np.ndarray]
 Batch = tuple[int, np.ndarray, np.ndarray, list[Raw]]
-"""Alphabet, contexts, symbols, and raw batches behind them."""
+"""Alphabet, contexts and symbols of a batch, and the raw batches that follow it."""
 
 
 def split(codes: np.ndarray, group: Group, base: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Symbols [m] u8, offsets [m] from the alphabet's lowest code in f64, and where symbols are escapes."""
+    """Split codes into symbols [m] u8, offsets [m] from the alphabet's lowest code, and the places of escapes."""
     offset = codes - np.float64(base) if isinstance(base, float) else codes - base
     symbols = np.floor(offset * 2.0**-group.shift) if group.shift else offset
     last = group.symbols - 1
@@ -32,7 +32,7 @@ def split(codes: np.ndarray, group: Group, base: np.ndarray | float) -> tuple[np
 
 
 class FitPort:
-    """Collects samples."""
+    """Collects samples (features and codes) for the fit of each group."""
 
     def __init__(self, groups: list[GroupKind], stride: int) -> None:
         self.kinds = groups
@@ -59,13 +59,13 @@ class FitPort:
             features[place] = feature
         for term in known:
             features[list(term.places)] = term.values[:, rows]
-        # Of every pass the same share: the weights are to fit the last ones, which have most rows.
+        # Each pass gives the same share of its rows, so the last passes, which have most rows, weigh most in the fit.
         self.samples[group].append((list(features), codes.copy()))
         return codes
 
 
 class CountPort:
-    """Counts symbols by context, and keeps the batches."""
+    """Counts symbols by context, and keeps the batches to code them later."""
 
     stride = 1
 
@@ -77,7 +77,7 @@ class CountPort:
         self.batches: list[Batch] = []
 
     def add(self, other: CountPort) -> None:
-        """Add another port's counts (whole numbers, so in any order)."""
+        """Add the counts of another port; they are integers, so the order does not matter."""
         for counts, more in zip(self.counts, other.counts, strict=True):
             counts += more
         self.raw += other.raw
@@ -123,7 +123,7 @@ class CountPort:
 
 
 def _raw(values: np.ndarray, bits: int) -> list[Raw]:
-    """The low `bits` of integers [m], at most 8 a batch, lowest first."""
+    """Split off the low `bits` of integers [m], in batches of at most 8 bits, lowest first."""
     if len(values) == 0 or bits == 0:
         return []
     values = values.astype(np.int64)
@@ -133,7 +133,7 @@ def _raw(values: np.ndarray, bits: int) -> list[Raw]:
 
 
 class DecodePort:
-    """Decodes batches, counting what each alphabet costs if asked."""
+    """Decodes batches; with `cost`, it adds up the bits of each alphabet."""
 
     stride = 1
 
@@ -190,7 +190,7 @@ class DecodePort:
             and abs(base) + last <= CODE_LIMIT
             and not (symbols == last).any()
         ):
-            # Values of a short alphabet, which most symbols are: no rounding to think of.
+            # Most symbols: values of a short alphabet, which fit in i32 without a check or rounding.
             return symbols.astype(np.int32) + np.int32(base)
         offset = symbols.astype(np.float64)
         if fitted.shift:

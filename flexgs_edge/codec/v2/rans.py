@@ -1,7 +1,8 @@
-"""Range asymmetric numeral systems (rANS; Duda 2013) over many lanes at once, with static tables in integers.
+"""Range asymmetric numeral systems (rANS; Duda 2013) over many lanes at once, with static tables and integers only.
 
-32-bit states at or above 2^16, 16-bit words, probabilities in 1/2^14. Every batch of symbols starts at lane 0 and goes
-round the lanes; one vector operation moves all lanes by one symbol, so NumPy pays its overhead once for a round.
+States have 32 bits and stay at or above 2^16, words have 16 bits, and probabilities are in 1/2^14. Every batch of symbols
+starts at lane 0 and goes round the lanes. One vector operation moves all lanes by one symbol, so that NumPy's overhead is
+paid once a round.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _FLOOR = np.uint32(FLOOR)
 
 
 def lane_count(rows: int) -> int:
-    """Lanes of a stream for `rows` rows: a power of two, one for at least 128 rows (4 bytes each, below 0.5 %).
+    """Lanes of a stream of `rows` rows: a power of two, at most one for 128 rows. A lane costs 4 bytes, so below 0.5 % in all.
 
     >>> [lane_count(rows) for rows in (0, 127, 256, 65536, 10**6)]
     [1, 1, 2, 512, 512]
@@ -30,7 +31,7 @@ def lane_count(rows: int) -> int:
 
 
 class StreamError(ValueError):
-    """A stream that no encoder wrote."""
+    """A stream that no encoder writes; the message tells what was wanted and what was found."""
 
 
 class Tables:
@@ -39,7 +40,7 @@ class Tables:
     Parameters
     ----------
     freqs : np.ndarray
-        [t, a] integers; every row adds up to 2^14. At most 2^16 symbols.
+        [t, a] integers: t tables of a <= 2^16 symbols. Every row adds up to 2^14.
     """
 
     def __init__(self, freqs: np.ndarray) -> None:
@@ -50,13 +51,13 @@ class Tables:
         starts = np.zeros_like(self.freqs)
         np.cumsum(self.freqs[:, :-1], axis=1, out=starts[:, 1:])
         self.entries = ((self.freqs << _SHIFT) | starts).reshape(-1)
-        """[t * a] u32: frequency and start of every symbol, 0 where the frequency is."""
+        """[t * a] u32, frequency and start of every symbol; 0 if the frequency is 0."""
         self._slots: np.ndarray | None = None
         self._moves: np.ndarray | None = None
 
     @property
     def slots(self) -> np.ndarray:
-        """[t * 2^14]: the symbol of every slot of every table."""
+        """[t * 2^14], the symbol of every slot of every table."""
         if self._slots is None:
             kind = np.uint8 if self.size <= 256 else np.uint16
             symbols = np.tile(np.arange(self.size, dtype=kind), len(self.freqs))
@@ -65,7 +66,7 @@ class Tables:
 
     @property
     def moves(self) -> np.ndarray:
-        """[t * 2^14] u32: frequency, and place in its symbol, of every slot: one look-up a step of the decoder."""
+        """[t * 2^14] u32, for every slot the frequency of its symbol and the slot's place in it: one look-up a decoded symbol."""
         if self._moves is None:
             freqs = self.freqs.reshape(-1)
             moves = np.repeat((freqs << _SHIFT) - (self.entries & _LOW), freqs)
@@ -74,12 +75,12 @@ class Tables:
         return self._moves
 
     def bits(self, tables: np.ndarray, symbols: np.ndarray) -> float:
-        """Information of symbols in bits (floating point, for reports only)."""
+        """Information of symbols in bits; in floating point, so for reports only."""
         return float((PRECISION - np.log2(self.freqs[tables, symbols])).sum())
 
 
 class Encoder:
-    """Collects batches in the order in which they will be decoded, and writes them backwards.
+    """Collects batches of symbols in decoding order, and codes them backwards.
 
     Parameters
     ----------
@@ -92,7 +93,7 @@ class Encoder:
         self._batches: list[np.ndarray] = []
 
     def put(self, tables: Tables, rows: np.ndarray, symbols: np.ndarray) -> None:
-        """Add a batch: `symbols` [m], each coded by row `rows` [m] of `tables`. Zero frequencies are the caller's bug."""
+        """Add a batch: `symbols` [m], each with its table `rows` [m] in `tables`. A symbol of frequency 0 is a bug."""
         place = rows.astype(np.intp)
         place *= tables.size
         place += symbols
@@ -103,13 +104,13 @@ class Encoder:
 
     @property
     def batches(self) -> list[np.ndarray]:
-        """Frequency and start of every symbol of the batches so far ([m] u32 each)."""
+        """Frequency and start of every symbol ([m] u32), batch by batch."""
         return self._batches
 
     def finish(self) -> bytes:
-        """The stream: the states of all lanes as u32, then words as u16."""
-        # Doubles hold states exactly, and their division is a vector instruction: a state and a frequency differ too
-        # much from 2^53 for a quotient to be rounded up to the next integer.
+        """Code the stream: the states of all lanes as u32, then the words as u16."""
+        # f64 holds states exactly, and its division is a vector instruction. A quotient cannot round up to the next
+        # integer, since states are far below 2^53.
         states = np.full(self.lanes, float(FLOOR))
         quotient, full = np.empty(self.lanes), np.empty(self.lanes, bool)
         words = []
@@ -139,7 +140,7 @@ class Encoder:
 
 
 def first_states(data: bytes, lanes: int) -> np.ndarray:
-    """[lanes] u32 states at the head of a stream, checked."""
+    """Read and check the [lanes] u32 states at the head of a stream."""
     if len(data) < 4 * lanes or len(data) % 2:
         raise StreamError(f"stream: wanted an even number of at least {4 * lanes} bytes, got {len(data)}")
     states = np.frombuffer(data, "<u4", lanes).astype(np.uint32)
@@ -149,7 +150,7 @@ def first_states(data: bytes, lanes: int) -> np.ndarray:
 
 
 class Decoder:
-    """Reads what `Encoder` wrote, batch by batch.
+    """Decodes the batches of an `Encoder` in order.
 
     Parameters
     ----------
@@ -165,8 +166,8 @@ class Decoder:
         self.lanes = lanes
         self._words = words.astype(np.uint32)
         self._at = 2 * lanes
-        # Constants as arrays: NumPy takes half a microsecond to make one of a number, as long as to go through 512 of them.
-        # Low bits are written into the lower halves of wide numbers, which can be added to slots as they are.
+        # Constants are arrays, since NumPy converts a Python number to an array in every call. Low bits are written into
+        # the lower halves of wide integers, which can be added to slots as they are.
         place = np.zeros(lanes, np.intp)
         halves = place.itemsize // 4
         self._work: tuple[np.ndarray, ...] = (
@@ -181,14 +182,14 @@ class Decoder:
         )
 
     def get(self, tables: Tables, rows: np.ndarray) -> np.ndarray:
-        """[m] symbols of the next batch (u8 or u16), each coded by row `rows` [m] of `tables`."""
+        """Decode the next batch: [m] symbols (u8 or u16), each with its table `rows` [m] in `tables`."""
         first = rows.astype(np.intp)
         first <<= PRECISION
         return self.get_at(tables, first)
 
     def get_at(self, tables: Tables, first: np.ndarray) -> np.ndarray:
-        """As `get`, with the first slot of each row: row * 2^14 ([m] intp, overwritten)."""
-        # Few calls on whole arrays: 512 numbers take a quarter of what NumPy takes to be called.
+        """As `get`, with the first slot of each table, row * 2^14 ([m] intp, overwritten)."""
+        # Few calls on whole arrays: a call costs NumPy more than its work on 512 numbers.
         take, words, begin = tables.moves.take, self._words, self._at
         state, (low_half, place, move, low, empty, lows, shifts, floors) = self._states, self._work
         for at in range(0, len(first), self.lanes):
@@ -220,17 +221,17 @@ class Decoder:
         return tables.slots.take(first)
 
     def finish(self) -> int:
-        """Bytes read; raises `StreamError` unless every lane is back in its first state."""
+        """Return the bytes read; raises `StreamError` unless every lane is back in its first state."""
         if (self._states != FLOOR).any():
             raise StreamError("stream: wanted every lane to end in its first state")
         return 2 * self._at
 
 
 def normalize(weights: Sequence[int] | np.ndarray) -> np.ndarray:
-    """Frequencies that add up to 2^14 in proportion to `weights` [a]; at least 1 where a weight is not 0.
+    """Frequencies in proportion to `weights` [a], with the sum 2^14 and at least 1 for each weight above 0.
 
-    Floor of the share, at least 1; what is missing or too much goes to the largest frequencies in turn: one unit each,
-    the first of equals first. Integers only, so that every decoder finds the same.
+    Each frequency is the floor of its share, but at least 1. The rest, positive or negative, goes to the largest frequencies
+    in turn, one unit each; of equal ones the first comes first. Integers only, so that all decoders agree.
     """
     weights = np.asarray(weights, np.int64)
     total = int(weights.sum())
@@ -240,7 +241,7 @@ def normalize(weights: Sequence[int] | np.ndarray) -> np.ndarray:
     order = np.argsort(-freqs, kind="stable")[: np.count_nonzero(weights)]
     missing = TOTAL - int(freqs.sum())
     while missing:
-        # Taking away must leave 1.
+        # A frequency may not fall below 1.
         able = order if missing > 0 else order[freqs[order] > 1]
         chosen = able[: abs(missing)]
         freqs[chosen] += 1 if missing > 0 else -1

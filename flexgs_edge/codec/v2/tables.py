@@ -1,4 +1,4 @@
-"""Frequency tables as the file stores them: few levels a frequency, coded against the table before."""
+"""Store frequency tables in a file: frequencies are rounded to few levels, and coded with the table before as context."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ import numpy as np
 from flexgs_edge.codec.v2.rans import Decoder, Encoder, StreamError, Tables, normalize
 
 LEVELS = 65
-"""Level 0 is absent; level v stands for the weight (4 + (v - 1) % 4) << (v - 1) // 4: steps of 14 to 25 %. They cost
-less than the bytes that finer levels would take in the file: docs/results/tuning.md#codec"""
+"""Levels of a frequency. Level 0 means absent; level v stands for the weight (4 + (v - 1) % 4) << (v - 1) // 4, in steps of
+14 to 25 %. Finer levels would cost more bytes in the file than they save: docs/results/tuning.md#codec"""
 SYMBOLS_MOST = 256
 CONTEXTS_MOST = 64
 ENTRY_BITS = 3.0
-"""About what one frequency costs in the file: contexts are merged until their tables pay."""
+"""Estimated bits of one frequency in the file; contexts are merged until their tables pay."""
 
 _CLASSES = 5
-"""Of a symbol in the first table of an alphabet; in a later one, by the level above: none, rare, often; of a mapping."""
+"""Classes of a level: in the first table; in later ones, if the level above is absent, rare or often; in a mapping."""
 _OFTEN = 20
 _LANES = 16
 _WEIGHTS = np.array([0] + [(4 + (v - 1) % 4) << ((v - 1) // 4) for v in range(1, LEVELS)], np.int64)
 
 
 def merge_contexts(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge contexts greedily while that saves bits: symbols cost more, frequencies to store become fewer.
+    """Merge contexts greedily as long as it saves bits: symbols cost more, but fewer frequencies are stored.
 
     Parameters
     ----------
     counts : np.ndarray
-        [c, a] i64 symbols seen in each context.
+        [c, a] i64, symbols counted in each context.
 
     Returns
     -------
     tuple of np.ndarray
-        [c] u8: the table of each context; [t, a] i64: counts of the tables (none when nothing was seen). Tables are
-        numbered by their first context; a context without symbols takes the first table.
+        [c] u8, the table of each context, and [t, a] i64, the counts of each table; t is 0 if no symbol was counted.
+        Tables are numbered by their first context. A context without symbols takes the first table.
     """
     used = np.flatnonzero(counts.any(axis=1))
     merged = np.array(counts[used], np.int64)
@@ -61,7 +61,7 @@ def merge_contexts(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _costs(counts: np.ndarray) -> np.ndarray:
-    """[t] bits of symbols and of their table, for counts [t, a]."""
+    """Bits of the symbols and of their table ([t]), for counts [t, a]."""
     total = counts.sum(axis=1)
     logs = np.log2(np.maximum(counts, 1))
     cost: np.ndarray = total * np.log2(np.maximum(total, 1)) - (counts * logs).sum(axis=1)
@@ -70,7 +70,7 @@ def _costs(counts: np.ndarray) -> np.ndarray:
 
 
 def to_levels(counts: np.ndarray) -> np.ndarray:
-    """[t, a] u8 levels nearest to counts [t, a], relative to their sum."""
+    """Round counts [t, a] to levels [t, a] u8, relative to the sum of each table."""
     total = np.maximum(counts.sum(axis=1, keepdims=True), 1)
     target = counts * (1 << 17) // total
     middles = (_WEIGHTS[1:] + np.append(_WEIGHTS[2:], _WEIGHTS[-1] * 2)) // 2
@@ -79,19 +79,19 @@ def to_levels(counts: np.ndarray) -> np.ndarray:
 
 
 def from_levels(levels: np.ndarray) -> Tables:
-    """Frequency tables of levels [t, a]."""
+    """Frequency tables of levels [t, a], in integers, so that all decoders agree."""
     return Tables(np.array([normalize(_WEIGHTS[row]) for row in levels]).reshape(len(levels), -1))
 
 
 def encode_tables(mappings: Sequence[np.ndarray], levels: Sequence[np.ndarray]) -> bytes:
-    """The contexts' tables and the levels of all alphabets in one small stream.
+    """Code the mappings and levels of all alphabets in one small stream.
 
     Parameters
     ----------
     mappings : sequence of np.ndarray
-        [c] u8 each.
+        For each alphabet, [c] u8, the table of each context.
     levels : sequence of np.ndarray
-        [t, a] u8 each.
+        For each alphabet, [t, a] u8.
     """
     batches = []
     for mapping, rows in zip(mappings, levels, strict=True):
@@ -113,14 +113,14 @@ def encode_tables(mappings: Sequence[np.ndarray], levels: Sequence[np.ndarray]) 
 
 
 def decode_tables(data: bytes, shapes: Sequence[tuple[int, int]]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Inverse of `encode_tables`: (mapping, levels) of every alphabet.
+    """Inverse of `encode_tables`: (mapping, levels) of each alphabet; raises `StreamError` for damaged data.
 
     Parameters
     ----------
     data : bytes
-        All of it is read.
+        Nothing may follow the stream.
     shapes : sequence of tuple
-        Contexts and symbols of each alphabet.
+        Number of contexts and of symbols, for each alphabet.
     """
     meta, at = np.zeros((_CLASSES, LEVELS), np.uint8), 0
     for row in meta:
@@ -150,14 +150,14 @@ def decode_tables(data: bytes, shapes: Sequence[tuple[int, int]]) -> list[tuple[
 
 
 def _expect(before: np.ndarray | None, size: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Classes [a] of the symbols of a table, and the table before it: the first has none."""
+    """Classes [a] of a table's symbols, and the levels of the table before it (None for the first table)."""
     if before is None:
         return np.zeros(size, np.uint8), None
     return (1 + (before > 0).astype(np.uint8) + (before > _OFTEN)).astype(np.uint8), before
 
 
 def _meta_tables(meta: np.ndarray) -> Tables:
-    """Tables of the classes; a class that is never used has the same frequency for every symbol."""
+    """Tables of the classes; in an unused class, all symbols have the same frequency."""
     filled = np.where(meta.any(axis=1, keepdims=True), meta, 1)
     return from_levels(filled)
 

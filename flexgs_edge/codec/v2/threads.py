@@ -1,4 +1,4 @@
-"""Chunks side by side: NumPy lets other threads run while it works on arrays, and every chunk is a stream of its own."""
+"""Code chunks in parallel threads: each chunk is a stream of its own, and NumPy releases the interpreter's lock."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 THREADS_MOST = 2
-"""Chunks in work at once. Each takes memory while it is coded, and more than two wait for the interpreter."""
+"""Most chunks in work at once. Each takes memory, and more than two wait for the interpreter's lock."""
 
 
 def thread_count(chunks: int) -> int:
-    """Threads for so many chunks on this machine."""
+    """Number of threads that code so many chunks on this machine."""
     try:
         processors = len(os.sched_getaffinity(0))
     except AttributeError:
@@ -27,9 +27,9 @@ def thread_count(chunks: int) -> int:
 def in_order(
     work: Callable[[Item], Result], items: Iterable[Item], threads: int, always: bool = False
 ) -> Generator[Result, None, None]:
-    """`work` of every item, in order; at most `threads` of them are in work or finished before they are asked for.
+    """Yield `work(item)` of every item, in order; at most `threads` items are in work or finished ahead.
 
-    With one thread no other one is started, unless `always` asks for it.
+    With one thread, the caller does the work itself, unless `always` asks for a thread.
     """
     if threads <= 1 and not always:
         yield from map(work, items)

@@ -1,6 +1,6 @@
-"""The one walk over a chunk that fitting, encoding and decoding share: what is coded when, and from what it is predicted.
+"""The walk over a chunk that fitting, encoding and decoding share: the order of all symbols, and what predicts each.
 
-A port codes the batches. Encoding ports are given the codes; a decoding port gives them back.
+A port codes the batches. Encoding ports are given the codes; a decoding port returns them.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from flexgs_edge.constants import VALUE_LIMIT
 AXES = ("x", "y", "z")
 COLOURS = ("Y", "Co", "Cg")
 _OWN = 3
-"""Features from the channel's own neighbours: mean, spread, distance."""
+"""Number of features from the channel's own neighbours: mean, spread and distance."""
 _NEAR = (2,)
-"""Place of the distance among the weights."""
+"""Place of the distance's weight."""
 
 _SCALES = ("scale x", "scale y", "scale z")
 _EARLIER: dict[str, tuple[str, ...]] = {
@@ -39,20 +39,20 @@ _EARLIER: dict[str, tuple[str, ...]] = {
     "rotation y": _SCALES,
     "rotation z": _SCALES,
 }
-"""Base channels in order, and the earlier channels that each is predicted from. Each pays at least 0.01 bits."""
+"""Base channels in order, and the earlier channels that predict each of them."""
 _SOURCES = ("scale x", "scale y", "scale z", "opacity", "dc Y", "dc Co", "dc Cg")
-"""Channels that others are predicted from: three features each (value, neighbours' mean, distance), in this order."""
+"""Channels that predict others. Each gives three features in this order: value, neighbours' mean, distance."""
 _SH_SOURCES = ("opacity", *_SCALES)
-"""Rotations say little of the SH; opacity and colour say how much a row's light changes."""
+"""Channels that predict SH. Opacity and scale tell how strongly a row's light changes; rotations tell little."""
 _SH_BEFORE = ((3,), (11, 3, 9, 10), (3, 13, 14, 9, 10, 11, 12))
-"""Places of the weights of |sums| of Cg, Y, Co before, and Y, |Y|, Co, |Co| of this coefficient; of Y, Co and Cg, which
-begin at the second, second and first of them."""
+"""Places of weights for features of the same coefficient and those before, for the planes Y, Co and Cg. The features are
+the sums of |Cg|, |Y|, |Co| so far, then Y, |Y|, Co, |Co|. Y and Co use them from the second on, Cg from the first."""
 _RESIDUAL = ("scale", "opacity", "dc")
-"""Channels whose symbols are residuals: predictable and without edges. The others gain from tables of their values."""
+"""Channels whose symbols are residuals: they are predictable and have no sharp limits. Other channels code their values."""
 
 
 def base_kinds() -> list[GroupKind]:
-    """Groups of the base channels."""
+    """The groups of the base channels."""
     return [
         GroupKind(name, _OWN + 3 * len(earlier), name.startswith(_RESIDUAL), name == "sh degree")
         for name, earlier in _EARLIER.items()
@@ -60,7 +60,7 @@ def base_kinds() -> list[GroupKind]:
 
 
 def sh_kinds(sh_degree: int) -> list[GroupKind]:
-    """Groups of SH: one for each degree and colour plane."""
+    """The groups of SH: one for each degree and colour plane."""
     return [
         GroupKind(f"sh {degree} {colour}", _OWN + 6 + 3 * plane, False, True)
         for degree in range(1, sh_degree + 1)
@@ -70,39 +70,39 @@ def sh_kinds(sh_degree: int) -> list[GroupKind]:
 
 @dataclass(frozen=True, eq=False)
 class ChunkCodes:
-    """The codes of a chunk's rows, as in `GridScene`; position is relative to the scene's lowest cell."""
+    """The codes of a chunk, as in `GridScene`; positions are relative to the lowest cell of the scene."""
 
     cells: np.ndarray  # [r] u64, Morton index of every row's cell
     base: dict[str, np.ndarray]  # each [r]
     sh: tuple[np.ndarray, ...]
     coordinates: np.ndarray | None = None
-    """[3, r] i32 of the cells, where a decoder made them on its way."""
+    """[3, r] i32, coordinates of the cells, if a decoder has made them."""
 
     @property
     def position(self) -> np.ndarray:
-        """[3, r] i32: coordinates of the rows' cells."""
+        """[3, r] i32, coordinates of the rows' cells."""
         return unmorton(self.cells) if self.coordinates is None else self.coordinates
 
 
 class Port(Protocol):
-    """Codes batches; `codes` are None when decoding. What `known` gives is the port's own."""
+    """Codes batches for `walk_chunk`; `codes` and `symbols` are None to decode. The port chooses the type `known` returns."""
 
     stride: int
-    """One row in so many of each pass is coded."""
+    """One in so many rows of each pass is coded."""
 
     def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
-        """Octree bytes."""
+        """Code the bytes of octree nodes."""
 
     def repeats(self, codes: np.ndarray | None, cells: int, rows: int) -> np.ndarray:
-        """Rows beyond the first in every cell."""
+        """Code the number of rows beyond the first one in every cell."""
 
     def known(self, group: int, count: int, terms: list[Term], before: Any = None) -> Any:
-        """Take features of a group that are known for all `count` rows, beside those of `before`."""
+        """Take features of a group that are known for all `count` rows, in addition to those of `before`."""
 
     def channel(
         self, group: int, known: Any, rows: slice, own: tuple[np.ndarray, ...], codes: np.ndarray | None
     ) -> np.ndarray:
-        """Codes [m] of some rows, predicted from what is known and from `own`: mean and spread of their neighbours."""
+        """Code a channel for some rows, from `known` and from `own`, the mean and spread of their neighbours: codes [m]."""
 
 
 def walk_chunk(
@@ -115,13 +115,13 @@ def walk_chunk(
     rows : int
         Rows of the chunk.
     depth : int
-        Of the octree.
+        Depth of the octree.
     sh_degree : int
-        Of the scene.
+        SH degree of the scene.
     port : Port
         Codes the batches.
     codes : ChunkCodes, optional
-        What to encode; None when decoding.
+        Codes to encode; None to decode.
     base_only : bool
         Stop before the SH.
 
@@ -172,7 +172,7 @@ def _walk_channel(
     source: np.ndarray | None,
     mean: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Codes [rows] i32 and values [rows] f32 of one channel; the neighbours' means are written into `mean`."""
+    """Code one channel: codes [rows] i32 and values [rows] f32. The neighbours' means are written into `mean`."""
     if source is None:
         result, values = np.empty(rows, np.int32), np.empty(rows, np.float32)
     else:
@@ -184,13 +184,13 @@ def _walk_channel(
             result[step.rows] = batch
             values[step.rows] = limited(batch)
         if mean is not None:
-            # The first pass has no neighbours: as a feature of later channels its mean is its value.
+            # The first pass has no neighbours: later channels then take the value itself as the mean.
             mean[step.rows] = own[0] if own else values[step.rows] * np.float32(ONE)
     return result, values
 
 
 def walk_positions(rows: int, depth: int, port: Port, codes: ChunkCodes | None) -> np.ndarray:
-    """[r] u64 cells of all rows: the octree, then how often each cell is taken again."""
+    """Code the cells of all rows ([r] u64): the octree of cells, then the number of rows in each cell."""
     if codes is None:
         unique = walk_octree(depth, rows, port.occupancy)
         return np.repeat(unique, port.repeats(None, len(unique), rows) + 1)
@@ -208,7 +208,7 @@ def _walk_sh(
     port: Port,
     codes: ChunkCodes | None,
 ) -> Iterator[np.ndarray]:
-    """[3 * (2l + 1), rows] i32 for every degree l from 1."""
+    """Yield the SH codes of every degree l from 1: [3 * (2l + 1), rows] i32."""
     degrees = base["sh degree"]
     rows = np.arange(len(degrees))
     below = np.zeros((3, len(rows)), np.float32)
@@ -220,14 +220,14 @@ def _walk_sh(
         below, rows = below[:, keep], rows[keep]
         if degree == 1 or not keep.all():
             plan = plan_passes(position[:, rows], REACH[1], port.stride)
-        # The same for all coefficients of the degree.
+        # These features are the same for all coefficients of the degree.
         steady = Features(3 + len(sources), len(rows))
         steady.values[:3], steady.values[3:] = below, features.values[sources][:, rows]
         steady.seal()
         extra = [Term(_NEAR, plan.near), Term((5, 6, 7, 8), steady, 3)]
         fixed = [port.known(group + plane, len(rows), [*extra, Term((4,), steady, plane)]) for plane in range(3)]
         band = np.zeros((3, 2 * degree + 1, len(rows)), np.int32)
-        # Sums of Cg, Y, Co so far; then Y, |Y|, Co, |Co| of this coefficient.
+        # Sums of |Cg|, |Y|, |Co| so far; then Y, |Y|, Co, |Co| of this coefficient.
         before = Features(7, len(rows))
         for k in range(2 * degree + 1):
             last = np.zeros(0, np.float32)

@@ -1,1 +1,1 @@
-"""Version 2 coded and decoded by kernels."""
+"""Encode and decode version 2 chunks by OpenCL kernels, with the bytes that NumPy gives."""

@@ -1,4 +1,4 @@
-"""Chunks decoded by the OpenCL kernel `code_chunks`: the same codes as `coder.decode_chunk`, which is its specification."""
+"""Decode chunks by the OpenCL kernel `code_chunks`; its specification is `decode.decode_chunk`, which gives the same codes."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _NO_WORDS, _NO_CHILDREN, _NODES, _REPEATS, _CODES, _DEGREES, _LANES_END = range(
 
 @dataclass(frozen=True)
 class RowSteps:
-    """What makes values of codes: position code of the first cell, and the steps."""
+    """The numbers that turn codes into values: the position code of the first cell, and the step sizes."""
 
     low: tuple[int, int, int]
     steps: StepSizes
 
     def packed(self) -> np.ndarray:
-        """[6 + 2 D] f32: position, scale, rotation, opacity, then luma and chroma of every degree from 0."""
+        """[6 + 2 D] f32: steps of position, scale, rotation, opacity, then of luma and chroma for every degree from 0."""
         steps = self.steps
         colours = [steps.colour(luma)[:2] for luma in (steps.dc, *steps.sh)]
         return np.concatenate([[steps.position, steps.scale, steps.rotation, steps.opacity], *colours]).astype(
@@ -42,20 +42,20 @@ class RowSteps:
 
 
 class ChunkKernel:
-    """Decodes some chunks of a file at once, a work-item each.
+    """Decodes several chunks of a file at once, one work-item each.
 
     Parameters
     ----------
     device : Device
-        A backend whose work-items run as threads of a processor: one decodes a chunk, at which a GPU's would crawl.
+        A backend whose work-items run as threads of a processor. On a GPU, a chunk in one work-item would take far too long.
     model : Model
-        Of the file.
+        The model of the file.
     rows : int
-        Of the largest chunk.
+        Rows of the largest chunk.
     data_bytes : int
-        Of the longest chunk.
+        Bytes of the longest chunk.
     chunks : int
-        As many at once.
+        Number of chunks decoded at once.
     """
 
     def __init__(self, device: Device, model: Model, rows: int, data_bytes: int, chunks: int) -> None:
@@ -79,7 +79,7 @@ class ChunkKernel:
 
     @staticmethod
     def bytes_of(rows: int, sh_degree: int) -> int:
-        """Bytes that a chunk of so many rows takes on the device, its stream and table of values aside."""
+        """Bytes that a chunk takes on the device, without its stream and its table of values."""
         work = sum(planes * np.dtype(kind).itemsize for planes, kind in PLANES.values())
         return padded(rows) * (work + 4 * _out_planes(sh_degree))
 
@@ -89,13 +89,13 @@ class ChunkKernel:
         return self._arrays[name]
 
     def close(self) -> None:
-        """Free the arrays."""
+        """Free the arrays on the device."""
         for array in self._arrays.values():
             array.release()
         self._arrays.clear()
 
     def codes(self, chunks: Sequence[tuple[int, bytes]], base_only: bool) -> list[ChunkCodes | ValueError]:
-        """The codes of chunks (rows and bytes of each), or for each the error that `coder.decode_chunk` would raise."""
+        """Decode chunks (rows and bytes of each): the codes of each one, or the error that `decode.decode_chunk` raises."""
         with self._lock:
             errors = self._decode(chunks, base_only)
             return [
@@ -104,7 +104,7 @@ class ChunkKernel:
             ]
 
     def tables(self, chunks: Sequence[tuple[int, bytes]], steps: RowSteps) -> list[np.ndarray | ValueError]:
-        """As `codes`, but their values as rows of INRIA's PLY: each [rows, columns] f32, as `SceneSource.read_table` says."""
+        """As `codes`, but with values as rows of INRIA's PLY: [rows, columns] f32 each, as in `SceneSource.read_table`."""
         columns = 17 + 3 * sh_rest_count(self.model.sh_degree)
         with self._lock:
             errors = self._decode(chunks, False)
@@ -133,7 +133,7 @@ class ChunkKernel:
             return results
 
     def _decode(self, chunks: Sequence[tuple[int, bytes]], base_only: bool) -> list[Any]:
-        """Leave the codes of chunks on the device; what is wrong with each, or None."""
+        """Decode chunks and leave the codes on the device; returns the error of each chunk, or None."""
         info = np.zeros((len(chunks), len(INFO)), np.int32)
         errors: list[ValueError | None] = [None] * len(chunks)
         arrays = self._arrays
@@ -186,7 +186,7 @@ class ChunkKernel:
         return ChunkCodes(cells, base, tuple(sh), out[:3, :rows])
 
     def _error(self, info: list[int], rows: int) -> ValueError:
-        """What the specification says to the same damage."""
+        """The error that `decode.decode_chunk` raises for the same damage."""
         status, wanted = info[_STATUS], info[_WANTED]
         found = info[_FOUND_HIGH] << 32 | info[_FOUND] & 0xFFFFFFFF
         if status == _NODES:
@@ -205,17 +205,17 @@ class ChunkKernel:
 
 
 def _out_planes(sh_degree: int) -> int:
-    """Positions, base channels, SH."""
+    """Number of planes: positions, base channels, SH."""
     return 3 + len(base_kinds()) + 3 * sh_rest_count(sh_degree)
 
 
 def pack_model(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A model as the kernel reads it.
+    """Pack a model for the kernel.
 
     Returns
     -------
     tuple of np.ndarray
-        [alphabets, 203] i32 records; [tables, 2^14] u8 symbols of all slots; [symbols of all tables] u32 entries.
+        [alphabets, 203] i32 records; [tables, 2^14] u8, the symbol of every slot; [symbols of all tables] u32 entries.
     """
     records = np.zeros((len(model.tables), RECORD), np.int32)
     tables_before = entries_before = 0

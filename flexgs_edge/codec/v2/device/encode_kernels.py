@@ -1,4 +1,4 @@
-"""Coding by OpenCL kernels: `code_chunks` makes what `ports.CountPort` does, `encode_chunks` what `rans.Encoder` does."""
+"""Encode by OpenCL kernels: `code_chunks` counts as `ports.CountPort` does, `encode_chunks` codes as `rans.Encoder` does."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from flexgs_edge.constants import COARSE_ROWS, RANS_LANES
 from flexgs_edge.scene.fields import sh_rest_count
 
 _ESCAPES = 32
-"""One in so many codes may be an escape, each of which has 4 raw bytes; a chunk with more is left to NumPy."""
+"""One in so many codes may be an escape, with 4 raw bytes each. A chunk with more of them is left to NumPy."""
 
 
 def device_bytes(rows: int, sh_degree: int) -> int:
-    """Bytes that coding a chunk of so many rows takes on a device, at most."""
+    """Most bytes on a device for coding a chunk of so many rows."""
     work = sum(planes * np.dtype(kind).itemsize for planes, kind in PLANES.values())
-    # A code, its context and symbol, three raw bytes or for some an escape's four; then 6 bytes a symbol.
+    # A code, its context and symbol, three raw bytes (four for an escape, which is rare), then 6 bytes a symbol.
     return padded(rows) * (work + 10 * (len(base_kinds()) + 3 * sh_rest_count(sh_degree))) + (1 << 22)
 
 
 class CountKernel:
-    """Counts the symbols of some chunks at once, a work-item each; positions aside.
+    """Counts the symbols of several chunks at once, one work-item each; NumPy counts those of positions.
 
     Parameters
     ----------
     device : Device
         A backend whose work-items run as threads of a processor.
     groups : list of Group
-        Of the model.
+        The groups of the model.
     sh_degree : int
-        Of the scene.
+        SH degree of the scene.
     rows : int
-        Of the largest chunk.
+        Rows of the largest chunk.
     chunks : int
-        As many at once.
+        Number of chunks counted at once.
     """
 
     def __init__(self, device: Device, groups: list[Group], sh_degree: int, rows: int, chunks: int) -> None:
@@ -81,13 +81,13 @@ class CountKernel:
             stack.pop_all()
 
     def close(self) -> None:
-        """Free the arrays."""
+        """Free the arrays on the device."""
         for array in self._arrays.values():
             array.release()
         self._arrays.clear()
 
     def count(self, chunks: Sequence[ChunkCodes], ports: Sequence[CountPort]) -> list[bool]:
-        """Add the channels of chunks to a port each; False where there was no room for the escapes, and nothing was added."""
+        """Count chunks, and add each to its port; False for a chunk with too many escapes, which is not added."""
         info = np.zeros((len(chunks), len(INFO)), np.int32)
         for i, codes in enumerate(chunks):
             rows = len(codes.cells)
@@ -149,7 +149,7 @@ class CountKernel:
 
 
 def encode_streams(device: Device, encoders: Sequence[Encoder]) -> list[bytes]:
-    """`Encoder.finish` of some encoders at once, a work-item each."""
+    """Do `Encoder.finish` for several encoders at once, one work-item each."""
     sizes = [[len(batch) for batch in encoder.batches] for encoder in encoders]
     most, batch_most = max(map(sum, sizes), default=0) + 1, max(map(len, sizes), default=0) + 1
     count = len(encoders)

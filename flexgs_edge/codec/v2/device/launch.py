@@ -1,4 +1,4 @@
-"""What the codec's kernels share with their host side: the device that runs them, and how numbers lie in their arrays."""
+"""Shared by the codec's kernels and their host code: the device protocol, and the layout of records and planes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from flexgs_edge.codec.v2.groups import Group
 
 _SPARE = 96
-"""Numbers of every plane behind those of the rows: what vectors load and store beyond them."""
-# Of a chunk: what is wanted and found; as in the kernel.
+"""Elements of each plane beyond its rows: vectors may load and store there."""
+# Fields of a chunk's info record, for input and result; the kernel has the same order.
 INFO = ("rows", "lanes", "words", "status", "found", "found high", "wanted", "at")
-# Places in the record of an alphabet.
+# Places in the record of an alphabet; the kernel has the same.
 PLACES = {
     "start": 0,
     "shift": 2,
@@ -29,28 +29,28 @@ PLACES = {
     "counts": 202,
 }
 RECORD = 203
-"""Numbers of a record."""
+"""Length of a record in i32."""
 PLANES = {"cells": (2, "u8"), "weights": (8, "u2"), "bytes": (4, "u1"), "ints": (4, "i4"), "floats": (44, "f4")}
-"""Work planes of a chunk."""
+"""Work planes of a chunk: number and type of each."""
 
 
 class Device(Protocol):
-    """What of a kernel backend is used here."""
+    """The part of a kernel backend that the codec uses."""
 
     threads: int
-    """Work-items that run side by side as threads of a processor do; 0 where none do."""
+    """Work-items that run side by side as threads of a processor; 0 for a device without threads, such as a GPU."""
 
     def array(self, shape: tuple[int, ...], dtype: Any) -> Any:
-        """An array, not initialised."""
+        """A new array, not initialised."""
 
     def write(self, array: Any, values: np.ndarray, offset: int = 0) -> None:
-        """Copy values into an array."""
+        """Copy values into an array, from element `offset` on."""
 
     def read(self, array: Any, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
-        """Copy an array out."""
+        """Copy an array, or a part of it from element `offset` on, to the host."""
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
-        """Run a kernel."""
+        """Run a kernel with so many work-items."""
 
 
 def launch_coding(
@@ -61,18 +61,18 @@ def launch_coding(
     decoding: tuple[Sequence[int], Sequence[Any]] | None = None,
     counting: tuple[Sequence[int], Sequence[Any]] | None = None,
 ) -> None:
-    """Run `code_chunks` in one of its directions.
+    """Run `code_chunks`, either to decode or to count.
 
     Parameters
     ----------
     shape : tuple of int
-        Numbers of a plane, planes of codes, SH degree.
+        Elements of a plane, number of code planes, SH degree.
     shared : sequence of arrays
-        What both directions use, in the kernel's order.
+        Arguments for both directions, in the kernel's order.
     decoding, counting : tuple, optional
-        Numbers and arrays of the one direction that is wanted.
+        Numbers and arrays for the one direction to run.
     """
-    # The kernel leaves what belongs to the other direction alone: any array will do.
+    # The kernel does not touch the arrays of the other direction, so any array may stand there.
     numbers, arrays = decoding or ([0] * 3, [shared[0]] * 4)
     more_numbers, more_arrays = counting or ([0] * 4, [shared[0]] * 5)
     device.launch(
@@ -89,18 +89,18 @@ def launch_coding(
 
 
 def padded(rows: int) -> int:
-    """Numbers of a plane of so many rows."""
+    """Elements of a plane for so many rows, with room for vectors."""
     return -(-rows // 16) * 16 + _SPARE
 
 
 def pack_group(record: np.ndarray, group: Group) -> None:
-    """A group's fitted numbers into its alphabet's record."""
+    """Write a group's fitted numbers into the record of its alphabet."""
     start = group.start
     record[PLACES["start"] : PLACES["symbols"]] = np.int64(start).astype(np.int32), start >> 32, group.shift
     sizes = [len(cut) for cut in group.cuts]
     record[PLACES["sizes"] : PLACES["mean cuts"]] = *sizes, group.kind.residual, group.kind.features
     for place, cuts in zip((PLACES["mean cuts"], PLACES["error cuts"]), group.cuts, strict=True):
-        # Contexts count the cuts reached: their order says nothing, and the kernel looks at the lowest first.
+        # A context is the number of cuts reached, so their order does not matter. The kernel starts at the lowest cut.
         record[place : place + len(cuts)] = np.sort(cuts)
     for place, weights in zip((PLACES["mean weights"], PLACES["error weights"]), group.weights, strict=True):
         record[place : place + len(weights)] = weights
