@@ -1,4 +1,4 @@
-"""The error tree: every failure that is the user's to mend is one of these.
+"""The errors that a user can mend, and their exit codes.
 
     FlexGSError
     |-- InputError    bad scene, cameras, photos or arguments        exit code 2
@@ -7,7 +7,7 @@
     |-- DeviceError   no usable OpenCL device, a failed build        exit code 4
     `-- BudgetError   the memory limit or the disk is too small      exit code 5
 
-Anything else that escapes is a bug of ours (exit code 1).
+Any other error is a bug of ours (exit code 1).
 A message says where (file, field, row or byte), what was expected, what was found, and what to do.
 """
 
@@ -17,7 +17,7 @@ from __future__ import annotations
 def brief(value: object, most: int = 80) -> str:
     """The beginning of a value, for messages.
 
-    Numbers may have more digits than Python writes, and lists may be nested deeper than it can follow.
+    It stands numbers with more digits than Python writes, and lists nested deeper than Python can follow.
 
     >>> brief([1, 2]), brief("a" * 9, 8)
     ('[1, 2]', "'aaaa...")
@@ -48,7 +48,7 @@ class FormatError(InputError):
 
 
 class TargetError(FlexGSError):
-    """A quality or size target outside what the method can reach; names the closest point."""
+    """A target of quality or size that the method cannot reach; the message names the closest point."""
 
     exit_code = 3
 
@@ -60,6 +60,6 @@ class DeviceError(FlexGSError):
 
 
 class BudgetError(FlexGSError):
-    """The memory limit (or the disk) is too small; names the smallest limit that would do."""
+    """The memory limit or the disk is too small; the message names the smallest sufficient limit."""
 
     exit_code = 5

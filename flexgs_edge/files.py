@@ -1,4 +1,4 @@
-"""Files and folders of results: each appears whole, under its name, or not at all."""
+"""Write result files and folders so that each gets its name only when it is complete."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def check_writable(path: str | os.PathLike[str], force: bool = False) -> Path:
-    """The place that `path` names (links followed), or an error before any work is done.
+    """Check, before any work is done, that a file can be written; returns its place with links followed.
 
     Raises
     ------
     InputError
-        When the folder is missing, `path` is no regular file, or it exists and `force` is not set.
+        If the folder is missing, `path` is not a regular file, or it exists and `force` is not set.
     """
     target = Path(os.path.realpath(path))
     try:
         folder, exists, plain = target.parent.is_dir(), target.exists(), target.is_file()
-    except OSError as error:  # a name too long, a folder that may not be entered
+    except OSError as error:  # such as a name that is too long, or a folder without permission to enter
         raise InputError(f"{path}: cannot write there ({error.strerror})") from error
     if not folder:
         raise InputError(f"{path}: the folder {target.parent} does not exist; make it first")
-    # A rename would replace a device node such as /dev/null by a file: refuse whatever is not a plain file.
+    # A rename would replace a device such as /dev/null by a file, so we refuse everything but plain files.
     if exists and not plain:
         raise InputError(f"{path}: expected a file name to write to, found a folder or a special file")
     if exists and not force:
@@ -41,27 +41,27 @@ def check_writable(path: str | os.PathLike[str], force: bool = False) -> Path:
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str], force: bool = False) -> Iterator[BinaryIO]:
-    """Yield a binary file that takes the name `path` only when the block ends without an error.
+    """Yield a binary file that gets the name `path` only if the block ends without an error.
 
-    The file is seekable and may be read back. On any error (Ctrl-C included) nothing is left behind and an
-    earlier file of that name is untouched.
+    The file can be read and seeked. After any error (Ctrl-C included), no partial file is left, and an earlier file of that
+    name stays as it was.
 
     Parameters
     ----------
     path : path
-        Where the finished file shall be; a symbolic link is followed.
+        Place of the finished file; a symbolic link is followed.
     force : bool, optional
-        Replace a file that exists.
+        Replace an existing file.
 
     Raises
     ------
     InputError
-        When `path` cannot be written to (see `check_writable`).
+        If `path` cannot be written to (see `check_writable`).
     BudgetError
-        When the disk is full.
+        If the disk is full.
     """
     target = check_writable(path, force)
-    # Named afresh and short: two runs never share it, and a long target name does not outgrow the file system's limit.
+    # A random, short name: two runs never share it, and it fits where a long target name with a suffix would not.
     temporary = target.with_name(f".flexgs-{secrets.token_hex(8)}.tmp")
     try:
         with open(temporary, "x+b") as file:
@@ -72,7 +72,7 @@ def atomic_write(path: str | os.PathLike[str], force: bool = False) -> Iterator[
             raise BudgetError(
                 f"{path}: the disk is full ({error.strerror}); free some space or write elsewhere"
             ) from error
-        # Errors of files read inside the block are not ours to explain.
+        # Other errors in the block, such as of files that it reads, are not explained here.
         if error.filename is not None and os.fspath(error.filename) == os.fspath(temporary):
             raise InputError(f"{path}: cannot write there ({error.strerror})") from error
         raise
@@ -82,12 +82,12 @@ def atomic_write(path: str | os.PathLike[str], force: bool = False) -> Iterator[
 
 
 def check_folder(path: str | os.PathLike[str], force: bool = False) -> Path:
-    """The place that `path` names (links followed), or an error before any work is done.
+    """Check, before any work is done, that a folder can be written; returns its place with links followed.
 
     Raises
     ------
     InputError
-        When its parent is missing, it is no folder, or it holds something and `force` is not set.
+        If its parent is missing, `path` is not a folder, or it is not empty and `force` is not set.
     """
     target = Path(os.path.realpath(path))
     try:
@@ -101,20 +101,20 @@ def check_folder(path: str | os.PathLike[str], force: bool = False) -> Path:
             )
         if not os.access(target if target.is_dir() else target.parent, os.W_OK | os.X_OK):
             raise InputError(f"-o {path}: cannot write there (permission denied)")
-    except OSError as error:  # a name too long, a folder that may not be entered
+    except OSError as error:  # such as a name that is too long, or a folder without permission to enter
         raise InputError(f"-o {path}: cannot write there ({error.strerror})") from error
     return target
 
 
 @contextmanager
 def atomic_folder(path: str | os.PathLike[str], force: bool = False) -> Iterator[Path]:
-    """Yield an empty folder whose files get to `path` only when the block ends without an error.
+    """Yield an empty folder; its files get to `path` only if the block ends without an error.
 
-    On any error (Ctrl-C included) nothing is left behind. A new `path` appears whole. Where there is such a folder (with
-    `force` also one that is in use), the finished files take the places of those of the same names, and all others stay.
+    After any error (Ctrl-C included), nothing is left behind. A new `path` appears as a whole. If the folder exists (with
+    `force`, it may have contents), the finished files replace files of the same names, and all others stay.
     """
     target = check_folder(path, force)
-    # Inside a folder that is there: its parent may be closed to us, or on another disk.
+    # Inside a folder that exists, since its parent may not be writable, or may be on another disk.
     home = target if target.is_dir() else target.parent
     place = home / f".flexgs-{secrets.token_hex(8)}.tmp"
     try:
@@ -144,9 +144,9 @@ def _merge(source: Path, target: Path) -> None:
 
 @contextmanager
 def temporary_name(output: Path, force: bool, word: str | None = None) -> Iterator[Path]:
-    """A name in a folder beside `output` that becomes `output` when the block ends well; the folder is removed in any case.
+    """Yield a name in a temporary folder beside `output`; the file there becomes `output` if the block ends without an error.
 
-    With a `word` the folder is named by it, and one that a killed run left is removed first.
+    The folder is always removed. If `word` is given, the folder is named by it, and one left by a killed run is removed first.
     """
     target = check_writable(output, force)
     folder = target.with_name(f".flexgs-out-{word or secrets.token_hex(8)}")

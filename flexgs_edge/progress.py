@@ -1,4 +1,4 @@
-"""Progress bars for long work: one door, so that quiet runs and pipes stay clean."""
+"""Progress bars on stderr for long work. All bars go through here, so that quiet runs and pipes show none."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ T = TypeVar("T")
 
 
 class Progress:
-    """Hands out progress bars on stderr, or none.
+    """Shows progress bars on stderr, or none.
 
     Parameters
     ----------
     enabled : bool, optional
-        Show bars. Default: only when stderr is a terminal.
+        Show bars. By default, only if stderr is a terminal.
     """
 
     def __init__(self, enabled: bool | None = None) -> None:
         self.enabled = sys.stderr.isatty() if enabled is None else enabled
 
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-        """Iterate over `items` with a bar named `label`."""
+        """Iterate over `items`, and show a bar with the name `label`."""
         if not self.enabled:
             yield from items
             return
-        from tqdm import tqdm  # slow to import; a quiet run need not pay for it
+        from tqdm import tqdm  # slow to import, and a quiet run does not need it
 
         yield from tqdm(items, desc=label, total=total, leave=False, file=sys.stderr)
 

@@ -1,4 +1,4 @@
-"""Sizes in bytes as people write them: `8MB`, `1.5 GiB`."""
+"""Read and write sizes in bytes with units, such as `8MB` and `1.5 GiB`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _UNITS = {
 
 
 def parse_size(text: str) -> int:
-    """Bytes from `1.5MB` (10^6), `512MiB` (2^20) or plain bytes.
+    """Bytes of a size such as `1.5MB` (10^6), `512MiB` (2^20) or `700`.
 
     >>> parse_size("1.5MB"), parse_size("512MiB"), parse_size("700")
     (1500000, 536870912, 700)
@@ -32,7 +32,7 @@ def parse_size(text: str) -> int:
 
 
 def format_size(size: int) -> str:
-    """Bytes for people, in powers of ten: `1.50 MB`.
+    """A size for people, in powers of ten: `1.50 MB`.
 
     >>> format_size(1500000)
     '1.50 MB'
@@ -44,5 +44,5 @@ def format_size(size: int) -> str:
 
 
 def format_mib(size: int) -> str:
-    """Bytes for memory limits, rounded up to whole MiB: `512MiB` (what `parse_size` reads back)."""
+    """A memory limit for people, rounded up to whole MiB: `512MiB`. `parse_size` reads it back."""
     return f"{-(-size // 2**20)}MiB"

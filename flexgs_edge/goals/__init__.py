@@ -1,1 +1,1 @@
-"""What is asked and what a search has seen: targets, steps and choices, without arrays."""
+"""The targets of a search, and the points that it measured: plain records and arithmetic, without arrays."""

@@ -1,4 +1,4 @@
-"""What to prune, in thousandths."""
+"""The choice that a search of `paper` makes: how much to prune, in thousandths."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from flexgs_edge.errors import InputError
 
 @dataclass(frozen=True, order=True)
 class Choice:
-    """How much to prune, in thousandths of N.
+    """How much to prune, in thousandths of the N rows.
 
     Parameters
     ----------
     prune : int
         Share of the rows that is removed (the paper's p).
     sh : int
-        Share of the rows that loses SH above degree 0 (the paper's s).
+        Share of the rows that loses its SH above degree 0 (the paper's s).
     """
 
     prune: int
@@ -31,7 +31,7 @@ class Choice:
 
     @classmethod
     def from_rates(cls, prune: float, sh: float) -> Choice:
-        """A choice from shares of one, rounded to thousandths.
+        """A choice from shares between 0 and 1, rounded to thousandths.
 
         >>> Choice.from_rates(0.4, 0.3)
         Choice(prune=400, sh=300)
@@ -43,9 +43,9 @@ class Choice:
         return cls(round(prune * 1000), round(sh * 1000))
 
     def pruned(self, count: int) -> int:
-        """Rows removed from a scene of `count` rows."""
+        """Number of rows removed from a scene of `count` rows."""
         return count * self.prune // 1000
 
     def boundary(self, count: int) -> int:
-        """Rank below which a row has no SH any more (or is gone)."""
+        """Rank below which a row has lost its SH, or is removed."""
         return count * (self.prune + self.sh) // 1000

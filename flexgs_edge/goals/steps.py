@@ -1,4 +1,4 @@
-"""What a search has seen: the points it measured, its answer, and which of two points is better."""
+"""The points that a search measured, its answer, and the order of two points."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from flexgs_edge.goals.target import Measurement, Target
 
 Phase = Literal["list", "refine", "confirm", "fixed", "line", "multiplier"]
 MAX_PRUNE = 980
-"""Largest prune rate of the refinement, in thousandths: something must be left to draw."""
+"""Largest prune rate of the refinement, in thousandths; something must be left to draw."""
 REFINE_STEPS = {"fast": 4, "balanced": 10, "thorough": 32}
-"""Measured steps of the refinement at each `--effort`."""
+"""Measured points of the refinement for each `--effort`."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One point that the search looked at.
+    """One point of a search.
 
     Parameters
     ----------
     choice : Choice
-        Prune rate and SH rate, thousandths.
+        Prune rate and SH rate, in thousandths.
     size : int
         Exact bytes of the file.
     measurement : Measurement or None
-        Quality; `None` where size alone decided.
+        Quality; `None` if size alone decided.
     excess : float
-        By how much the target was missed; zero or less holds.
+        By how much the point misses the target; zero or less holds.
     phase : {"list", "refine", "confirm", "fixed", "line", "multiplier"}
-        Part of the search that asked.
+        Part of the search that asked for the point.
     seconds : float
-        Wall time of the step.
+        Wall time of the measurement.
     estimated : bool
-        `measurement` is an estimate from a part of the pixels, and `excess` what a full one is expected to show.
+        `measurement` comes from a part of the pixels, and `excess` is an estimate for all of them.
     """
 
     choice: Choice
@@ -48,22 +48,22 @@ class Step:
 
     @property
     def holds(self) -> bool:
-        """The target holds here."""
+        """Whether the target holds at this point."""
         return self.excess <= 0.0
 
 
 @dataclass(frozen=True)
 class Scored:
-    """What a search by measured costs looked at.
+    """The camera poses that a search by measured costs has scored.
 
     Parameters
     ----------
     poses : int
         Scored poses.
     made : int
-        How many of them nobody took (`--views-margin`).
+        Generated poses among them (`--views-margin`).
     unseen : int
-        Gaussians that can show at all, but in none of them.
+        Gaussians that could show, but that no scored pose sees.
     """
 
     poses: int
@@ -73,18 +73,18 @@ class Scored:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The answer of a search and the way to it.
+    """The answer of a search, and the points on the way to it.
 
     Parameters
     ----------
     chosen : Step
         The point to write.
     reached : bool
-        The target holds at `chosen` (always, unless the best effort was asked for).
+        The target holds at `chosen`; only `--best-effort` accepts a point that misses.
     steps : tuple of Step
-        Every step, in order.
+        All points, in order.
     scored : Scored or None
-        What it was told by; `None` for searches that are given scores.
+        The poses behind the scores; `None` for searches that are given scores.
     """
 
     chosen: Step
@@ -94,7 +94,7 @@ class SearchResult:
 
 
 class Point(Protocol):
-    """A measured point of any search."""
+    """A measured point of any kind of search."""
 
     @property
     def size(self) -> int:
@@ -106,15 +106,15 @@ class Point(Protocol):
 
     @property
     def excess(self) -> float:
-        """By how much the target was missed."""
+        """By how much the point misses the target; zero or less holds."""
 
     @property
     def holds(self) -> bool:
-        """The target holds here."""
+        """Whether the target holds at this point."""
 
 
 def better(step: Point, other: Point, target: Target) -> bool:
-    """Whether `step` is the better answer: holding before missing, then fewer bytes (a size target: less loss)."""
+    """Whether `step` is the better answer: one that holds, then the smaller file (for a size target, the lower loss)."""
     if step.holds != other.holds:
         return step.holds
     if not step.holds:
@@ -125,14 +125,14 @@ def better(step: Point, other: Point, target: Target) -> bool:
 
 
 def step_words(step: Step, target: Target | None) -> str:
-    """A step of a search in a line."""
+    """One line about a step of a search."""
     figure = target.report(step.size, step.measurement) if target else ""
     figure += " (estimated)" if step.estimated else ""
     return f"{step.phase}: prune {step.choice.prune / 1000:g}, SH {step.choice.sh / 1000:g}: {figure}, {step.seconds:.1f} s"
 
 
 def out_of_reach(target: Target, closest: Step) -> TargetError:
-    """The error when nothing holds, with the closest point."""
+    """The error to raise if no point holds; it names the closest point."""
     return TargetError(
         f"{target.describe()} cannot be reached: the closest point is {target.report(closest.size, closest.measurement)} "
         f"(prune rate {closest.choice.prune / 1000:g}, SH rate {closest.choice.sh / 1000:g}); "

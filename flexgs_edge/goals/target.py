@@ -1,7 +1,7 @@
-"""What a search aims at: a loss of quality that may not be passed, or a size that must be kept.
+"""Targets of a search: a largest loss of quality, or a largest size.
 
-A target answers one question about a measured point: by how much does it miss (`excess`)? Zero or less holds. The excess
-rises smoothly with compression, so the search may interpolate in it.
+A target gives each measured point its `excess`: by how much the point misses. Zero or less holds. The excess rises smoothly
+with compression, so that the search may interpolate in it.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.units import format_size
 
 Figure = Literal["drop", "modelled drop", "fidelity"]
-"""Which figure decides: the drop against photos, the modelled drop, or the PSNR against the original's renders."""
+"""The figure that decides: drop against photos, modelled drop, or fidelity (PSNR against the original's renders)."""
 
 IDENTICAL_DB = 200.0
-"""Stands for the fidelity of identical renders where numbers are compared (never reported)."""
+"""Fidelity of identical renders in comparisons; it is never reported."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Quality of one point of the search, means over the decision views, in dB.
+    """Quality of one point of a search, means over the views that decide, in dB.
 
     Parameters
     ----------
     drop : float or None
         Drop against the photos; `None` without photos.
     fidelity : float or None
-        PSNR against the original's renders; `None` when identical.
+        PSNR against the original's renders; `None` if they are identical.
     modelled_drop : float
         Drop modelled from the error against the original's renders.
     worst : Measurement or None
-        The same of the worst view alone.
+        Quality of the worst view alone.
     """
 
     drop: float | None
@@ -42,11 +42,11 @@ class Measurement:
     worst: Measurement | None = None
 
     def figure(self, figure: Figure) -> float | None:
-        """What `figure` names, dB (`None`: identical, or no photos)."""
+        """The figure of this name, dB; `None` if renders are identical or photos are missing."""
         return {"drop": self.drop, "modelled drop": self.modelled_drop, "fidelity": self.fidelity}[figure]
 
     def loss(self, figure: Figure) -> float:
-        """The same figure as a number that grows as quality falls."""
+        """The figure of this name as a number that grows as quality falls."""
         if figure == "fidelity":
             return -IDENTICAL_DB if self.fidelity is None else -self.fidelity
         value = self.figure(figure)
@@ -56,14 +56,14 @@ class Measurement:
 
 
 class Target(Protocol):
-    """What `adapt` needs to know of a target."""
+    """A target, as searches use it."""
 
     @property
     def figure(self) -> Figure: ...
 
     @property
     def limit_bytes(self) -> int | None:
-        """Largest size that is allowed, or `None` when quality decides."""
+        """Largest allowed size, or `None` if quality decides."""
 
     def excess(self, size: int, measurement: Measurement | None) -> float:
         """By how much a point misses; zero or less holds."""
@@ -72,12 +72,12 @@ class Target(Protocol):
         """The target in words, for the summary and for messages."""
 
     def report(self, size: int, measurement: Measurement | None) -> str:
-        """The point's figure in the target's own words."""
+        """The figure of a point that the target is about, in words."""
 
 
 @dataclass(frozen=True)
 class MaxDrop:
-    """Lose at most `limit` dB, by photos (`figure="drop"`) or modelled (`figure="modelled drop"`)."""
+    """Lose at most `limit` dB against photos (`figure="drop"`), or modelled (`figure="modelled drop"`)."""
 
     limit: float
     figure: Figure = "drop"
@@ -100,9 +100,9 @@ class MaxDrop:
 
 
 def _log_loss(loss: float, limit: float) -> float:
-    """Log scale: the error grows about exponentially with the rates, so interpolation is near linear in it.
+    """Log of loss over limit. The error grows about exponentially with the rates, so that this is nearly linear in them.
 
-    The floor keeps drops at or below zero (compressed beats original) in the domain, far on the side that holds.
+    The floor allows for drops at or below zero (the compressed scene beats the original), which hold by far.
     """
     return math.log(max(loss / limit, 0.02))
 
@@ -136,12 +136,12 @@ class MinFidelity:
 
 @dataclass(frozen=True)
 class WorstToo:
-    """Hold `target`, and lose at most `limit_worst` dB in the worst view as well."""
+    """Hold `target`, and also lose at most `limit_worst` dB in the worst view."""
 
     target: MaxDrop | MinFidelity
     limit_worst: float
     drop: Figure
-    """What the worst view loses is told by this figure: `drop` or `modelled drop`."""
+    """Figure for the worst view: `drop` or `modelled drop`."""
     limit_bytes: int | None = None
 
     def __post_init__(self) -> None:
@@ -152,12 +152,12 @@ class WorstToo:
 
     @property
     def figure(self) -> Figure:
-        """The figure of the mean."""
+        """The figure of the target for the mean."""
         return self.target.figure
 
     @property
     def limit(self) -> float:
-        """Of the mean."""
+        """The limit of the target for the mean."""
         return self.target.limit
 
     def _loss(self, measurement: Measurement | None) -> float:
@@ -177,7 +177,7 @@ class WorstToo:
 
 @dataclass(frozen=True)
 class MaxSize:
-    """Stay within `limit_bytes`; `figure` picks the best of the points that fit."""
+    """Stay within `limit_bytes`; among points that fit, `figure` tells the best."""
 
     limit_bytes: int
     figure: Figure = "modelled drop"
@@ -199,7 +199,7 @@ class MaxSize:
 
 
 def min_ratio(ratio: float, ply_bytes: int, figure: Figure = "modelled drop") -> MaxSize:
-    """The size target behind `--min-ratio`: PLY bytes / ratio, rounded down.
+    """The size target of `--min-ratio`: bytes of the PLY / ratio, rounded down.
 
     >>> min_ratio(10.0, 2480).limit_bytes
     248

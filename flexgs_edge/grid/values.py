@@ -1,4 +1,4 @@
-"""From grid codes back to float32 values, as every decoder computes them."""
+"""Dequantize grid codes to float32 values, in the operations that every decoder must use."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flexgs_edge.scene.fields import FIELD, sh_rest_count
 
 
 def values_of(grid: GridScene, storage: Storage = IN_MEMORY) -> dict[str, np.ndarray]:
-    """`from_grid` of all rows and fields, in arrays of `storage`."""
+    """Values of all rows and fields (see `from_grid`), in arrays of `storage`."""
     planes = {
         name: storage.empty((field.width(grid.sh_degree), grid.count), np.float32) for name, field in FIELD.items()
     }
@@ -33,7 +33,7 @@ def values_of(grid: GridScene, storage: Storage = IN_MEMORY) -> dict[str, np.nda
         )
         for name, values in from_grid(some, slice(None), names).items():
             put_rows(planes[name], part, values)
-        # As `from_grid` finds them, but counted once.
+        # The same places as in `from_grid`, but counted once.
         degrees = grid.sh_degrees[part]
         last = first + np.array([np.count_nonzero(degrees > level) for level in range(grid.sh_degree)], np.int64)
         bands = [
@@ -47,10 +47,10 @@ def values_of(grid: GridScene, storage: Storage = IN_MEMORY) -> dict[str, np.nda
 def from_grid(
     grid: GridScene, rows: slice | np.ndarray = slice(None), fields: Sequence[str] = tuple(FIELD)
 ) -> dict[str, np.ndarray]:
-    """Values of `rows` of a grid: the specification of every decoder.
+    """Values of some rows of a grid; this is the specification of every decoder.
 
-    In float32, each operation rounded once and none fused: value = code * step; quaternions
-    w = sqrt(max(0, 1 - ((x*x + y*y) + z*z))); colours h = Cg * 0.5, c = Co * 0.5, t = Y - h, then
+    All operations are float32, each is rounded once, and none is fused. A value is code * step. Quaternions have
+    w = sqrt(max(0, 1 - ((x*x + y*y) + z*z))). Colours take h = Cg * 0.5, c = Co * 0.5, t = Y - h, and then
     red = t + c, green = Y + h, blue = t - c.
 
     Returns
@@ -77,7 +77,7 @@ def _part(values: np.ndarray, rows: slice | np.ndarray) -> np.ndarray:
 
 
 def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:
-    """[3 * K, n] f32, zero above each row's degree."""
+    """[3 * K, n] f32, zero above each row's SH degree."""
     if isinstance(rows, slice):
         start, stop, step = rows.indices(grid.count)
         rows = rows if step == 1 else np.arange(start, stop, step)
@@ -94,14 +94,14 @@ def _sh_rest(grid: GridScene, rows: slice | np.ndarray) -> np.ndarray:
 
 
 def _spread_bands(grid: GridScene, degrees: np.ndarray, bands: Sequence[np.ndarray]) -> np.ndarray:
-    """[3 * K, n] f32 of rows with these degrees ([n]) and these codes of each degree."""
+    """[3 * K, n] f32 of rows with these SH degrees [n], from the codes of each degree."""
     planes = np.zeros((3, sh_rest_count(grid.sh_degree), len(degrees)), np.float32)
     for degree, chosen in enumerate(bands, start=1):
         has = np.flatnonzero(degrees >= degree)
         values = _rgb(chosen.reshape(3, 2 * degree + 1, len(has)), grid.steps.colour(grid.steps.sh[degree - 1]))
         band = planes[:, degree * degree - 1 : (degree + 1) ** 2 - 1]
         for colour, coefficients in zip(band, values, strict=True):
-            # Plane by plane: one list of places for all of them at once is much slower.
+            # Plane by plane: indexing all planes at once with one list of places is much slower.
             for plane, value in zip(colour, coefficients, strict=True):
                 plane[has] = value
     return planes.reshape(planes.shape[0] * planes.shape[1], len(degrees))
@@ -113,14 +113,14 @@ def _values(codes: np.ndarray, step: float) -> np.ndarray:
 
 
 def _quats(xyz: np.ndarray) -> np.ndarray:
-    """[4, n] f32 quaternions w x y z of their last three components."""
+    """[4, n] f32 quaternions w x y z, from their last three components."""
     x, y, z = xyz
     square = np.float32(1) - ((x * x + y * y) + z * z)
     return np.stack([np.sqrt(np.maximum(square, np.float32(0))), x, y, z])
 
 
 def _rgb(codes: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """[3, m, n] f32 colours of Y, Co, Cg codes."""
+    """[3, m, n] f32 red, green and blue, from codes of Y, Co, Cg."""
     luma, orange, green = codes.astype(np.float32) * steps[:, None, None]
     half_orange, half_green = orange * np.float32(0.5), green * np.float32(0.5)
     rest = luma - half_green

@@ -1,1 +1,1 @@
-"""Integers of the method `paper`: a value is a b-bit code in a range."""
+"""Bit-packed scenes: each value is a code of b bits within a range. The method `paper` makes these."""

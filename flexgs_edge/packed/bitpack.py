@@ -1,7 +1,7 @@
-"""Codes of 1 to 16 bits in byte strings, least significant bit first: the code of row i starts at bit i * bits.
+"""Pack codes of 1 to 16 bits into bytes, least significant bit first: the code of row i starts at bit i * bits.
 
-Eight codes of b bits fill exactly b bytes, so every width has whole bytes at every eighth row: eight codes are put
-together in two 64-bit words and their first b bytes are kept. Any row range can be read without the rest.
+Eight codes of b bits fill exactly b bytes, so every eighth row starts at a whole byte. We join eight codes in two 64-bit words
+and keep the first b bytes. Any range of rows can be read without the rest.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 MAX_BITS = 16
-"""Widest code: two bytes."""
+"""Most bits of a code: two bytes."""
 
 
 def plane_bytes(rows: int, bits: int) -> int:
-    """Bytes of `rows` codes of `bits` bits.
+    """Bytes of a plane of `rows` codes of `bits` bits.
 
     >>> plane_bytes(3, 4), plane_bytes(0, 7), plane_bytes(9, 1)
     (2, 0, 2)
@@ -22,7 +22,7 @@ def plane_bytes(rows: int, bits: int) -> int:
 
 
 def pack(codes: np.ndarray, bits: int) -> np.ndarray:
-    """Codes as bytes; unused bits of the last byte are zero.
+    """Pack codes into bytes; unused bits of the last byte are zero.
 
     Parameters
     ----------
@@ -59,12 +59,12 @@ def pack(codes: np.ndarray, bits: int) -> np.ndarray:
 
 
 def unpack(plane: np.ndarray, bits: int, start: int, stop: int) -> np.ndarray:
-    """Codes of rows [start, stop) of a packed plane.
+    """Unpack the codes of rows [start, stop) of a plane.
 
     Parameters
     ----------
     plane : np.ndarray
-        [bytes] u8, contiguous, as `pack` made it.
+        [bytes] u8, contiguous, from `pack`.
     bits : int
         1 to 16.
     start, stop : int
@@ -95,7 +95,7 @@ def unpack(plane: np.ndarray, bits: int, start: int, stop: int) -> np.ndarray:
 
 
 def pack_into(plane: np.ndarray, bits: int, start: int, codes: np.ndarray) -> None:
-    """Write codes at row `start` of a plane that holds rows [0, start) already (later rows are lost)."""
+    """Write codes into a plane from row `start` on; rows [0, start) are kept, and later rows are lost."""
     head = start // 8 * 8
     if head != start:
         codes = np.concatenate([unpack(plane, bits, head, start), codes])
@@ -105,7 +105,7 @@ def pack_into(plane: np.ndarray, bits: int, start: int, codes: np.ndarray) -> No
 
 
 def _join(fours: np.ndarray, bits: int) -> np.ndarray:
-    """Four codes a row ([m, 4] u64) in one word of 4 * bits bits."""
+    """Join the four codes of each row ([m, 4] u64) in one word of 4 * bits bits."""
     word = fours[:, 0].copy()
     for i in range(1, 4):
         word |= fours[:, i] << np.uint64(i * bits)
@@ -113,7 +113,7 @@ def _join(fours: np.ndarray, bits: int) -> np.ndarray:
 
 
 def _unpack_eights(used: np.ndarray, bits: int) -> np.ndarray:
-    """[m, 8] u16 codes of the bytes `used` (a missing tail of the last eight reads as zero)."""
+    """[m, 8] u16 codes of the bytes `used`; missing bytes of the last eight codes read as zero."""
     eights = -(-len(used) // bits)
     padded = np.zeros((eights, 16), np.uint8)
     whole = len(used) // bits

@@ -1,4 +1,4 @@
-"""Bits per code for every attribute: the `--bits` of the command line and the `bits` of the container."""
+"""Bits per code for every attribute: `--bits` of the command line, and `bits` of the container."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flexgs_edge.scene.fields import FIELD
 
 @dataclass(frozen=True)
 class BitSpec:
-    """Bits per code, 1 to 16, for every attribute; the default is the paper's choice."""
+    """Bits per code, 1 to 16, for every attribute; the default is the choice of the FlexGaussian paper."""
 
     xyz: int = 16
     dc: int = 8
@@ -27,7 +27,7 @@ class BitSpec:
 
     @classmethod
     def parse(cls, text: str) -> BitSpec:
-        """Read `xyz=16,dc=8,...`; attributes that are not named keep the paper's bits.
+        """Read `xyz=16,dc=8,...`; attributes that are not named keep the default bits.
 
         >>> str(BitSpec.parse("rest=3,xyz=14"))
         'xyz=14,dc=8,scale=8,rot=8,opacity=4,rest=3'
@@ -45,11 +45,11 @@ class BitSpec:
 
     @classmethod
     def rtn(cls, bits: int) -> BitSpec:
-        """One width for all attributes (with `groups=1`: plain round to nearest, the baseline)."""
+        """The same bits for all attributes; with `groups=1`, plain round to nearest, a baseline of the studies."""
         return cls(*[bits] * len(fields(cls)))
 
     def of(self, field: str) -> int:
-        """Bits of the scene field of that name (`log_scales`, ...)."""
+        """Bits of a scene field, such as `log_scales`."""
         return int(getattr(self, FIELD[field].bits))
 
     def __str__(self) -> str:

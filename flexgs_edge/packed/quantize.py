@@ -1,11 +1,11 @@
-"""MPQ, mixed-precision quantization: b-bit codes per channel with one range for every group of consecutive rows.
+"""Mixed-precision quantization (MPQ): b-bit codes per channel, with one range for each group of consecutive rows.
 
-Source: FlexGaussian (ACM MM 2025), section on MPQ. For a group with smallest value lo and largest hi:
+Source: FlexGaussian (ACM MM 2025), section on MPQ. For a group with smallest value lo and largest value hi:
 
     step = (hi - lo) / (2^bits - 1)        code = rint((x - lo) / step), clipped        x' = lo + code * step
 
-all stored and computed in float32, x' with one multiply and one add that are never fused, so that every device gives
-the same bits.
+All numbers are stored and computed in float32. x' takes one multiplication and one addition that are never fused, so that
+every device gives the same bits.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
 
 
 LARGEST = 2.0**126
-"""Largest magnitude that can be coded: a range twice as wide still fits float32, so nothing on the way overflows."""
+"""Largest magnitude that can be coded. A range is at most twice as wide and still fits float32, so nothing overflows."""
 SMALLEST_STEP = 2.0**-126
-"""Smallest normal float32. A finer step counts as constant, because devices may flush it to zero."""
+"""Smallest normal float32. A range with a finer step counts as constant, since devices may flush the step to zero."""
 
 
 _Read = Callable[[slice, Sequence[str]], dict[str, np.ndarray]]
-"""Gives {field: [c, n] f32} for a row range and field names."""
+"""Reads {field: [c, n] f32} for a range of rows and some fields."""
 
 
 def group_count(rows: int, groups: int | None = None) -> int:
-    """Groups of an array of `rows` rows: about one for 512 rows, or `groups`; never more than rows.
+    """Number of groups for `rows` rows: `groups`, or by default about one for 512 rows; never more than rows.
 
     >>> group_count(0), group_count(5), group_count(2048), group_count(3, 10)
     (0, 1, 4, 3)
@@ -49,20 +49,20 @@ def group_count(rows: int, groups: int | None = None) -> int:
 
 
 def group_bounds(rows: int, groups: int, first: int = 0, last: int | None = None) -> np.ndarray:
-    """First row of groups `first` to `last` (inclusive; `groups` gives the end): i * rows // groups as i64."""
+    """First rows of groups `first` to `last` (inclusive; `groups` stands for the end): i * rows // groups as i64."""
     index = np.arange(first, (groups if last is None else last) + 1, dtype=np.int64)
     bounds: np.ndarray = index * rows // max(groups, 1)
     return bounds
 
 
 def group_of(row: int, rows: int, groups: int) -> int:
-    """The group that holds `row`: the largest i with i * rows // groups <= row."""
+    """Index of the group that holds `row`: the largest i with i * rows // groups <= row."""
     return ((row + 1) * groups - 1) // rows
 
 
 @dataclass(frozen=True, eq=False)
 class QuantizedArray:
-    """The codes of one field, bit-packed, and their ranges.
+    """The bit-packed codes of one field, and the range of each group.
 
     Parameters
     ----------
@@ -93,24 +93,24 @@ class QuantizedArray:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of ranges and codes."""
+        """Bytes of the ranges and codes."""
         return self.low.nbytes + self.step.nbytes + self.planes.nbytes
 
 
 @dataclass(frozen=True, eq=False)
 class QuantizedScene:
-    """A quantized scene: rows [0, sh_count) have SH, the others none.
+    """A quantized scene; rows [0, sh_count) have SH, the others have none.
 
     Parameters
     ----------
     count, sh_count : int
         Rows, and rows with SH.
     sh_degree : int
-        0 when no row has SH.
+        0 if no row has SH.
     origin : np.ndarray
         [3] f64, world: positions are relative to it.
     arrays : dict
-        One `QuantizedArray` a scene field; `sh_rest` has `sh_count` rows, the others `count`.
+        One `QuantizedArray` for each scene field; `sh_rest` has `sh_count` rows, the others have `count`.
     """
 
     count: int
@@ -121,21 +121,21 @@ class QuantizedScene:
 
     @property
     def bits(self) -> BitSpec:
-        """Bits of every attribute."""
+        """Bits per code of every attribute."""
         return BitSpec(**{FIELD[name].bits: array.bits for name, array in self.arrays.items()})
 
     def rows_of(self, field: str) -> int:
-        """Rows that the array of `field` covers."""
+        """Rows of the array of `field`."""
         return self.sh_count if field == "sh_rest" else self.count
 
 
 def array_bytes(rows: int, channels: int, bits: int, groups: int) -> int:
-    """Exact bytes of a `QuantizedArray`: codes, and 8 bytes of range a group and channel."""
+    """Exact bytes of a `QuantizedArray`: its codes, and a range of 8 bytes for each group and channel."""
     return channels * (plane_bytes(rows, bits) + 8 * groups)
 
 
 def quantized_bytes(count: int, sh_count: int, sh_degree: int, bits: BitSpec, groups: int | None = None) -> int:
-    """Exact bytes of codes and ranges of a `QuantizedScene` of these counts, without the container around them."""
+    """Exact bytes of the codes and ranges of a `QuantizedScene`, without the container around them."""
     total = 0
     for field in FIELDS:
         rows = sh_count if field.name == "sh_rest" else count
@@ -144,7 +144,7 @@ def quantized_bytes(count: int, sh_count: int, sh_degree: int, bits: BitSpec, gr
 
 
 def quantize_array(values: np.ndarray, bits: int, groups: int) -> QuantizedArray:
-    """Quantize an array that is in memory.
+    """Quantize an array that lies in memory.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def quantize_array(values: np.ndarray, bits: int, groups: int) -> QuantizedArray
     Raises
     ------
     InputError
-        When a value is not finite or too large.
+        If a value is not finite or too large.
     """
     values = np.asarray(values, np.float32)
     channels, rows = values.shape
@@ -167,7 +167,7 @@ def quantize_array(values: np.ndarray, bits: int, groups: int) -> QuantizedArray
 
 
 def codes(array: QuantizedArray, rows: slice) -> np.ndarray:
-    """[c, n] u16 codes of `rows` (a slice with step 1)."""
+    """[c, n] u16, the codes of `rows` (a slice with step 1)."""
     start, stop, _ = rows.indices(array.count)
     out = np.empty((array.channels, max(stop - start, 0)), np.uint16)
     for channel in range(array.channels):
@@ -176,20 +176,20 @@ def codes(array: QuantizedArray, rows: slice) -> np.ndarray:
 
 
 def dequantize(array: QuantizedArray, rows: slice) -> np.ndarray:
-    """Values of `rows` (a slice with step 1): the specification of every dequantizer.
+    """Values of `rows` (a slice with step 1); this is the specification of every dequantizer.
 
     Returns
     -------
     np.ndarray
-        [c, n] f32, lo + code * step: the product is rounded to float32, then the sum.
+        [c, n] f32, lo + code * step: first the product is rounded to float32, then the sum.
     """
     return dequantize_part(array, 0, rows)
 
 
 def dequantize_part(array: QuantizedArray, first: int, rows: slice, out: np.ndarray | None = None) -> np.ndarray:
-    """`dequantize` for an array whose planes start at row `first` (a multiple of 8); ranges are those of all rows.
+    """`dequantize` for an array whose planes start at row `first` (a multiple of 8); the ranges cover all rows.
 
-    Fills `out` ([c, n] f32) where given.
+    Fills `out` ([c, n] f32) if it is given.
     """
     start, stop, _ = rows.indices(array.count)
     if out is None:
@@ -206,10 +206,10 @@ def dequantize_part(array: QuantizedArray, first: int, rows: slice, out: np.ndar
 
 
 def largest_error(array: QuantizedArray) -> np.ndarray:
-    """Largest |x' - x| that the quantizer may cause, per channel and group.
+    """Bound on the error |x' - x| of the quantizer, per channel and group.
 
-    Half a step, and the roundings of float32: of the step (times the largest code), of (x - lo) / step, of code * step
-    and of the sum; each is at most 2^-24 of the largest number in it.
+    It is half a step, plus the float32 roundings of the step (times the largest code), of (x - lo) / step, of code * step
+    and of the sum. Each rounding is at most 2^-24 of the largest number in it.
 
     Returns
     -------
@@ -218,7 +218,7 @@ def largest_error(array: QuantizedArray) -> np.ndarray:
     """
     low, step = array.low.astype(np.float64), array.step.astype(np.float64)
     span = step * (2**array.bits - 1)
-    # A step that underflowed stands for a range of at most (2^bits - 1) * SMALLEST_STEP.
+    # A step that underflowed to zero stands for a range of at most (2^bits - 1) * SMALLEST_STEP.
     lost = np.where(step == 0, SMALLEST_STEP * (2**array.bits - 1), 0.0)
     bound: np.ndarray = step / 2 + 2.0**-22 * span + 2.0**-24 * np.maximum(abs(low), abs(low + span)) + lost
     return bound
@@ -237,15 +237,15 @@ def quantize_scene(
     Parameters
     ----------
     source : SceneSource
-        A checked scene (finite, no zero quaternions).
+        A checked scene (finite values, no zero quaternions).
     rows_with_sh, rows_without_sh : np.ndarray
-        [n] i64 ascending, from `select_rows`; stored in this order. All are SH-less when the scene's SH degree is 0.
+        [n] i64 ascending, from `select_rows`, stored in this order. At SH degree 0, no row counts as one with SH.
     bits : BitSpec
         Bits per code.
     groups : int, optional
-        Groups per channel of every array; default about one for 512 rows. 1 for round to nearest.
+        Groups per channel of every array; by default about one for 512 rows. 1 is plain round to nearest.
     chunk_rows : int
-        Rows held at a time, beside the packed result.
+        Rows held in memory at a time, beside the packed result.
     """
     if source.sh_degree == 0 and len(rows_with_sh):
         rows_without_sh = np.sort(np.concatenate([rows_with_sh, rows_without_sh]))
@@ -274,7 +274,7 @@ def quantize_scene(
 def _read_blocks(
     source: SceneSource, blocks: Sequence[np.ndarray], part: slice, fields: Sequence[str]
 ) -> dict[str, np.ndarray]:
-    """{field: [c, n] f32} of rows `part` of the blocks' concatenation, each block read as sorted rows."""
+    """{field: [c, n] f32} of rows `part` of the joined blocks; each block is read as sorted rows."""
     pieces = []
     start, stop = part.start, part.stop
     for block in blocks:
@@ -290,17 +290,17 @@ def _read_blocks(
 def _quantize_stream(
     read: _Read, layouts: dict[str, tuple[int, int]], rows: int, groups: int, chunk_rows: int
 ) -> dict[str, QuantizedArray]:
-    """Quantize what `read` gives, in runs of whole groups of at most `chunk_rows` rows.
+    """Quantize the rows that `read` gives, in runs of whole groups of at most `chunk_rows` rows.
 
-    A single group larger than that is read twice in pieces: once for its range, once for its codes.
-    `layouts` has channels and bits of every field.
+    A larger group is read twice, in pieces: once for its range, once for its codes. `layouts` has the channels and bits of
+    every field.
     """
     arrays = {name: _empty_array(rows, channels, bits, groups) for name, (channels, bits) in layouts.items()}
     names = [name for name, array in arrays.items() if array.channels]
     first = 0 if names else groups
     while first < groups:
         start = first * rows // groups
-        # Group i ends by row start + chunk_rows while i * rows // groups <= start + chunk_rows.
+        # Group i ends at or before row start + chunk_rows while i * rows // groups <= start + chunk_rows.
         last = min(max(((start + chunk_rows + 1) * groups - 1) // rows, first + 1), groups)
         stop = last * rows // groups
         pieces = [slice(at, min(at + chunk_rows, stop)) for at in range(start, stop, chunk_rows)]
@@ -325,7 +325,7 @@ def _empty_array(rows: int, channels: int, bits: int, groups: int) -> QuantizedA
 def _extremes(
     values: dict[str, np.ndarray], read: _Read, pieces: Sequence[slice], bounds: np.ndarray
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Smallest and largest value ([c, groups] f32) of the groups in one piece, or of one group in several."""
+    """Smallest and largest values ([c, groups] f32) of the groups in one piece, or of one group in several pieces."""
     starts = bounds[:-1] - bounds[0]
     ranges = {
         name: (np.minimum.reduceat(plane, starts, axis=1), np.maximum.reduceat(plane, starts, axis=1))
@@ -340,8 +340,8 @@ def _extremes(
 
 
 def _set_ranges(name: str, array: QuantizedArray, first: int, last: int, low: np.ndarray, high: np.ndarray) -> None:
-    """Fill low and step of groups [first, last)."""
-    # NaN spreads through minimum and maximum, and fails both comparisons.
+    """Set low and step of groups [first, last)."""
+    # NaN passes through minimum and maximum, and fails both comparisons.
     bad = ~((low >= -LARGEST) & (high <= LARGEST))
     if bad.any():
         channel, group = np.argwhere(bad)[0]
@@ -352,12 +352,12 @@ def _set_ranges(name: str, array: QuantizedArray, first: int, last: int, low: np
         )
     step = ((high.astype(np.float64) - low) / (2**array.bits - 1)).astype(np.float32)
     step[step < SMALLEST_STEP] = 0
-    array.low[:, first:last] = low + np.float32(0)  # -0 and 0 are equal: which of them is the minimum is chance
+    array.low[:, first:last] = low + np.float32(0)  # turns -0 into 0: either may come out as the minimum of both
     array.step[:, first:last] = step
 
 
 def _set_codes(array: QuantizedArray, rows: slice, values: np.ndarray) -> None:
-    """Pack the codes of `rows`, one channel at a time: its temporaries stay in the cache."""
+    """Pack the codes of `rows`, one channel at a time, so that temporary arrays stay in the processor's cache."""
     groups, sizes = _groups_of_rows(rows.start, rows.stop, array.count, array.groups)
     low, step = array.low[:, groups], array.step[:, groups]
     divisors = np.where(step == 0, np.float32(1), step)
@@ -370,7 +370,7 @@ def _set_codes(array: QuantizedArray, rows: slice, values: np.ndarray) -> None:
 
 
 def _groups_of_rows(start: int, stop: int, rows: int, groups: int) -> tuple[slice, np.ndarray]:
-    """The groups that rows [start, stop) touch, and how many of these rows each of them has."""
+    """The groups that rows [start, stop) touch, and the number of these rows in each group."""
     first, last = group_of(start, rows, groups), group_of(stop - 1, rows, groups)
     bounds = group_bounds(rows, groups, first, last + 1)
     bounds[0], bounds[-1] = start, stop

@@ -139,7 +139,7 @@ class Quality:
 
     @property
     def by_loss(self) -> list[int]:
-        """Indices of the views, the worst first: by drop where all have photos, else by their error."""
+        """Indices of the views, the worst first: by drop if all have photos, else by error."""
         drops = [view.drop for view in self.views]
         losses = [view.error if None in drops else drop or 0.0 for view, drop in zip(self.views, drops)]
         return sorted(range(len(losses)), key=lambda index: -losses[index])
@@ -174,22 +174,22 @@ def compare_view(
     ssims: Similarities | None = None,
     lpips: Distance | None = None,
 ) -> ViewQuality:
-    """Figures of one render.
+    """Measure the quality of one render.
 
     Parameters
     ----------
     name : str
-        The view's name.
+        Name of the view.
     image, original : np.ndarray
-        Renders of the scene in question and of the original, [H, W, 3] f32, not clamped.
+        Renders of the compressed scene and of the original, [H, W, 3] f32, not clamped.
     photo : np.ndarray, optional
         The photo, [H, W, 3] f32 in [0, 1].
     original_error : float, optional
         Mean squared error of `original` against `photo`, if it is known already.
     ssims : callable, optional
-        Also measure this similarity of all pairs of images.
+        Measures the similarity of all pairs of images; by default SSIM is left out.
     lpips : callable, optional
-        Also measure this distance of two images. LPIPS takes seconds for each pair.
+        Measures a distance of all pairs of images; left out by default. LPIPS takes seconds for each pair.
     """
     if photo is not None and original_error is None:
         original_error = mse(original, photo)
