@@ -1,1 +1,1 @@
-"""Where somebody stood: cameras, their files, photos, automatic views, orders of poses."""
+"""Cameras: their files and photos, generated views, and orders of views."""

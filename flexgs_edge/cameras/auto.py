@@ -1,10 +1,10 @@
-"""A rig for scenes without cameras: views chosen so that the Gaussians are seen as they were trained to be seen.
+"""Place cameras automatically around a scene that has none, so that the Gaussians are seen as in training.
 
 Two things in a trained scene tell where its cameras stood. SH above degree 0 start at zero and grow only along directions that
-were looked from, so view-dependent colour is strong towards the training cameras and fades elsewhere (measured: a third of it
-behind a captured wall, two thirds under a floor). And cameras stood in the open with matter in sight. Candidates are a lattice
-in and around the scene; those in opaque matter are dropped by a coarse grid of optical depth; views are then picked one by one
-for what they add. Objects get outside rings that way, and surroundings views inside out.
+cameras looked from. So view-dependent colour is strong towards the training cameras, and fades elsewhere. And cameras
+stood in the open, with matter in sight. Candidates form a lattice in and around the scene. A coarse grid of optical depth
+removes those in opaque matter. Then we pick views one by one for what they add. Objects get rings outside, and surroundings
+get views inside out.
 """
 
 from __future__ import annotations
@@ -21,49 +21,49 @@ from flexgs_edge.errors import InputError
 DEFAULT_VIEWS = 48
 DEFAULT_SIZE = (640, 480)
 FIELD_OF_VIEW = math.radians(50.0)
-"""Across the image's width: phones' and the field's usual lenses have 40 to 70 degrees."""
+"""Angle of view across the image's width; lenses of phones, and those usual in the field, have 40 to 70 degrees."""
 LATTICE = 16
-"""Candidates along the longest side."""
+"""Candidates along the longest side of the lattice."""
 MARGIN = 1.2
-"""The lattice reaches this many half sides beyond the middle box on each side."""
+"""The lattice reaches so many half sides of the middle box to each side."""
 POSITIONS = 400
-"""Best candidates that views are made from."""
+"""Number of best candidates from which views are made."""
 SHOWN_SHARE = {True: 0.5, False: 0.65}
-"""Places that show less than this share of what the best one shows, in all directions together, are left out: who is inside a
-room sees all walls, from outside it is half of them. Where SH tell directions (True), they tell this too."""
+"""Places that show less than this share of the best place, in all directions together, are left out. Inside a room one sees
+all walls, from outside only half of them. If SH tell directions (True), they tell this too."""
 QUICK = 5
-"""Every 5th witness judges all candidates, and all of them judge the better ones: faster, and the same views."""
+"""Every 5th witness judges all candidates, and all witnesses judge the better ones: faster, with the same views."""
 DIRECTIONS = 192
 OPEN_DEPTH = 0.25
-"""Largest optical depth, along its side, of a cell in which a camera may stand."""
+"""Largest optical depth of a cell, along its side, in which a camera may stand."""
 NEAR_SHARE = 0.15
-"""Nothing much may be in a view nearer than this share of the extent."""
+"""The part of a view nearer than this share of the extent should be almost empty."""
 NEAR_CLEAR = 0.7
-"""Light that must get through that near part, in the mean over the view."""
+"""Share of light that must get through that near part, in the mean over the view."""
 SHARP = 0.008
-"""Deviation of a splat over its distance as cameras usually saw it (5 pixels of a view 640 wide)."""
+"""Usual deviation of a splat over its distance from a camera (5 pixels in a view 640 wide)."""
 SHARP_SPREAD = math.log(8.0)
-"""One standard deviation of its logarithm: wide, since scenes of few large splats are seen from no farther."""
+"""One standard deviation of its logarithm. It is wide, since scenes of few large splats are seen from the same distance."""
 AGREEMENT_POWER = 3.0
 SEEN_POWER = 1.5
-"""A witness that n views show as well as any place can counts (1 + n)^-SEEN_POWER."""
+"""A witness that n views show as well as the best place counts (1 + n)^-SEEN_POWER."""
 APART = 0.2
 """Views nearer to each other than this share of the extent add less."""
 LEVEL = 0.2
-"""Views whose mean direction is within this of level do not tell which way is up."""
+"""Views do not tell which way is up if their mean direction is within this of level."""
 
 
 def automatic_rig(
     source: Gaussians, views: int = DEFAULT_VIEWS, width: int = DEFAULT_SIZE[0], height: int = DEFAULT_SIZE[1]
 ) -> tuple[list[Camera], str]:
-    """Cameras for a scene that has none; the same scene always gets the same ones.
+    """Place cameras for a scene that has none; the same scene always gets the same cameras.
 
     Parameters
     ----------
     source : SceneSource
         Checked: finite and not empty.
     views : int, optional
-        Cameras to make; named auto_000, auto_001, ... in order of what they add, so that every hold-out is a mixture.
+        Number of cameras, named auto_000, auto_001, ... in order of what they add, so that every hold-out is a mixture.
     width, height : int, optional
         Pixels.
 
@@ -72,12 +72,12 @@ def automatic_rig(
     cameras : list of Camera
         World coordinates.
     note : str
-        How the rig was made, for the summary.
+        How the cameras were placed, for the summary.
 
     Raises
     ------
     InputError
-        For less than one view, or a scene without extent.
+        If less than one view is asked for, or the scene has no extent.
     """
     if views < 1:
         raise InputError(f"{views} automatic views: expected at least 1")
@@ -90,7 +90,7 @@ def automatic_rig(
         rank = np.where(shown >= least, merit.sum(axis=1), 0.0)
         best = np.argsort(-rank, kind="stable")[: min(kept, int((rank > 0).sum()) or 1)]
         places, merit = places[best], merit[best]
-    # A circle of the frame's area: what is in its corners and beside it evens out.
+    # A circle of the frame's area. What it misses in the corners and adds beside the frame evens out.
     frame = _Frame(fibonacci(DIRECTIONS), math.atan(math.sqrt(width * height / math.pi) / focal))
     chosen = _choose(scene, places, merit, frame, views)
     directions = frame.directions
@@ -103,7 +103,7 @@ def automatic_rig(
 
 
 def open_places(scene: Witnesses) -> np.ndarray:
-    """[n, 3] f64: candidates on a lattice in and around the scene, none of them in opaque matter."""
+    """[n, 3] f64, candidates on a lattice in and around the scene, without those in opaque matter."""
     reach = (1 + MARGIN) * np.maximum(scene.half, 0.5 * scene.half.max())
     step = 2 * float(reach.max()) / LATTICE
     axes = [np.arange(-math.floor(r / step), math.floor(r / step) + 1) * step for r in reach]
@@ -112,13 +112,13 @@ def open_places(scene: Witnesses) -> np.ndarray:
     worst = np.zeros(lattice.shape[1])
     for offset in offsets.T:
         worst = np.maximum(worst, scene.optical_depth(lattice + offset[:, None]))
-    # Thin fog everywhere: the clearest quarter is the best there is.
+    # If there is thin fog everywhere, the clearest quarter is the best there is.
     limit = max(OPEN_DEPTH, float(np.quantile(worst, 0.25)))
     return np.ascontiguousarray(lattice[:, worst <= limit].T)
 
 
 def _merit(scene: Witnesses, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How well each place shows each witness ([n, M] f64), and how much of the scene each place is meant to show ([n] f64)."""
+    """How well each place shows each witness ([n, M] f64), and how much of the scene a place should show ([n] f64)."""
     merit = np.empty((len(places), scene.weights.size))
     shown = np.empty(len(places))
     for row, place in enumerate(places):
@@ -133,21 +133,21 @@ def _merit(scene: Witnesses, places: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 @dataclass(frozen=True)
 class _Frame:
-    """Directions of view ([D, 3]), and the half angle of what a view shows."""
+    """Directions of view ([D, 3]), and the half angle of a view."""
 
     directions: np.ndarray
     cone: float
 
     def shows(self, place: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """[D, n] bool: which of `points` ([3, n]) are in a view from `place`."""
+        """[D, n] bool, the `points` ([3, n]) that each view from `place` shows."""
         lines = points - place[:, None]
         lines /= np.maximum(np.linalg.norm(lines, axis=0), 1e-12)
-        # einsum, not @: these products are too small for BLAS, whose threads are far slower on a busy machine.
+        # einsum instead of @: these products are too small for BLAS, whose threads are far slower on a busy machine.
         inside: np.ndarray = np.einsum("dx,xn->dn", self.directions, lines) > math.cos(self.cone)
         return inside
 
     def clear(self, scene: Witnesses, place: np.ndarray) -> np.ndarray:
-        """[D] bool: directions in which nothing much is near."""
+        """[D] bool, the directions in which almost nothing is near."""
         ahead = self.directions.T * (NEAR_SHARE * scene.extent + SKIN * scene.cell)
         through = scene.transmittance(place, place[:, None] + ahead)
         around = np.einsum("dx,ex->de", self.directions, self.directions) > math.cos(self.cone)
@@ -158,12 +158,12 @@ class _Frame:
 def _choose(
     scene: Witnesses, places: np.ndarray, merit: np.ndarray, frame: _Frame, views: int
 ) -> list[tuple[int, int]]:
-    """(place, direction) of each view, greedily by the merit that it adds."""
-    # Where nothing is clear the best of the rest is taken.
+    """(place, direction) of each view; each next view is the one that adds most."""
+    # If no place is clear, the best of the others is taken.
     clear = [np.where(frame.clear(scene, place), 1.0, 1e-6) for place in places]
     seen, room = np.zeros(merit.shape[1]), np.ones(len(places))
     fullest = np.maximum(merit.max(axis=0), 1e-300)
-    # What a view adds only ever gets less, so an older figure bounds it: few places are looked at again for each view.
+    # The gain of a view only falls, so an older gain is an upper bound. Few places are looked at again for each view.
     bounds, directions = np.full(len(places), np.inf), np.zeros(len(places), np.int64)
     chosen: list[tuple[int, int]] = []
     for _ in range(views):
@@ -181,11 +181,11 @@ def _choose(
 
 
 def up_axis(places: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, str]:
-    """Up ([3] f64, a coordinate axis), and its name.
+    """The direction of up ([3] f64, a coordinate axis), and its name.
 
-    People walk around a scene more than they climb, and look down on it more than up: up is y or z, along which places
-    ([n, 3]) and directions ([n, 3]) vary least, against the mean direction. Where views are level, it is -y or +z, the
-    conventions of COLMAP and NeRF.
+    People walk around a scene more than they climb, and look down on it more than up. So up is y or z, whichever the places
+    ([n, 3]) and directions ([n, 3]) vary least along, and it points against the mean direction. If views are level, up is -y
+    or +z, by the conventions of COLMAP and NeRF.
     """
     mean = directions.mean(axis=0)
     spread = places.std(axis=0) / max(float(places.std()), 1e-300) + 2 * mean * mean
@@ -199,10 +199,10 @@ def up_axis(places: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, str
 def look(
     name: str, position: np.ndarray, direction: np.ndarray, up: np.ndarray, width: int, height: int, focal: float
 ) -> Camera:
-    """A camera at `position` that looks along `direction`, the image's top towards `up` (all [3], world)."""
+    """A camera at `position` that looks along `direction`; the top of the image points to `up` (all [3], world)."""
     forward = direction / np.linalg.norm(direction)
     right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-3:  # straight up or down: any roll is as good
+    if np.linalg.norm(right) < 1e-3:  # straight up or down: any roll will do
         right = np.cross(forward, np.roll(up, 1))
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
@@ -210,7 +210,7 @@ def look(
 
 
 def fibonacci(count: int) -> np.ndarray:
-    """[count, 3] f64: unit vectors spread evenly over all directions."""
+    """[count, 3] f64, unit vectors spread evenly over all directions."""
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.arange(count) * math.pi * (3 - math.sqrt(5))
     radius = np.sqrt(1 - z * z)

@@ -1,4 +1,4 @@
-"""A pinhole camera, and what is done to whole lists of them: split, limit, scale."""
+"""A pinhole camera, and operations on lists of cameras: split, limit, scale."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Camera:
     Parameters
     ----------
     name : str
-        What photos are matched by and views sorted by.
+        Photos are matched, and views sorted, by this name.
     width, height : int
         Pixels.
     rotation : np.ndarray
@@ -32,7 +32,7 @@ class Camera:
     cx, cy : float
         Principal point, pixels, integer pixel centres: (W - 1) / 2 is the middle.
     distortion : str, optional
-        The lens distortion that was left out: the pose is good for scores, but photos of this camera do not match its renders.
+        A lens distortion that was ignored. The pose serves for scores, but photos of this camera do not match its renders.
     dilation : float
         Added to both diagonal terms of the 2D covariance, px^2.
     """
@@ -59,8 +59,8 @@ class Camera:
 
     @property
     def center(self) -> np.ndarray:
-        """[3] f64: where the camera stands in the world."""
-        # Not by the transpose: files keep rotations to six digits, and 1e6 units from the origin that is a unit.
+        """[3] f64, the camera's place in the world."""
+        # Not by the transpose: files keep rotations to six digits, which 1e6 units from the origin is an error of a unit.
         place: np.ndarray = np.linalg.solve(self.rotation, -self.translation)
         return place
 
@@ -69,7 +69,7 @@ class Camera:
         if width < 1 or height < 1:
             raise InputError(f"camera {self.name!r}: size {width}x{height}: expected at least 1x1")
         across, down = width / self.width, height / self.height
-        # The image's edge, not the centre of its first pixel, is what stays put: hence the half pixels.
+        # The edge of the image stays in place, not the centre of its first pixel: hence the half pixels.
         return replace(
             self,
             width=width,
@@ -81,9 +81,9 @@ class Camera:
         )
 
     def every(self, step: int, column: int = 0, row: int = 0) -> Camera:
-        """The view at every `step`-th pixel of both directions, from pixel (`column`, `row`) on: the same colours, fewer of them.
+        """The view with every `step`-th pixel of both directions, from pixel (`column`, `row`) on; their colours stay the same.
 
-        Raises `InputError` where no pixel is left.
+        Raises `InputError` if no pixel is left.
         """
         width, height = -(-(self.width - column) // step), -(-(self.height - row) // step)
         if not (0 <= column < step and 0 <= row < step) or width < 1 or height < 1:
@@ -102,12 +102,12 @@ class Camera:
         )
 
     def moved(self, origin: np.ndarray) -> Camera:
-        """The same view of a scene whose positions are relative to `origin` ([3] f64, world)."""
+        """The same view for a scene whose positions are relative to `origin` ([3] f64, world)."""
         return replace(self, translation=self.translation + self.rotation @ np.asarray(origin, np.float64))
 
 
 def split_views(count: int, holdout: int = DEFAULT_HOLDOUT) -> tuple[list[int], list[int]]:
-    """Views to train on and views held out, as indices into the list sorted by name.
+    """Split views into those to train on and those held out, as indices into the list sorted by name.
 
     Parameters
     ----------
@@ -127,14 +127,14 @@ def split_views(count: int, holdout: int = DEFAULT_HOLDOUT) -> tuple[list[int], 
 
 
 def limit_width(cameras: Sequence[Camera], max_width: int) -> tuple[list[Camera], str | None]:
-    """Scale views wider than `max_width` pixels down to it, keeping their shape.
+    """Scale views wider than `max_width` pixels down to this width, with the same aspect.
 
     Returns
     -------
     cameras : list of Camera
-        In the same order; heights are rounded down, as the reference training program does.
+        In the same order. Heights are rounded down, as in the reference training program.
     note : str or None
-        How many were scaled, for the summary.
+        How many views were scaled, for the summary.
     """
     if max_width < 1:
         raise InputError(f"--resolution {max_width}: expected a width of at least 1 pixel")
@@ -150,5 +150,5 @@ def limit_width(cameras: Sequence[Camera], max_width: int) -> tuple[list[Camera]
 
 
 def largest_of(cameras: Sequence[Camera]) -> Camera:
-    """The camera with most pixels."""
+    """The camera with the most pixels."""
     return max(cameras, key=lambda camera: camera.width * camera.height)

@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, binary and text: cameras and images; points are not needed."""
+"""Read cameras and images of COLMAP's sparse models, binary or text; the points are not needed."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Model:
     ----------
     name : str
     focals : int
-        Focal lengths at the front of the parameters, 1 or 2; the principal point follows.
+        Number of focal lengths at the front of the parameters, 1 or 2; the principal point follows.
     count : int
-        Parameters in all: those behind the principal point are the lens's.
+        Number of all parameters; those after the principal point describe the lens.
     fisheye : bool
-        No pinhole even where the lens's parameters are zero.
+        The lens is no pinhole, even if its parameters are zero.
     """
 
     name: str
@@ -56,14 +56,14 @@ MODELS: dict[int, Model] = dict(
         )
     )
 )
-"""By COLMAP's model id."""
+"""Camera models by COLMAP's model id."""
 
 UNDISTORT = (
     "colmap image_undistorter --image_path IMAGES --input_path {model} --output_path OUTPUT --output_type COLMAP"
 )
-"""What makes a pinhole model and matching photos of a distorted one; `{model}` is the folder."""
+"""Command that makes a pinhole model and matching photos from a distorted one; `{model}` is the folder."""
 QUATERNION_TOLERANCE = 1e-2
-"""Largest |norm - 1|: COLMAP normalises what it reads, other writers keep 4 digits and more."""
+"""Largest |norm - 1| of a quaternion. COLMAP normalises what it reads; other writers keep 4 digits or more."""
 _NAME_LIMIT = 4096
 _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I4d3dI")
@@ -76,7 +76,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class _Lens:
-    """Width, height and parameters of one of COLMAP's cameras."""
+    """Width, height and parameters of a camera in COLMAP's sense."""
 
     model: Model
     width: int
@@ -90,7 +90,7 @@ class _Lens:
 
 @dataclass(frozen=True)
 class _Image:
-    """One posed image: quaternion w x y z and translation, world to camera."""
+    """A posed image: quaternion w x y z and translation, world to camera."""
 
     quaternion: tuple[float, ...]
     translation: tuple[float, ...]
@@ -99,7 +99,7 @@ class _Image:
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder that holds cameras and images: `folder` itself, or its `0`, `sparse/0` or `sparse`."""
+    """The folder of cameras and images: `folder` itself, or its `0`, `sparse/0` or `sparse`; None if there is none."""
     for place in (folder, folder / "0", folder / "sparse" / "0", folder / "sparse"):
         if any((place / f"{stem}{kind}").is_file() for stem in ("images", "cameras") for kind in _KINDS):
             return place
@@ -107,23 +107,23 @@ def find_model(folder: Path) -> Path | None:
 
 
 def read_colmap(path: str | os.PathLike[str], ignore_distortion: bool = False) -> list[Camera]:
-    """Read a COLMAP model, in the file's order; the binary files where there are both.
+    """Read a COLMAP model in the file's order; binary files go before text files.
 
-    COLMAP's pixel centres lie at integer + 0.5: half a pixel is taken off the principal point.
+    COLMAP's pixel centres lie at integer + 0.5, so half a pixel is subtracted from the principal point.
 
     Parameters
     ----------
     path : path
-        The model's folder, its parent, or the folder that holds `sparse/0`.
+        The folder of the model, its parent, or the folder that holds `sparse/0`.
     ignore_distortion : bool, optional
-        Take the poses of distorted lenses as pinholes; such cameras refuse to be compared with photos.
+        Take the poses of distorted lenses as pinholes; such cameras cannot be compared with photos.
 
     Raises
     ------
     InputError
-        When a file is missing or cannot be read, or a lens is distorted; names the command that undistorts.
+        If a file is missing or cannot be read, or a lens is distorted; the message names the command that undistorts.
     FormatError
-        When a file breaks the format; names file and camera, image, line or byte.
+        If a file breaks the format; the message names file and camera, image, line or byte.
     """
     folder = find_model(Path(path))
     if folder is None:
@@ -212,7 +212,7 @@ def _shown(numbers: Sequence[float]) -> str:
 
 
 class _Bytes:
-    """Reads a binary file piece by piece; nothing is allocated for a claim that the file is too short for."""
+    """Reads a binary file piece by piece, and checks each claimed size against the file before anything is allocated."""
 
     def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
         self.path, self.file, self.size, self.at = path, file, size, 0
@@ -308,7 +308,7 @@ def _text_lenses(path: Path, file: BinaryIO, size: int) -> dict[int, _Lens]:
 def _text_images(path: Path, file: BinaryIO, size: int) -> list[_Image]:
     images: list[_Image] = []
     for place, line in _lines(path, file):
-        # The name is the rest of the line: it may contain spaces.
+        # The name is the rest of the line, since it may contain spaces.
         words = _decoded(place, line).split(maxsplit=9)
         if len(words) != 10:
             raise FormatError(
@@ -316,7 +316,7 @@ def _text_images(path: Path, file: BinaryIO, size: int) -> list[_Image]:
             )
         _whole(place, words[0])
         images.append(_image(place, _floats(place, words[1:8]), _whole(place, words[8]), words[9].rstrip()))
-        # Every image has a line of points, mostly empty without them; the last may lack it.
+        # Each image has a line of points, which may be empty; the last image may lack it.
         points = len(file.readline().split())
         if points % 3:
             raise FormatError(
@@ -326,7 +326,7 @@ def _text_images(path: Path, file: BinaryIO, size: int) -> list[_Image]:
 
 
 def _lines(path: Path, file: BinaryIO) -> Iterator[tuple[str, bytes]]:
-    """Lines that are not empty and no comments, with their places."""
+    """Yield lines that are neither empty nor comments, with their places."""
     while line := file.readline():
         if line.strip() and not line.lstrip().startswith(b"#"):
             yield f"{path}: the line at byte {file.tell() - len(line)}", line

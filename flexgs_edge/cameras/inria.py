@@ -1,4 +1,4 @@
-"""INRIA's cameras.json: a list of poses, camera to world, as the reference training program writes it."""
+"""Read and write INRIA's cameras.json, the list of poses (camera to world) of the reference training program."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from flexgs_edge.errors import FormatError
 
 
 def read_inria(path: str | os.PathLike[str]) -> list[Camera]:
-    """Read INRIA's cameras.json, in the file's order.
+    """Read INRIA's cameras.json in the file's order.
 
-    The file has no principal point: it is the middle of the image, (W - 1) / 2 with integer pixel centres.
+    The file has no principal point, so it is the middle of the image: (W - 1) / 2, with integer pixel centres.
 
     Raises
     ------
     InputError
-        When the file cannot be read.
+        If the file cannot be read.
     FormatError
-        When it is not JSON, not a list, empty, or an entry is wrong; names file, entry and field.
+        If it is not JSON, not a list, empty, or an entry is wrong; the message names file, entry and field.
     """
     path = Path(path)
     return cameras_of_list(path, load_json(path))
 
 
 def cameras_of_list(path: Path, entries: Any) -> list[Camera]:
-    """`read_inria` for a file whose JSON is loaded already."""
+    """`read_inria` for JSON that is loaded already."""
     if not isinstance(entries, list):
         hint = "; this looks like a NeRF transforms.json" if isinstance(entries, dict) and "frames" in entries else ""
         raise FormatError(f"{path}: expected a JSON list of cameras, found {kind(entries)}{hint}")
@@ -42,7 +42,7 @@ def cameras_of_list(path: Path, entries: Any) -> list[Camera]:
 
 
 def inria_json(cameras: Sequence[Camera]) -> str:
-    """The text of INRIA's cameras.json, a camera a line; principal points and distortion have no place in it."""
+    """The text of INRIA's cameras.json, one camera a line; it has no place for principal points and distortion."""
     entries = [
         {
             "id": number,

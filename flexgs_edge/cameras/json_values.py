@@ -1,4 +1,4 @@
-"""Values out of JSON camera files, checked, with messages that name file, entry and key."""
+"""Check values of JSON camera files; error messages name the file, the entry and the key."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ import numpy as np
 from flexgs_edge.errors import FormatError, InputError, brief
 
 ROTATION_TOLERANCE = 1e-3
-"""Largest entry of |R R^T - 1|: files keep 6 digits and more, a scaled or sheared matrix is off by far more."""
+"""Largest entry of |R R^T - 1|. Files keep 6 digits or more; a scaled or sheared matrix is off by far more."""
 MAX_SIDE = 65535
-"""Pixels: more is a damaged file (JPEG ends here too)."""
+"""Most pixels of a side; a larger number means a damaged file (JPEG has this limit too)."""
 
 
 def load_json(path: Path) -> Any:
-    """The value of a JSON file.
+    """Load the value of a JSON file.
 
     Raises
     ------
     InputError
-        When the file cannot be read; `FormatError` when it is not JSON.
+        If the file cannot be read.
+    FormatError
+        If it is not JSON.
     """
     try:
         return json.loads(path.read_bytes())
@@ -36,7 +38,7 @@ def load_json(path: Path) -> Any:
 
 
 def kind(value: Any) -> str:
-    """What a JSON value is, for messages."""
+    """The type of a JSON value, in words for messages."""
     names = {dict: "an object", list: "a list", str: "a string", bool: "a boolean", type(None): "null"}
     return names.get(type(value), "a number")
 
@@ -59,17 +61,17 @@ class Entry:
         self.entry = entry
 
     def has(self, key: str) -> bool:
-        """Whether the key is there and not null."""
+        """Whether the key exists and its value is not null."""
         return self.entry.get(key) is not None
 
     def get(self, key: str) -> Any:
-        """Any value."""
+        """The value of a key, of any type."""
         if key not in self.entry:
             raise FormatError(f"{self.place}: missing key {key!r}; found {', '.join(map(repr, self.entry)) or 'none'}")
         return self.entry[key]
 
     def fail(self, key: str, expected: str, found: str) -> FormatError:
-        """An error to raise."""
+        """Make the error for a wrong value."""
         return FormatError(f"{self.place}: {key}: expected {expected}, found {found}")
 
     def name(self, key: str) -> str:
@@ -80,7 +82,7 @@ class Entry:
         return name
 
     def number(self, key: str, expected: str) -> float:
-        """Any number, NaN and infinities included."""
+        """Any number, including NaN and infinities."""
         value = self.get(key)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise self.fail(key, expected, kind(value))
@@ -131,7 +133,7 @@ class Entry:
 
     def check_rotation(self, key: str, rotation: np.ndarray) -> None:
         """Raise unless `rotation` ([3, 3]) is orthonormal (to the digits that files keep) and no reflection."""
-        with np.errstate(over="ignore", invalid="ignore"):  # entries of 1e200: far off, whatever comes out
+        with np.errstate(over="ignore", invalid="ignore"):  # entries such as 1e200 fail the check, whatever comes out
             error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if not error <= ROTATION_TOLERANCE:
             raise self.fail(key, f"an orthonormal matrix (within {ROTATION_TOLERANCE})", f"one off by {error:.3g}")
@@ -140,7 +142,7 @@ class Entry:
 
 
 def check_names(path: Path, names: list[str], entries: str, key: str) -> None:
-    """Raise `FormatError` where a name appears twice (names find photos and order the views)."""
+    """Raise `FormatError` if a name appears twice, since names find photos and order the views."""
     first: dict[str, int] = {}
     for index, name in enumerate(names):
         if first.setdefault(name, index) != index:
@@ -150,7 +152,7 @@ def check_names(path: Path, names: list[str], entries: str, key: str) -> None:
 
 
 def _shape(value: Any, depth: int) -> tuple[int, ...] | None:
-    """Shape of lists nested `depth` levels deep, None if they are ragged (which NumPy would raise on) or deeper."""
+    """Shape of lists nested `depth` levels deep; None if they are deeper or ragged, which NumPy would raise on."""
     if not isinstance(value, list):
         return ()
     if not depth:

@@ -1,4 +1,4 @@
-"""Poses that nobody took, made from given ones."""
+"""Generate camera poses from given ones: closer, farther, and in between."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 
 LEAST_ALIKE = 0.7
-"""Cosine of the angle between two directions of view (45 degrees): beyond it the middle sees what neither of the two does."""
+"""Least cosine between two directions of view (45 degrees). Beyond it, the middle view would see what neither of the two sees."""
 
 
 def at_distance(camera: Camera, depth: float, factor: float) -> Camera:
-    """The pose moved along its axis: `factor` times as far from what lies at `depth`."""
-    # Along the camera's own axis only the third part of the translation changes.
+    """The camera moved along its axis, to `factor` times its distance from the things at `depth`."""
+    # Along the camera's own axis, only the z part of the translation changes.
     moved = camera.translation + np.array([0.0, 0.0, (factor - 1) * depth])
     return replace(camera, name=f"{camera.name} at {factor:g}x", translation=moved)
 
 
 def between(first: Camera, second: Camera) -> Camera:
-    """The pose half way between two, with the first one's lens: the middle of the places, the nearest rotation to the mean."""
+    """The camera half way between two, with the lens of the first; its rotation is the nearest one to the mean."""
     left, _, right = np.linalg.svd(first.rotation + second.rotation)
     rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
     center = (first.center + second.center) / 2
@@ -29,9 +29,9 @@ def between(first: Camera, second: Camera) -> Camera:
 
 
 def poses_between(cameras: Sequence[Camera]) -> list[Camera]:
-    """A camera halfway between each camera and the nearest one that looks in about the same direction, each pair once.
+    """Generate cameras half way between each camera and its nearest neighbour that looks in about the same direction.
 
-    See `between`.
+    Each pair gives one camera; see `between`.
     """
     centres = np.array([camera.center for camera in cameras]).reshape(-1, 3)
     ahead = np.array([camera.rotation[2] for camera in cameras]).reshape(-1, 3)

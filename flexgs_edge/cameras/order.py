@@ -1,4 +1,4 @@
-"""Poses in an order in which every beginning covers the whole: by what they see, or by where they are."""
+"""Order cameras so that the first ones of any number cover the whole scene: by what they see, or by where they are."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 
 DIGITS = 6
-"""Decimals that squares of distances are told apart by: rounding of a scene that was moved must not break the ties of a rig."""
+"""Decimals in comparisons of squared distances, so that rounding in a scene that was moved does not break ties of a rig."""
 GAIN_DIGITS = 4
-"""The same of what a camera adds, as a share of all points."""
+"""Decimals in comparisons of what a camera adds, as a share of all points."""
 SAME_VIEW = 0.2
-"""Two views of a point tell something of each other where the cosines of their directions differ by less: up to 37
-degrees. A wider reach leaves out views that are needed: docs/results/tuning.md#same_view"""
+"""Two views of a point overlap if the cosine of the angle between their directions differs from 1 by less than this, up to
+37 degrees. A wider reach would leave out views that are needed: docs/results/tuning.md#same_view"""
 
 
 def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, count: int) -> list[int]:
-    """Indices of `count` cameras at most, each next one with the most to add to what those before it see.
+    """Choose at most `count` cameras, each next one with the most to add to what the chosen ones see; returns their indices.
 
-    A point adds 1 to a camera that has it in its picture (nothing is hidden by anything), and less for every camera chosen
-    before that has it from a near direction: 1 / (1 + sum of max(0, 1 - (1 - cosine) / `SAME_VIEW`)). Ties go to the lower index.
+    A point adds 1 to a camera that has it in its picture; occlusion is ignored. It adds less for every chosen camera that has
+    it from a near direction: 1 / (1 + sum of max(0, 1 - (1 - cosine) / `SAME_VIEW`)). Ties go to the lower index.
 
     Parameters
     ----------
     cameras : sequence of Camera
     points : np.ndarray
-        [3, n] f64, some of the scene's positions, in the cameras' world.
+        [3, n] f64, a sample of the scene's positions, world coordinates.
     near : float
-        Near plane.
+        Near plane, scene units.
     count : int
-        Cameras wanted.
+        Most cameras to choose.
     """
     if not cameras:
         return []
@@ -50,7 +50,7 @@ def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, c
 
 
 def _in_picture(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
-    """[n] bool: points ([3, n] f64) that project into the picture of a camera."""
+    """[n] bool, the points ([3, n] f64) that project into the picture of a camera."""
     x, y, z = camera.rotation @ points + camera.translation[:, None]
     with np.errstate(all="ignore"):
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
@@ -59,11 +59,11 @@ def _in_picture(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
 
 
 def farthest_order(cameras: Sequence[Camera]) -> list[int]:
-    """Indices of all cameras, each next one farthest from those chosen; the first is the one nearest to their middle.
+    """Order all cameras so that each next one is farthest from those before; the first is nearest to their middle.
 
-    Far is as the square root of two squares: of the distance of the places, over the mean distance from their middle, and of the
-    distance of the directions looked in (two opposite ones are 2 apart), over the same mean of the directions. So neither
-    a ring of cameras that look inwards nor a tripod that turns counts as one place. Ties go to the lower index.
+    The distance of two cameras has two parts, whose squares are added: the distance of their places, over the mean distance
+    from the middle, and the distance of their directions (opposite ones are 2 apart), over the same mean of directions. So
+    neither a ring of cameras that look inwards nor a turning tripod counts as one place. Ties go to the lower index.
 
     >>> from types import SimpleNamespace
     >>> line = [SimpleNamespace(center=np.array([x, 0.0, 0.0]), rotation=np.eye(3)) for x in (0.0, 1.0, 2.0, 3.0, 4.0)]
@@ -85,8 +85,8 @@ def farthest_order(cameras: Sequence[Camera]) -> list[int]:
 
 
 def _spread(points: np.ndarray) -> np.ndarray:
-    """[n, 3] about their middle, in units of their mean distance from it."""
+    """[n, 3], the points relative to their middle, in units of their mean distance from it."""
     moved = points - points.mean(axis=0)
     unit = float(np.sqrt(np.square(moved).sum(axis=1)).mean())
-    # Rounding alone must not decide where all stand in one place.
+    # If all points are in one place, rounding must not decide.
     return moved / unit if unit > 1e-9 * (1.0 + float(np.abs(points).max())) else np.zeros_like(moved)

@@ -1,4 +1,4 @@
-"""The photos of a scene, matched to its cameras by name and by size."""
+"""Match the photos of a scene to its cameras by name and size, and read them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 _SHOWN = 5
-# What Pillow raises for damaged files, beside OSError (its base for truncated and unknown ones).
+# Errors of Pillow for damaged files, besides OSError (the base of its errors for truncated and unknown files).
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, OverflowError)
 
 Size = tuple[int, int]
@@ -27,18 +27,16 @@ Size = tuple[int, int]
 
 
 class Photos:
-    """One photo a camera; sizes are known, pixels are read when asked for.
-
-    Made by `Photos.open`.
+    """One photo for each camera; sizes are known, and pixels are read when needed. Made by `Photos.open`.
 
     Attributes
     ----------
     cameras : list of Camera
-        In the order given, scaled to the photos (and to the width limit).
+        In the given order, scaled to the photos (and to the width limit).
     paths : list of Path
         The photo of each camera.
     notes : tuple of str
-        What was scaled, for the summary.
+        Notes on photos that were scaled, for the summary.
     """
 
     def __init__(
@@ -54,7 +52,7 @@ class Photos:
         background: Sequence[float] = (0.0, 0.0, 0.0),
         max_width: int | None = None,
     ) -> Photos:
-        """Find the photo of every camera and check its size.
+        """Find the photo of every camera, and check its size.
 
         Parameters
         ----------
@@ -63,14 +61,14 @@ class Photos:
         cameras : sequence of Camera
             Names are file names with or without extension.
         background : sequence of float, optional
-            Red, green, blue in [0, 1] behind photos with an alpha channel.
+            Red, green, blue in [0, 1] behind photos with an alpha channel; black by default.
         max_width : int, optional
-            Photos wider than this, and their cameras, are scaled down to it.
+            Wider photos, and their cameras, are scaled down to this width. No limit by default.
 
         Raises
         ------
         InputError
-            When the folder or a photo is missing or damaged, or sizes do not match the cameras.
+            If the folder or a photo is missing or damaged, or sizes do not match the cameras.
         """
         folder = Path(images_dir)
         bent = next((camera for camera in cameras if camera.distortion), None)
@@ -92,12 +90,12 @@ class Photos:
         return len(self.paths)
 
     def load(self, index: int) -> np.ndarray:
-        """Photo of camera `index`: [H, W, 3] f32 in [0, 1], at the camera's size.
+        """Read the photo of camera `index`: [H, W, 3] f32 in [0, 1], at the camera's size.
 
         Raises
         ------
         InputError
-            When the photo is damaged or of a pixel kind that has no colours in [0, 1].
+            If the photo is damaged, or its kind of pixels has no colours in [0, 1].
         """
         from PIL import Image
 
@@ -110,7 +108,7 @@ class Photos:
             raise InputError(f"{path}: the photo cannot be decoded ({error}); is the file complete?") from error
         if pixels.shape[:2] == (camera.height, camera.width):
             return pixels
-        # Area average in float, so that the result is not rounded to 8 bits a second time.
+        # Area average in floats, so that colours are not rounded to 8 bits a second time.
         planes = [
             Image.fromarray(np.ascontiguousarray(pixels[:, :, c])).resize(
                 (camera.width, camera.height), Image.Resampling.BOX
@@ -121,7 +119,7 @@ class Photos:
 
 
 def _match(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
-    """The photo of each camera: by file name, by name without extension, by the camera's name without extension."""
+    """The photo of each camera: by file name, by name without extension, or by the camera's name without extension."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of photos")
     deep = any("/" in camera.name for camera in cameras)
@@ -154,7 +152,7 @@ def _match(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
 
 
 def photo_size(path: Path) -> Size:
-    """Size from the file's header; nothing is decoded."""
+    """Size in the header of a photo file; nothing is decoded."""
     from PIL import Image
 
     try:
@@ -165,7 +163,7 @@ def photo_size(path: Path) -> Size:
 
 
 def _scale_to(sizes: list[Size], paths: list[Path], cameras: Sequence[Camera]) -> tuple[list[Camera], str | None]:
-    """The cameras at the sizes of their photos, if one factor explains all of them."""
+    """Scale the cameras to their photos, if one factor fits all of them."""
     factors: tuple[float, float] = (1.0, float("inf"))
     seen: dict[Size, Size] = {}
     for (width, height), path, camera in zip(sizes, paths, cameras):
@@ -189,16 +187,16 @@ def _scale_to(sizes: list[Size], paths: list[Path], cameras: Sequence[Camera]) -
 
 
 def _most(camera: int, photo: int) -> float:
-    """Largest factor that leaves `photo` pixels of `camera` when rounded either way."""
+    """Largest factor at which `photo` pixels come from `camera` pixels, rounded either way."""
     return camera / (photo - 1) if photo > 1 else float("inf")
 
 
 def _pixels(image: Image.Image, background: np.ndarray, path: Path) -> np.ndarray:
-    """[H, W, 3] f32 in [0, 1] of a decoded image of any of Pillow's usual modes."""
+    """Pixels of a decoded image in any usual mode of Pillow: [H, W, 3] f32 in [0, 1]."""
     mode = image.mode
     if mode == "F":
         raise InputError(f"{path}: pixels are floats; expected 8-bit or 16-bit colours")
-    if mode == "I" or mode.startswith("I;16"):  # 16-bit grey: Pillow's own conversion to RGB would clip at 255
+    if mode == "I" or mode.startswith("I;16"):  # 16-bit grey: Pillow's conversion to RGB would clip at 255
         grey = np.asarray(image).astype(np.float32) / 65535.0
         return np.repeat(grey[:, :, None], 3, axis=2).clip(0.0, 1.0)
     if mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:

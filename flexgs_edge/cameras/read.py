@@ -1,4 +1,4 @@
-"""One door for camera files: which kind it is, and its cameras sorted by name."""
+"""Read a camera file of any supported kind; the cameras are sorted by name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SUPPORTED = (
 
 
 def find_cameras(folder: str | os.PathLike[str]) -> Path | None:
-    """What `read_cameras` reads in a folder: cameras.json, else transforms.json, else the folder of a COLMAP model."""
+    """The camera file in a folder: cameras.json, else transforms.json, else the folder of a COLMAP model, else None."""
     place = Path(folder)
     for name in ("cameras.json", "transforms.json"):
         if (place / name).is_file():
@@ -33,15 +33,17 @@ def read_cameras(path: str | os.PathLike[str], ignore_distortion: bool = False) 
     Parameters
     ----------
     path : path
-        INRIA's cameras.json, a transforms.json, a file of a COLMAP model, or a folder that holds one (a COLMAP model also
-        in its `sparse/0`).
+        INRIA's cameras.json, a transforms.json, a file of a COLMAP model, or a folder that holds one of these (a COLMAP
+        model also in its `sparse/0`).
     ignore_distortion : bool, optional
-        Take the poses of distorted lenses; such cameras refuse to be compared with photos.
+        Take the poses of distorted lenses; such cameras cannot be compared with photos.
 
     Raises
     ------
     InputError
-        When the path is missing or of an unknown kind, or a lens is distorted; `FormatError` when the file breaks its format.
+        If the path is missing or of an unknown kind, or a lens is distorted.
+    FormatError
+        If the file breaks its format.
     """
     place = Path(path)
     if place.is_dir():

@@ -1,7 +1,7 @@
-"""NeRF's and nerfstudio's transforms.json: poses camera to world in OpenGL's axes, intrinsics for all frames or for each.
+"""Read transforms.json of NeRF and nerfstudio: poses camera to world in OpenGL's axes, and intrinsics.
 
-Poses are taken as the file has them. Where `dataparser_transforms.json` lies beside it (nerfstudio writes it next to a trained
-model), they are moved into the frame that the training used, which is the frame of an exported PLY.
+Poses are taken as they stand in the file. nerfstudio writes `dataparser_transforms.json` beside a trained model. If it is
+there, we move the poses into the frame of the training, which is also the frame of an exported PLY.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from flexgs_edge.errors import FormatError, InputError
 DATAPARSER = "dataparser_transforms.json"
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
-"""Values of `camera_model` that have no lens."""
+"""Values of `camera_model` without a lens."""
 BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Those that are pinholes when their parameters are zero."""
+"""Values of `camera_model` that are pinholes if their parameters are zero."""
 FLIP = np.diag([1.0, -1.0, -1.0])
-"""From OpenGL's camera (y up, looking along -z) to COLMAP's."""
+"""Turns OpenGL's camera (y up, looking along -z) into COLMAP's."""
 UNDISTORT = (
     "make a pinhole model of the photos with `ns-process-data images --data PHOTOS --output-dir MODEL` and "
     "`colmap image_undistorter --image_path PHOTOS --input_path MODEL/colmap/sparse/0 --output_path OUTPUT --output_type COLMAP` "
@@ -36,32 +36,32 @@ UNDISTORT = (
 
 
 def read_transforms(path: str | os.PathLike[str], ignore_distortion: bool = False) -> list[Camera]:
-    """Read a transforms.json, in the file's order.
+    """Read a transforms.json in the file's order.
 
-    Names are the frames' `file_path`, without the folder that all of them share. The principal point has pixel centres at
-    integer + 0.5 in the file: half a pixel is taken off; without one it is the image's middle. A missing size is taken
-    from the frame's photo (with or without extension in `file_path`).
+    Names are the frames' `file_path`, without the folder that all of them share. Pixel centres of the file lie at
+    integer + 0.5, so half a pixel is subtracted from the principal point; by default it is the image's middle. If the size
+    is missing, it is taken from the frame's photo (`file_path` with or without extension).
 
     Parameters
     ----------
     path : path
         The file.
     ignore_distortion : bool, optional
-        Take the poses of distorted lenses as pinholes; such cameras refuse to be compared with photos.
+        Take the poses of distorted lenses as pinholes; such cameras cannot be compared with photos.
 
     Raises
     ------
     InputError
-        When the file cannot be read, a size is nowhere to be found, or a lens is distorted; names commands that undistort.
+        If the file cannot be read, a size is not found, or a lens is distorted; the message names commands that undistort.
     FormatError
-        When the file breaks its format; names file, frame and key.
+        If the file breaks its format; the message names file, frame and key.
     """
     path = Path(path)
     return cameras_of_frames(path, load_json(path), ignore_distortion)
 
 
 def cameras_of_frames(path: Path, value: Any, ignore_distortion: bool = False) -> list[Camera]:
-    """`read_transforms` for a file whose JSON is loaded already."""
+    """`read_transforms` for JSON that is loaded already."""
     top = Entry(str(path), value)
     frames = top.get("frames")
     if not isinstance(frames, list) or not frames:
@@ -92,7 +92,7 @@ def _without_shared_folder(paths: list[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class _Similarity:
-    """x' = scale * (linear @ x + shift)."""
+    """The map x' = scale * (linear @ x + shift)."""
 
     linear: np.ndarray
     shift: np.ndarray
@@ -100,7 +100,7 @@ class _Similarity:
 
     @classmethod
     def beside(cls, path: Path, top: Entry) -> _Similarity:
-        """From the file's frame to the training's: the identity where there is no dataparser_transforms.json."""
+        """The map from the file's frame to the training's; the identity if there is no dataparser_transforms.json."""
         place = path.with_name(DATAPARSER)
         if not place.is_file():
             return cls(np.eye(3), np.zeros(3), 1.0)
@@ -109,7 +109,7 @@ class _Similarity:
         scale = entry.finite("scale", "a factor above 0")
         if scale <= 0:
             raise entry.fail("scale", "a factor above 0", f"{scale:g}")
-        # nerfstudio's `transform` and `scale` start at the frame of the original capture, our poses behind `applied_*`.
+        # nerfstudio's `transform` and `scale` start at the frame of the original capture, but our poses come after `applied_*`.
         if top.has("applied_transform"):
             applied, moved = _rigid(top, "applied_transform")
             linear = linear @ applied.T
@@ -122,7 +122,7 @@ class _Similarity:
         return cls(linear, shift, scale)
 
     def moved(self, turn: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A pose, camera to world."""
+        """Move a pose (camera to world)."""
         return self.linear @ turn, self.scale * (self.linear @ position + self.shift)
 
 
@@ -164,12 +164,12 @@ def _has(top: Entry, frame: Entry, key: str) -> bool:
 
 
 def _holder(top: Entry, frame: Entry, key: str) -> Entry:
-    """Where a key is looked up: the frame comes before the file."""
+    """The entry that has a key: the frame, else the whole file."""
     return frame if frame.has(key) else top
 
 
 def _distortion(top: Entry, frame: Entry) -> str | None:
-    """The lens, for messages; None for a pinhole. Raises for models that no pinhole comes close to."""
+    """The distortion of the lens, for messages; None for a pinhole. Raises for models that no pinhole resembles."""
     model = "OPENCV"
     if _has(top, frame, "camera_model"):
         model = _holder(top, frame, "camera_model").name("camera_model")
@@ -201,7 +201,7 @@ def _size(path: Path, top: Entry, frame: Entry, file_path: str) -> tuple[int, in
 
 
 def _focals(top: Entry, frame: Entry, width: int, height: int) -> tuple[float, float]:
-    """Focal lengths in pixels, from lengths or angles; one stands for both where the other is missing."""
+    """Focal lengths in pixels, from lengths or angles; if one is missing, the other stands for both."""
     found = [_focal(top, frame, axis, side) for axis, side in (("x", width), ("y", height))]
     across, down = found
     if across is None and down is None:

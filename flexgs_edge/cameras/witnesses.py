@@ -1,6 +1,6 @@
-"""What a rig needs to know of a scene: its robust middle and extent, where matter is, and a sample of rows to be seen.
+"""A scene in small, for placing cameras: its robust middle and extent, a grid of matter, and a sample of rows to be seen.
 
-World positions are relative to the source's origin throughout.
+All positions are relative to the source's origin.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from flexgs_edge.constants import SH_C1, SH_C2, SH_C3
 from flexgs_edge.errors import InputError
 
 SAMPLE_ROWS = 1 << 16
-"""Rows that middle, extent and grid are made from."""
+"""Rows for middle, extent and grid."""
 WITNESSES = 1500
-"""Rows that judge candidates one by one."""
+"""Rows that judge candidates (the witnesses)."""
 GRID = 40
-"""Cells of the density grid along the longest side."""
+"""Cells of the matter grid along its longest side."""
 BOX = (0.01, 0.99)
-"""Quantiles that the grid spans."""
+"""Quantiles of the positions that the grid spans."""
 BULK = (0.05, 0.95)
-"""Quantiles of middle and extent."""
+"""Quantiles of the positions for middle and extent."""
 MARCH = 24
 """Steps of a line of sight through the grid."""
 SPREAD_POINTS = 16
-"""Points that the matter of a splat wider than a cell is spread over."""
+"""Points over which the matter of a splat is spread if it is wider than a cell."""
 SKIN = 3.0
-"""Cells at a line's end that belong to the surface that is looked at."""
+"""Cells at the end of a line of sight that belong to the surface it looks at."""
 SH_FLOOR = 0.01
-"""Rows whose view-dependent colour is weaker on average do not tell directions."""
+"""Rows with a weaker view-dependent colour, on average, do not tell directions."""
 
 
 class Gaussians(Protocol):
-    """What the rig needs of a scene source."""
+    """The part of a scene source that this module needs."""
 
     name: str
     count: int
@@ -44,7 +44,7 @@ class Gaussians(Protocol):
     origin: np.ndarray
 
     def read(self, rows: np.ndarray, fields: Sequence[str]) -> dict[str, np.ndarray]:
-        """{field: [width, n] f32} of some rows."""
+        """Read some rows: {field: [width, n] f32}."""
 
 
 @dataclass
@@ -93,7 +93,7 @@ class Witnesses:
         return float(np.linalg.norm(self.half))
 
     def thinned(self, step: int) -> Witnesses:
-        """The same scene with every `step`-th witness."""
+        """A copy with every `step`-th witness."""
         part = slice(None, None, step)
         return replace(
             self,
@@ -105,19 +105,19 @@ class Witnesses:
         )
 
     def optical_depth(self, points: np.ndarray) -> np.ndarray:
-        """[n] f64 of the cells at `points` ([3, n]); 0 outside the grid."""
+        """[n] f64, optical depth of the cells at `points` ([3, n]); 0 outside the grid."""
         places = (points - self.corner[:, None]) / self.cell + 1
         x, y, z = (np.clip(line, 0, n - 1).astype(np.int64) for line, n in zip(places, self.depth.shape))
         found: np.ndarray = self.depth[x, y, z]
         return found
 
     def transmittance(self, eye: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """[n] f64: what is left of light from `ends` ([3, n]) at `eye` ([3])."""
+        """[n] f64, the share of light from `ends` ([3, n]) that reaches `eye` ([3])."""
         shape = np.array(self.depth.shape)
         start = (eye - self.corner) / self.cell + 1
         lines = (ends - eye[:, None]) / self.cell
         length = np.linalg.norm(lines, axis=0)
-        # From where the line enters the grid to where it leaves it, or to the surface that is looked at.
+        # From the point where the line enters the grid to where it leaves it, or to the surface it looks at.
         with np.errstate(divide="ignore", invalid="ignore"):
             sides = np.stack([-start[:, None] / lines, (shape - start)[:, None] / lines])
         sides = np.where(np.isnan(sides), 0.0, sides)
@@ -130,7 +130,7 @@ class Witnesses:
         return np.exp(-cells.mean(axis=0) * inside * length)
 
     def agreement(self, eye: np.ndarray) -> np.ndarray:
-        """[M] f64: view-dependent colour towards `eye` over its mean over all directions; 1 for rows that do not tell."""
+        """[M] f64, view-dependent colour towards `eye` over its mean over all directions; 1 for rows that do not tell."""
         lines = self.means - eye[:, None]
         lines /= np.maximum(np.linalg.norm(lines, axis=0), 1e-12)
         basis = sh_basis(lines, self.sh.shape[1])
@@ -144,13 +144,13 @@ def gather_witnesses(source: Gaussians) -> Witnesses:
     Raises
     ------
     InputError
-        When the Gaussians have no extent at all.
+        If the Gaussians have no extent.
     """
     rows = np.arange(0, source.count, max(1, -(-source.count // SAMPLE_ROWS)))
     sample = source.read(rows, ["means", "opacity_logits", "log_scales", "quats"])
     means = sample["means"].astype(np.float64)
     opacity = 1 / (1 + np.exp(-sample["opacity_logits"][0].astype(np.float64)))
-    # Far fewer than a float's exponents: squares and products stay finite.
+    # Clipped well inside float64's exponents, so that squares and products stay finite.
     deviations = np.exp(np.sort(np.clip(sample["log_scales"].astype(np.float64), -40, 40), axis=0))
     sizes = np.sqrt(deviations[1] * deviations[2])
     low, middle, high = weighted_quantiles(means, opacity, (BULK[0], 0.5, BULK[1]))
@@ -168,7 +168,7 @@ def gather_witnesses(source: Gaussians) -> Witnesses:
 
 
 def weighted_quantiles(values: np.ndarray, weights: np.ndarray, shares: Sequence[float]) -> np.ndarray:
-    """Quantiles of each row of `values` ([c, n]) with `weights` ([n]): [len(shares), c]."""
+    """[len(shares), c], quantiles of each row of `values` ([c, n]) with `weights` ([n])."""
     order = np.argsort(values, axis=1, kind="stable")
     result = np.empty((len(shares), len(values)))
     for row, (places, line) in enumerate(zip(order, values)):
@@ -181,10 +181,10 @@ def weighted_quantiles(values: np.ndarray, weights: np.ndarray, shares: Sequence
 def _grid(
     sample: dict[str, np.ndarray], opacity: np.ndarray, deviations: np.ndarray, share: float
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """First corner, cell side, and optical depth of each cell along its side, in a rim of empty cells.
+    """First corner, cell side, and optical depth of each cell along its side, with a rim of empty cells.
 
-    A splat's matter is its opacity times its mean cross-section. That of splats wider than a cell is spread over points
-    drawn from the splat, and cut where even these would fill more than a cell each. Each row stands for `share` rows.
+    The matter of a splat is its opacity times its mean cross-section. If a splat is wider than a cell, its matter is spread
+    over points drawn from it, and cut if even these would fill more than a cell each. Each row stands for `share` rows.
     """
     means = sample["means"].astype(np.float64)
     low, high = np.quantile(means, BOX, axis=1)
@@ -212,7 +212,7 @@ def _grid(
 
 
 def rotations(quats: np.ndarray) -> np.ndarray:
-    """[3, 3, n] f64 of quaternions w x y z ([4, n]) of any norm but zero; columns are the splat's axes."""
+    """[3, 3, n] f64, rotation matrices of quaternions w x y z ([4, n], any norm but zero); columns are the splat's axes."""
     w, x, y, z = quats / np.linalg.norm(quats.astype(np.float64), axis=0)
     return np.array(
         [
@@ -224,14 +224,14 @@ def rotations(quats: np.ndarray) -> np.ndarray:
 
 
 def _smooth(depth: np.ndarray) -> np.ndarray:
-    """[-1] f64: the mean over 3 cells along each axis (the rim is empty, so nothing wraps around)."""
+    """[-1] f64, the mean over 3 cells along each axis; the rim is empty, so that nothing wraps around."""
     for axis in range(3):
         depth = (np.roll(depth, 1, axis) + depth + np.roll(depth, -1, axis)) / 3
     return depth.reshape(-1)
 
 
 def _directions(source: Gaussians, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """SH above degree 0 over their root mean square, and which rows are strong enough to tell directions."""
+    """SH above degree 0 over their root mean square, and the rows that are strong enough to tell directions."""
     used = min(source.sh_degree, 3)
     kept = (used + 1) ** 2 - 1
     if not kept:
@@ -242,7 +242,7 @@ def _directions(source: Gaussians, rows: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def sh_basis(directions: np.ndarray, count: int) -> np.ndarray:
-    """The first `count` (3, 8 or 15) SH functions above degree 0 of unit `directions` ([3, n]): [count, n]."""
+    """[count, n], the first `count` (3, 8 or 15) SH functions above degree 0 in unit `directions` ([3, n])."""
     if not count:
         return np.zeros((0, directions.shape[1]))
     x, y, z = directions

@@ -100,9 +100,9 @@ def search_line(
 
 
 def _weighed(steps: list[Step]) -> list[tuple[int, float]]:
-    """(rate, excess) of the steps. After points on one side only, the excess of the other side is halved for each (Illinois rule).
+    """(rate, excess) of the steps; after several on one side, the other side counts half for each beyond the first.
 
-    The log of a loss is curved, so that plain false position would approach the target slowly, from one side.
+    This is the Illinois rule. The log of a loss is curved, so that plain false position would approach the target slowly.
     """
     side = steps[-1].holds
     streak = next((i for i, step in enumerate(reversed(steps)) if step.holds != side), len(steps))

@@ -1,1 +1,1 @@
-"""Files of other programs: PLY, SPZ, SOG, compressed PLY, model folders."""
+"""Read and write files of other programs: PLY, SPZ, SOG, compressed PLY, model folders."""

@@ -1,7 +1,7 @@
-"""The converter package gaussforge (extra `[formats]`), run in a child process.
+"""Run the converter package gaussforge (extra `[formats]`) in a child process.
 
-It holds whole files and is native code. In a process of its own its memory is gone when it ends, and a
-crash becomes an error of ours.
+The converter is native code and holds whole files. The end of its process frees that memory, and a crash there becomes an
+error here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from flexgs_edge.io.formats import Format
 
 CONVERTER = "gaussforge"
 CONVERTER_MEMORY = 20 * 2**20
-"""Bytes of the converter's process before it has read anything."""
+"""Bytes of the converter's process before it reads a file."""
 _CHILD = """
 import sys
 import gaussforge
@@ -43,14 +43,14 @@ def converter_bytes(format: Format, count: int) -> int:
 
 
 def check_converter(path: str | os.PathLike[str]) -> None:
-    """Raise `InputError` with what to install where the converter is missing."""
+    """Raise `InputError` if the converter is missing; the message tells how to install it."""
     if importlib.util.find_spec(CONVERTER) is None:
         raise InputError(f"{path}: this format needs the package {CONVERTER}: pip install 'flexgs-edge[formats]'")
 
 
 def convert(path: str | os.PathLike[str], source: Path, source_format: str, target: Path, target_format: str) -> None:
-    """Run the converter; `path` is the user's file, for messages."""
-    # Absolute: a name that starts with a dash is no option. Output is never ours: the converter prints as it goes.
+    """Convert a file; `path` is the user's file, named in messages."""
+    # Absolute paths, since a name with a leading dash is an option. We capture the output: the converter prints progress.
     command = [sys.executable, "-c", _CHILD, os.path.abspath(source), source_format, str(target), target_format]
     done = subprocess.run(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False

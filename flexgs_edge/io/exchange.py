@@ -1,7 +1,7 @@
-"""Scenes in other projects' formats, in and out, through the converter package gaussforge (extra `[formats]`).
+"""Read and write scenes in formats of other projects, through the converter package gaussforge (extra `[formats]`).
 
-The converter holds whole files and is native code, so it runs in a process of its own: its memory is gone when it ends, what it
-prints stays out of ours, and a file that crashes it is an error like any other. Between the two processes goes an INRIA PLY.
+The converter is native code and holds whole files, so it runs in a process of its own. The end of that process frees its
+memory, its output stays out of ours, and a crash becomes an ordinary error. The processes exchange an INRIA PLY.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from flexgs_edge.scene.rotations import normalize_quats
 from flexgs_edge.scene.source import MemorySource, Planes, Rows, SceneSource
 
 OPACITY_LIMIT = 7.0
-"""Logits of opacity 0 and 1, which 8-bit formats store and no logit reaches: half of a 8-bit step from either end is 6.2."""
+"""Logits for opacities 0 and 1. 8-bit formats store these, but logits do not reach them; half a step from the end is 6.2."""
 
 
 def read_foreign(path: str | os.PathLike[str]) -> SceneSource:
     """Open a `.spz`, `.sog` or `.compressed.ply` scene.
 
-    It is expanded into a temporary PLY of about 248 bytes a Gaussian (in the folder that TMPDIR names), which lives as long
-    as the source; the converter holds the whole scene for a moment.
+    The file is expanded into a temporary PLY of about 248 bytes a Gaussian, in the folder that TMPDIR names. The PLY lives as
+    long as the source. During expansion, the converter holds the whole scene in memory.
 
     Raises
     ------
     InputError
-        When the converter is not installed or the file cannot be read.
+        If the converter is not installed, or the file cannot be read.
     FormatError
-        When the file breaks its format.
+        If the file breaks its format.
     """
     format = required_format(path)
     check_converter(path)
@@ -58,10 +58,10 @@ def read_foreign(path: str | os.PathLike[str]) -> SceneSource:
 
 
 def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: bool = False) -> tuple[str, ...]:
-    """Write a scene as `.spz`, `.sog` or `.compressed.ply`, with that format's own losses.
+    """Write a scene as `.spz`, `.sog` or `.compressed.ply`, with the losses of that format.
 
-    Needs a temporary PLY of about 248 bytes a Gaussian beside the file; `.sog` takes about a minute for 100 000 Gaussians
-    (it clusters the SH).
+    This needs a temporary PLY of about 248 bytes a Gaussian beside the file. `.sog` clusters the SH, which takes about a
+    minute for 100 000 Gaussians.
 
     Returns
     -------
@@ -71,9 +71,9 @@ def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: b
     Raises
     ------
     InputError
-        When the converter is not installed, the file exists and `force` is not set, or the format cannot hold the scene.
+        If the converter is not installed, the file exists and `force` is not set, or the format cannot hold the scene.
     BudgetError
-        When the disk is full.
+        If the disk is full.
     """
     format = required_format(path)
     check_converter(path)
@@ -86,7 +86,7 @@ def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: b
         )
     world = _WorldSource(source)
     _check_reach(path, world, format)
-    # Beside the target: the last step is a rename, and /tmp may be memory.
+    # Beside the target, since the last step is a rename, and /tmp may lie in memory.
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=target.parent) as folder:
         plain, finished = Path(folder) / "scene.ply", Path(folder) / f"scene{format.suffix}"
         if format.probed and source.sh_degree:
@@ -102,7 +102,7 @@ def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: b
 
 
 def written_order(source: SceneSource, format: Format) -> np.ndarray | None:
-    """[N] i64: the rows of `source` in the order of the file that `write_foreign` makes; None where the converter sorts."""
+    """[N] i64, rows of `source` in the order that `write_foreign` writes them; None if the converter sorts by itself."""
     if format.shuffled:
         return None
     return near_order(_WorldSource(source)) if format.sorted else np.arange(source.count)
@@ -122,17 +122,17 @@ def _check_reach(path: str | os.PathLike[str], source: SceneSource, format: Form
 
 
 def near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
-    """[N] i64: rows along a Morton curve through the scene's box."""
+    """[N] i64, the rows along a Morton curve through the box of the scene."""
     means = np.concatenate([source.read(rows, ["means"])["means"] for rows in source.chunks(chunk_rows)], axis=1)
     return near_rows(means)
 
 
 @cache
 def _sh_places(format: Format, degree: int) -> np.ndarray:
-    """[3 K] i64: where each SH coefficient must be put so that the converter writes it to its place.
+    """[3 K] i64, the place where each SH coefficient must stand so that the converter writes it to its right place.
 
-    Version 0.6.0 writes the coefficients of `.compressed.ply` red, green, blue by turns, while it and all others read them
-    channel by channel. What this version does is found out by one Gaussian with a ramp of coefficients, there and back.
+    Version 0.6.0 writes SH of `.compressed.ply` with red, green, blue by turns, but all versions read them channel by channel.
+    To find out, we convert one Gaussian with a ramp of coefficients there and back.
     """
     width = FIELD["sh_rest"].width(degree)
     planes = {field.name: np.zeros((field.width(degree), 1), np.float32) for field in FIELDS}
@@ -153,7 +153,7 @@ def _sh_places(format: Format, degree: int) -> np.ndarray:
 
 
 class _WrappedSource(SceneSource):
-    """A source over another one of the same rows."""
+    """A source over another one, with the same rows."""
 
     def __init__(self, parent: SceneSource, name: str, origin: np.ndarray) -> None:
         self.parent, self.name, self.origin, self.notes = parent, name, origin, parent.notes
@@ -161,9 +161,10 @@ class _WrappedSource(SceneSource):
 
 
 class _WorldSource(_WrappedSource):
-    """World positions in float32 whatever the origin, since other formats have no more digits, and unit quaternions.
+    """A scene as the converter needs it: world positions in float32, and unit quaternions.
 
-    The converter does not normalise: `.sog` files of quaternions as 3DGS trains them came out up to 51 degrees wrong.
+    The other formats have no digits for an origin. The converter does not normalise quaternions, and `.sog` files would get
+    wrong rotations.
     """
 
     def __init__(self, parent: SceneSource) -> None:
@@ -183,7 +184,7 @@ class _WorldSource(_WrappedSource):
 
 
 class _ForeignSource(_WrappedSource):
-    """An expanded scene; opacities of exactly 0 and 1 get finite logits. `settings` say what the file says about drawing."""
+    """A scene expanded to a PLY. Opacities of exactly 0 and 1 get finite logits; `settings` hold the file's way of drawing."""
 
     def __init__(
         self,

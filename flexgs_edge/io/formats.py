@@ -1,4 +1,4 @@
-"""The table of other programs' formats, and which of them a file name asks for."""
+"""The table of other programs' formats, and the choice of a format by file name."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ class Format:
     Parameters
     ----------
     suffix : str
-        Of file names, with its dot.
+        End of file names, with its dot.
     name : str
-        The converter's name of it.
+        The converter's name of the format.
     reach : float
-        Largest coordinate that it can hold, scene units.
+        Largest coordinate that it holds, scene units.
     max_degree : int
         Highest SH degree.
     sorted : bool
-        Rows must come in an order in which neighbours are near each other: each 256 share a range, and the converter
-        does not sort. Unsorted, positions are several times worse.
+        Rows must come in an order in which neighbours are near each other: 256 rows share a range, and the converter does
+        not sort. Unsorted positions would be several times worse.
     shuffled : bool
         The converter sorts rows by itself.
     probed : bool
         The converter may write SH in another order than it reads them (see `_sh_places`).
     finer_sh : bool
-        SH are written again, with a finer step than the converter's (see `flexgs_edge.io.spz`).
+        We write the SH again with a finer step than the converter's (see `flexgs_edge.io.spz`).
     one_degree : bool
-        Bytes fall with the SH degree of the whole scene only: SH that are zero take as much as any.
+        Only a lower SH degree of the whole scene saves bytes; SH that are zero take as much as others.
     row_bytes : float
-        About what a Gaussian of SH degree 3 takes: where searches start.
+        Approximate bytes of a Gaussian of SH degree 3, where searches start.
     sh_bytes : float
-        SH's part of it.
+        Bytes of SH among them.
     memory : int
-        Bytes a Gaussian that the converter holds at most.
+        Most bytes a Gaussian that the converter holds.
     """
 
     suffix: str
@@ -62,7 +62,7 @@ FORMATS: dict[str, Format] = {
         # Positions are 24-bit numbers with 12 bits behind the point.
         Format(".spz", "spz", reach=2.0**11 - 2.0**-12, finer_sh=True, row_bytes=22.0, sh_bytes=5.5),
         Format(".sog", "sog", shuffled=True, row_bytes=39.7, sh_bytes=27.4, memory=2048),
-        # 16 bytes, 45 of SH, and 72 a chunk of 256.
+        # 16 bytes, 45 bytes of SH, and 72 bytes for each chunk of 256 rows.
         Format(
             ".compressed.ply",
             "compressed.ply",
@@ -77,13 +77,13 @@ FORMATS: dict[str, Format] = {
 
 
 def format_of(path: str | os.PathLike[str]) -> Format | None:
-    """The format that a file name asks for, or None."""
+    """The format of a file name, or None."""
     name = Path(path).name.lower()
     return next((format for suffix, format in FORMATS.items() if name.endswith(suffix)), None)
 
 
 def required_format(path: str | os.PathLike[str]) -> Format:
-    """The format of a file name; raises `InputError` where it names none."""
+    """The format of a file name; raises `InputError` if there is none."""
     format = format_of(path)
     if format is None:
         raise InputError(f"{path}: expected a file ending in {', '.join(FORMATS)}")

@@ -1,4 +1,4 @@
-"""What a format makes of a scene's geometry, row by row: colours are refitted to it before the whole file is written."""
+"""Read back the geometry that a format makes of a scene, so that colours can be refitted to it before the file is written."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
 
 def read_geometry(folder: Path, source: SceneSource, format: Format) -> tuple[SceneSource, np.ndarray]:
-    """What `write_foreign` would make of a scene's geometry, and which row of `source` each of its rows was.
+    """Write a scene without SH in a format and read it back: the geometry that `write_foreign` would give.
 
-    A file without SH, which takes no clustering; positions, scales, rotations and opacities are the same with SH.
+    Without SH, there is no clustering. Positions, scales, rotations and opacities are the same as with SH.
 
     Parameters
     ----------
     folder : Path
-        For the file, which is removed.
+        For the temporary file.
 
     Returns
     -------
     tuple
-        A source of SH degree 0 (its colours mean nothing), and [N] i64 rows.
+        A source of SH degree 0, whose colours have no meaning, and [N] i64: the row of `source` behind each row.
     """
     path = folder / f"geometry{format.suffix}"
     write_foreign(path, _LabelSource(source), force=True)
@@ -47,9 +47,9 @@ def read_geometry(folder: Path, source: SceneSource, format: Format) -> tuple[Sc
 
 
 class _LabelSource(SceneSource):
-    """A scene without SH whose colours spell the row's number, in three digits of 256.
+    """A scene without SH whose colours spell the number of each row, in three digits of base 256.
 
-    Formats of 8 bits and codebooks of 256 entries keep them (`.sog`: within .03 of a digit).
+    Formats with 8 bits, and with codebooks of 256 entries, keep these digits (`.sog` up to .03 of a digit).
     """
 
     def __init__(self, parent: SceneSource) -> None:
@@ -60,7 +60,7 @@ class _LabelSource(SceneSource):
 
     @staticmethod
     def decode(colours: np.ndarray) -> np.ndarray:
-        """Digits from colour coefficients: the range of 8-bit formats, 0 to 1 of (.15 c + .5)."""
+        """Digits from colour coefficients: 8-bit formats cover 0 to 1 of (.15 c + .5)."""
         return (colours * 0.15 + 0.5) * 255
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:

@@ -1,4 +1,4 @@
-"""From a path to a scene: files by suffix, INRIA's model folders, and what lies beside them."""
+"""Find the scene in INRIA's model folders, and the cameras and photos beside a scene."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexgs_edge.errors import FormatError, InputError
 
 _ITERATION = re.compile(r"iteration_([0-9]{1,18})")
 _CFG_LIMIT = 1 << 16
-"""Bytes of cfg_args: it has a few hundred."""
+"""Most bytes of cfg_args, which normally has a few hundred."""
 
 
 def latest_iteration(folder: Path) -> Path:
@@ -30,7 +30,7 @@ def latest_iteration(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Companions:
-    """What was found beside a scene; None for what was not."""
+    """Cameras, photos and settings that were found beside a scene; None for those that were not."""
 
     cameras: Path | None = None
     images: Path | None = None
@@ -39,20 +39,20 @@ class Companions:
 
 
 def find_companions(path: str | os.PathLike[str]) -> Companions:
-    """Find the cameras, photos and ways of drawing that belong to a scene.
+    """Find the cameras, photos and drawing settings that belong to a scene.
 
-    Looks beside the file (`cameras.json`, `images/`), or in the model folder: the one given, or the one that holds
-    the file as `point_cloud/iteration_*/*.ply`. A model folder's `cfg_args` names photos elsewhere, the background, and
-    may say that the model is antialiased (the reference program leaves `antialiasing` out of it, others put it in).
+    The search covers the folder of the file (`cameras.json`, `images/`), or the model folder: the given one, or the one that
+    holds the file as `point_cloud/iteration_*/*.ply`. `cfg_args` of a model folder names the background, and photos in
+    another place. It may also tell that the model is antialiased; the reference program leaves `antialiasing` out.
 
     Raises
     ------
     FormatError
-        When there is a `cfg_args` that cannot be understood.
+        If `cfg_args` cannot be understood.
     """
     place = Path(path)
     folder = place if place.is_dir() else place.parent
-    holder = folder.absolute()  # a bare file name has no parents of its own to look at
+    holder = folder.absolute()  # a bare file name has no parents
     inside = _ITERATION.fullmatch(holder.name) and holder.parent.name == "point_cloud"
     if inside and not (folder / "cameras.json").is_file():
         folder = holder.parent.parent
@@ -68,16 +68,16 @@ def find_companions(path: str | os.PathLike[str]) -> Companions:
 
 
 def _find_images(folder: Path, settings: dict[str, Any]) -> Path | None:
-    """The folder of photos: where cfg_args says if it is there, else `images/` beside the scene."""
+    """The folder of photos: the one that cfg_args names if it exists, else `images/` beside the scene."""
     images, source = settings.get("images", "images"), settings.get("source_path")
     places = [folder / "images"]
     if isinstance(images, str) and isinstance(source, str) and images and source and "\0" not in images + source:
-        places.insert(0, folder / source / images)  # an absolute source_path stands alone
+        places.insert(0, folder / source / images)  # an absolute source_path replaces `folder`
     return next((place for place in places if place.is_dir()), None)
 
 
 def _read_cfg_args(path: Path) -> dict[str, Any]:
-    """The literal arguments of the text `Namespace(key=value, ...)`; empty without the file. Nothing is evaluated."""
+    """The arguments of the text `Namespace(key=value, ...)`, literals only, nothing is evaluated; empty without the file."""
     if not path.is_file():
         return {}
     try:

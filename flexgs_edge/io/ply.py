@@ -1,7 +1,7 @@
-"""PLY scenes in INRIA's layout: read by row ranges, written by chunks.
+"""Read and write PLY scenes in INRIA's layout, by row ranges and by chunks.
 
-Files are read with plain positioned reads into a small block, not mapped: mapped pages count as resident memory of
-the process, and a file that shrinks while mapped kills it.
+Files are read with plain reads into a small block, and not mapped. Mapped pages would count as resident memory of the
+process, and a mapped file that shrinks would kill it.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
 _BLOCK_ROWS = 4096
-"""Rows read at a time: 1 MB at SH degree 3, so that the gather runs in the cache."""
+"""Rows read at a time: 1 MB at SH degree 3, so that gathering stays in the processor's cache."""
 _SPAN = 4
-"""A list of rows is read as one span of the file while the span has at most this many rows a row asked for."""
+"""A list of rows is read as one span of the file if the span has at most this many rows for each wanted one."""
 _GAP = 64
-"""Rows from one asked for to the next that are read with what lies between: as long as a read of its own takes."""
+"""Rows between two wanted ones are read too, up to this many: a read of its own for the second would take as long."""
 _ORIGIN_ROWS = 65536
 _ORIGIN_QUANTILES = (0.05, 0.95)
 _ORIGIN_FAR = 16.0
-"""Extents from zero to where float32 has lost 4 of its 24 bits. Nearer scenes keep origin 0: their numbers stay exact,
-and they can be written as INRIA's float properties (many viewers cannot read double)."""
+"""Scenes nearer to zero than so many extents keep origin 0: their numbers stay exact, and they can be written as INRIA's
+float properties (many viewers cannot read double). At this distance, float32 has lost 4 of its 24 bits."""
 
 
 class PlySource(SceneSource):
     """A PLY in INRIA's layout: any property order, byte order and float width; SH degree 0 to 4.
 
-    Binary files are read by row ranges; ascii files, and those with lists in or before the vertices, are loaded whole
-    by plyfile. The origin is chosen by `choose_origin` from a sample of the positions; it is taken off in float64 before
-    positions are rounded to float32. Mip-Splatting's `filter_3D` is applied to scales and opacities, and `settings` then say
-    that the model is antialiased.
+    Binary files are read by row ranges. plyfile loads ascii files as a whole, and also files with lists in or before the
+    vertices. `choose_origin` takes the origin from a sample of the positions. We subtract it in float64, before positions are
+    rounded to float32. Mip-Splatting's `filter_3D` is applied to scales and opacities; `settings` then name the model as
+    antialiased.
 
     Parameters
     ----------
@@ -49,9 +49,9 @@ class PlySource(SceneSource):
     Raises
     ------
     InputError
-        When the file cannot be read.
+        If the file cannot be read.
     FormatError
-        When it breaks the format or is no Gaussian scene; names header line, property or bytes.
+        If it breaks the format or is not a Gaussian scene; the message names the header line, the property or the bytes.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -71,13 +71,13 @@ class PlySource(SceneSource):
             raise InputError(f"{path}: cannot read the scene ({error.strerror})") from error
         self.count = header.vertex.count
         self.sh_count = self.count if self.sh_degree else 0
-        self.origin = np.zeros(3)  # while the sample is read: world positions
+        self.origin = np.zeros(3)  # for the sample, which needs world positions
         self.origin = choose_origin(self._sample())
 
     def _sample(self) -> np.ndarray:
-        """[n, 3] f64: world positions of every k-th row, at most 65536; of runs of rows where these lie far apart.
+        """[n, 3] f64, world positions of every k-th row, at most 65536 rows. If k is large, it takes runs of rows instead.
 
-        Reading single rows that lie far apart is slow: each costs the disk a move.
+        Reads of single rows far apart are slow, since each one moves the disk.
         """
         step = max(1, -(-self.count // _ORIGIN_ROWS))
         rows = np.arange(0, self.count, step)
@@ -92,7 +92,7 @@ class PlySource(SceneSource):
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`; needs about 1 MB beside the arrays (4 MB for lists of rows)."""
         rows, planes = self.begin_read(rows, fields, out)
-        # Doubles beyond float32 become infinite here; check_scene reports them.
+        # f64 values beyond float32 become infinite here, and check_scene reports them.
         with np.errstate(over="ignore", invalid="ignore"):
             for part, block in self._rows.blocks(rows):
                 for field, plane in planes.items():
@@ -108,9 +108,9 @@ class PlySource(SceneSource):
 
 
 def _smooth(block: np.ndarray) -> dict[str, np.ndarray]:
-    """Log-scales and logits after the filter: variances add, and the opacity keeps what the Gaussian holds in all."""
+    """Log-scales and logits with the 3D filter applied: variances add, and opacity falls so that the Gaussian's sum stays."""
     scales = np.stack([block[name] for name in FIELD["log_scales"].ply]).astype(np.float64)
-    with np.errstate(all="ignore"):  # no filter is -inf; what is not finite is reported by check_scene
+    with np.errstate(all="ignore"):  # a filter of 0 gives -inf; check_scene reports what is not finite
         wide = np.logaddexp(2 * scales, 2 * np.log(block[SMOOTHING].astype(np.float64))) / 2
         log_opacity = -np.logaddexp(0, -block["opacity"].astype(np.float64)) + (scales - wide).sum(axis=0)
         logits = log_opacity - np.log(-np.expm1(log_opacity))
@@ -118,11 +118,11 @@ def _smooth(block: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def choose_origin(positions: np.ndarray) -> np.ndarray:
-    """Where to measure positions from, so that float32 keeps their digits.
+    """Choose an origin for positions, so that float32 keeps their digits.
 
-    Per axis the 5 % and 95 % quantiles of the finite positions give a centre and an extent; the grid is the largest
-    extent, rounded up to a power of two (1 if there is none). The origin is the grid point nearest to the centre,
-    or 0 for scenes whose centre is within 16 grid steps of zero on every axis: these lose too little to be moved.
+    Per axis, the 5 % and 95 % quantiles of the finite positions give a centre and an extent. The grid is the largest extent,
+    rounded up to a power of two (1 if there is none). The origin is the grid point nearest to the centre. It is 0 if the
+    centre is within 16 grid steps of zero on every axis: such scenes lose too little to be moved.
 
     Parameters
     ----------
@@ -146,13 +146,13 @@ def choose_origin(positions: np.ndarray) -> np.ndarray:
         grid = 2.0 ** np.ceil(np.log2(extent)) if extent > 0 else 1.0
         origin = np.round((low + high) / 2 / grid) * grid
         far = np.all(np.isfinite(origin)) and np.any(np.abs(origin) > _ORIGIN_FAR * grid)
-    # + 0.0 turns -0.0 into 0.0, which would otherwise show in files and messages.
+    # + 0.0 turns -0.0 into 0.0, since the sign would show in files and messages.
     return origin + 0.0 if far else np.zeros(3)
 
 
 class _RowReader(Protocol):
     def blocks(self, rows: Rows) -> Iterator[tuple[slice, np.ndarray]]:
-        """Blocks of structured rows, each with its place in the result; a block is valid until the next."""
+        """Yield blocks of structured rows, each with its place in the result; a block is valid until the next one."""
 
 
 class _ArrayRows:
@@ -200,7 +200,7 @@ class _FileRows:
         low, high = int(rows.min()), int(rows.max())
         if high - low < len(block):
             return _gather(self._range(file, low, block[: high - low + 1]), rows - low)
-        # Far apart: what lies close together is read with what lies between, straight to its place where that is nothing.
+        # Rows far apart. Wanted rows close together are read with the rows between; if none lie between, straight to their place.
         found, space = block[: len(rows)], block[len(rows) :]
         breaks = np.diff(rows, prepend=rows[0] - 2 * _GAP)
         starts = np.flatnonzero((breaks < 1) | (breaks > _GAP))
@@ -217,7 +217,7 @@ class _FileRows:
         return found
 
     def _range(self, file: BinaryIO, first: int, block: np.ndarray) -> np.ndarray:
-        """Fill `block` with the rows from `first` on."""
+        """Fill `block` with consecutive rows from `first` on."""
         view = block.view(np.uint8).data
         file.seek(self.offset + first * self.dtype.itemsize)
         done = 0
@@ -230,21 +230,21 @@ class _FileRows:
 
 
 def _gather(block: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """`block[rows]`, taken as rows of bytes: NumPy copies records more slowly."""
+    """`block[rows]`, taken as rows of bytes, since NumPy copies records more slowly."""
     size = block.dtype.itemsize
     return block.view(np.uint8).reshape(-1, size).take(rows, axis=0).view(block.dtype).reshape(-1)
 
 
 def _stamp(file: BinaryIO) -> tuple[int, int, int]:
-    """What changes when a file is replaced or written to: inode, size, time."""
+    """Inode, size and time of a file, which change if it is replaced or written to."""
     status = os.fstat(file.fileno())
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 class _HeaderThenData:
-    """What plyfile reads: our own header (it refuses comments in UTF-8), then the data, as text for ascii files.
+    """The stream that plyfile reads: our own header (plyfile refuses UTF-8 comments), then the data, as text for ascii files.
 
-    Plain bytes would not do for ascii: plyfile wraps them and reads ahead, and what follows cannot be checked.
+    A plain byte stream would not do for ascii: plyfile wraps it and reads ahead, so that the bytes left could not be checked.
     """
 
     def __init__(self, header: PlyHeader, file: BinaryIO) -> None:
@@ -255,7 +255,7 @@ class _HeaderThenData:
     def read(self, size: int) -> str | bytes:
         if size < 0:
             raise ValueError(f"a list of negative length ({size})")
-        # A list's length is a claim too: no more is asked for than there is.
+        # The length of a list may be false, so we ask for no more bytes than there are.
         data = self.head.read(size) or self.file.read(min(size, self.left))
         return data.decode("ascii") if self.text else data
 
@@ -264,8 +264,8 @@ class _HeaderThenData:
 
 
 def _load_whole(header: PlyHeader) -> np.ndarray:
-    """The rows of `vertex` of a file that only plyfile can take apart (held in memory as long as the source)."""
-    # GPL-3: imported only for the files that need it.
+    """Load the rows of `vertex` by plyfile, for files that need it; they stay in memory as long as the source."""
+    # plyfile is GPL-3: imported only for the files that need it.
     from plyfile import PlyData, PlyParseError
 
     try:
@@ -286,19 +286,19 @@ def write_ply(
 ) -> tuple[str, ...]:
     """Write a scene in INRIA's layout: x y z, nx ny nz (zeros), f_dc, f_rest, opacity, scale, rot; little endian.
 
-    Properties are `float`. Positions are world positions; with an origin other than zero they are `double`, since
-    float32 would lose the digits that the origin kept. What the source says of its values (`comments`) stands in the header.
+    Properties are `float`. Positions are world positions. If the origin is not zero, they are `double`, since float32 would
+    lose the digits that the origin kept. The source's `comments` are written to the header.
 
     Parameters
     ----------
     path : path
-        Written beside its place first, renamed when complete.
+        Gets its name only when the file is complete.
     source : SceneSource
         May be the very file that is overwritten.
     force : bool, optional
-        Replace a file that exists.
+        Replace an existing file.
     chunk_rows : int, optional
-        Rows held at a time.
+        Rows held in memory at a time.
 
     Returns
     -------
@@ -308,9 +308,9 @@ def write_ply(
     Raises
     ------
     InputError
-        When the file exists and `force` is not set, or the folder is missing.
+        If the file exists and `force` is not set, or the folder is missing.
     BudgetError
-        When the disk is full.
+        If the disk is full.
     """
     wide = bool(np.any(source.origin != 0))
     dtype = inria_dtype(source.sh_degree, wide)
@@ -325,7 +325,7 @@ def write_ply(
         for rows in source.chunks(chunk_rows):
             part = source.read_table(rows, table)
             if block is not None:
-                # Everything but the positions: one table of floats.
+                # All properties but the positions form one table of floats.
                 whole = block[: len(part)]
                 whole.view(np.uint8).reshape(len(part), -1)[:, 3 * dtype["x"].itemsize :].view("<f4")[:] = part[:, 3:]
                 for axis, name in enumerate(FIELD["means"].ply):
@@ -338,7 +338,7 @@ def write_ply(
 
 
 def inria_dtype(sh_degree: int, wide: bool = False) -> np.dtype:
-    """One row of INRIA's PLY (248 bytes at degree 3); `wide`: positions as float64.
+    """One row of INRIA's PLY (248 bytes at degree 3); with `wide`, positions are float64.
 
     >>> inria_dtype(3).itemsize
     248

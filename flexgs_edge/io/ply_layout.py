@@ -1,4 +1,4 @@
-"""PLY headers: what a file says it holds, checked against its size before a byte of it is allocated."""
+"""Parse PLY headers, and check their claims against the size of the file before anything is allocated."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ _TYPES = {
 _NAMES = {kind: name for name, kind in reversed(_TYPES.items())}
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 1 << 20
-"""Bytes: headers of scenes have 2 kB; a file without `end_header` is not read to its end."""
+"""Most bytes of a header; those of scenes have 2 kB. A file without `end_header` is not read further."""
 _SILENT = ("nx", "ny", "nz")
-"""INRIA's own properties that carry nothing."""
+"""Properties of INRIA's layout without content (normals)."""
 PROGRAM = "flexgs-edge"
 """First word of our comments."""
 SMOOTHING = "filter_3D"
-"""Mip-Splatting's own property: standard deviation, scene units, of a filter that scales and opacities are stored without."""
+"""Property of Mip-Splatting: standard deviation (scene units) of a filter that stored scales and opacities do not include."""
 
 
 @dataclass
 class Property:
-    """One property of an element; `length` is the type of a list's count, None for scalars."""
+    """One property of an element; `length` is the type of a list's count, and None for scalars."""
 
     name: str
     type: str
@@ -53,13 +53,13 @@ class Property:
 
     @property
     def smallest(self) -> int:
-        """Fewest bytes that one value takes in a binary file."""
+        """Least bytes of one value in a binary file."""
         return np.dtype(self.length or self.type).itemsize
 
 
 @dataclass
 class Element:
-    """One element of the header, e.g. `vertex`."""
+    """One element of the header, such as `vertex`."""
 
     name: str
     count: int
@@ -67,12 +67,12 @@ class Element:
 
     @property
     def scalar(self) -> bool:
-        """Has no lists: all rows have the same size."""
+        """Whether the element has no lists, so that all its rows have one size."""
         return all(p.length is None for p in self.properties)
 
     @property
     def row_size(self) -> int:
-        """Bytes a row in a binary file (the least, with lists)."""
+        """Bytes of a row in a binary file; with lists, the least."""
         return sum(p.smallest for p in self.properties)
 
 
@@ -83,13 +83,13 @@ class PlyHeader:
     Attributes
     ----------
     order : str
-        "<", ">" or "" (ascii).
+        Byte order, "<" or ">"; "" for ascii.
     elements : list of Element
-        In the file's order.
+        In the order of the file.
     data_offset : int
-        Byte where the data starts.
+        First byte of the data.
     comments : tuple of str
-        Of this program.
+        Comments that this program wrote.
     """
 
     path: Path
@@ -100,7 +100,7 @@ class PlyHeader:
 
     @property
     def vertex(self) -> Element:
-        """The element that holds the Gaussians."""
+        """The element with the Gaussians; raises `FormatError` if there is none."""
         for element in self.elements:
             if element.name == "vertex":
                 return element
@@ -114,17 +114,17 @@ class PlyHeader:
 
     @property
     def plain(self) -> bool:
-        """Binary, and no lists in `vertex` or before it: can be read by row ranges."""
+        """Whether rows can be read by range: a binary file, with no lists in `vertex` or before it."""
         return bool(self.order) and all(element.scalar for element in (*self.before, self.vertex))
 
     @property
     def vertex_offset(self) -> int:
-        """Byte where the rows of `vertex` start (plain files)."""
+        """First byte of the rows of `vertex`, in plain files."""
         return self.data_offset + sum(element.count * element.row_size for element in self.before)
 
     @property
     def text(self) -> str:
-        """The header again, without comments."""
+        """The header as text, without comments."""
         names = {order: name for name, order in _FORMATS.items()}
         lines = ["ply", f"format {names[self.order]} 1.0"]
         for element in self.elements:
@@ -136,21 +136,21 @@ class PlyHeader:
 
     @property
     def vertex_dtype(self) -> np.dtype:
-        """One row of `vertex` as the file stores it (plain files)."""
+        """One row of `vertex` in the file, for plain files."""
         return np.dtype([(p.name, self.order + p.type) for p in self.vertex.properties])
 
     def check_size(self, size: int) -> None:
-        """Compare what the header claims with the file's `size` in bytes (exactly for binary files without lists).
+        """Compare the claims of the header with the file's `size` in bytes (exactly for binary files without lists).
 
         Raises
         ------
         FormatError
-            When data are missing, or there are bytes too many.
+            If data are missing, or there are too many bytes.
         """
         for element in self.elements:
             if element.count and not element.properties:
                 raise FormatError(f"{self.path}: element {element.name!r} has {element.count} rows without properties")
-        # In ascii a value is one character and its separator at the least; the last may lack the latter.
+        # In ascii, a value takes at least one character and a separator; the last value may lack the separator.
         exact = bool(self.order) and all(element.scalar for element in self.elements)
         least = sum(e.count * (e.row_size if self.order else 2 * len(e.properties)) for e in self.elements)
         found = size - self.data_offset
@@ -169,12 +169,12 @@ class PlyHeader:
 
 
 def read_header(path: Path, file: BinaryIO) -> PlyHeader:
-    """Parse the header of the PLY `file` (positioned at its start).
+    """Parse the header of the PLY `file`, which must be at its start.
 
     Raises
     ------
     FormatError
-        Names the line and what was expected there.
+        If the header breaks the format; the message names the line and what was expected there.
     """
     number, order, elements, comments = 0, None, list[Element](), list[str]()
     while True:
@@ -241,12 +241,12 @@ def _property(place: str, words: list[str], element: Element) -> Property:
 
 
 def gaussian_layout(header: PlyHeader) -> tuple[int, tuple[str, ...]]:
-    """SH degree of the scene, and notes on what is left out.
+    """SH degree of the scene, and notes on properties that are left out.
 
     Raises
     ------
     FormatError
-        When properties are missing, of the wrong type, or there is a wrong number of `f_rest_*`.
+        If properties are missing or of the wrong type, or the number of `f_rest_*` is wrong.
     """
     vertex = header.vertex
     by_name = {p.name: p for p in vertex.properties}
@@ -273,7 +273,7 @@ def gaussian_layout(header: PlyHeader) -> tuple[int, tuple[str, ...]]:
 
 
 def smoothing_of(header: PlyHeader) -> bool:
-    """Whether the vertices have Mip-Splatting's 3D filter still to be applied."""
+    """Whether the vertices have a 3D filter of Mip-Splatting that must still be applied."""
     return any(p.name == SMOOTHING and p.length is None and p.type.startswith("f") for p in header.vertex.properties)
 
 

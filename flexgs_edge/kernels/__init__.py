@@ -1,1 +1,1 @@
-"""OpenCL kernels and their NumPy twins: devices, sessions and the backend that is one of the two."""
+"""OpenCL kernels and their NumPy twins, behind one interface: devices, sessions and backends."""

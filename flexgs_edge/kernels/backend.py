@@ -1,4 +1,4 @@
-"""The one interface that the renderer drives: OpenCL kernels or their NumPy twins."""
+"""The interface to kernels and memory: an OpenCL device, or the NumPy twins."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from flexgs_edge.memory.budget import MemoryBudget
 
 @dataclass(frozen=True)
 class KernelSpec:
-    """How a kernel is found and launched.
+    """Where a kernel is found, and how it is launched.
 
     Parameters
     ----------
     file : str
         Name in `cl_kernels/`; `{form}` is `cpu` or `gpu`.
     signature : str
-        One letter an argument: u uint32, i int32, f float32, b array.
+        One letter for each argument: u uint32, i int32, f float32, b array.
     per : str
-        What a work-item is: `rows` (a vector of W rows; the launch size counts rows), `item` (one of the launch
-        size), `tile` (one item a tile on CPUs, a group of 256 on GPUs).
+        The work of one item: `rows` (a vector of W rows; the launch size counts rows), `item` (one of the launch size),
+        `tile` (one work-item a tile on CPUs, a group of 256 on GPUs).
     stats : int, optional
-        The blend's kind.
+        Kind of statistics, for blends.
     widest : int
-        Lanes of a vector at most.
+        Most lanes of a vector.
     """
 
     file: str
@@ -50,7 +50,7 @@ KERNELS: dict[str, KernelSpec] = {
     "sort_count": KernelSpec("sort.cl", "uubb"),
     "sort_scatter": KernelSpec("sort.cl", "uubbbbb"),
     "exclusive_scan": KernelSpec("sort.cl", "uub"),
-    # Most splats are in no more than 8 block rows: with vectors of 16 their lists take a fifth longer.
+    # Most splats touch at most 8 block rows, so vectors of 16 would be slower.
     "tile_room": KernelSpec("tiles.cl", "uubbb", widest=8),
     "tile_count": KernelSpec("tiles.cl", "uuffibbbbb", widest=8),
     "tile_scatter": KernelSpec("tiles.cl", "ubbbb", widest=8),
@@ -70,14 +70,14 @@ KERNELS: dict[str, KernelSpec] = {
     "snap": KernelSpec("backward.cl", "uubbbbbbbb", "rows"),
     "dequantize": KernelSpec("dequantize.cl", "uuuuuuubbbb"),
 }
-"""Every kernel by the name that `Backend.launch` and the twins share."""
+"""Every kernel, by the name that `Backend.launch` and the twins use."""
 
 CODEC_KERNELS: dict[str, KernelSpec] = {
     "code_chunks": KernelSpec("code_chunks.cl", 11 * "u" + 17 * "b"),
     "encode_chunks": KernelSpec("encode_chunks.cl", "uubbbbbb"),
     "grid_rows": KernelSpec("grid_rows.cl", "uuuuuiiibbbb"),
 }
-"""Kernels that a codec launches; what they do in NumPy is the codec's own code, not a twin."""
+"""Kernels of the codec. They have no twins: the codec's own NumPy code is their specification."""
 
 
 class Array(Protocol):
@@ -87,16 +87,16 @@ class Array(Protocol):
     nbytes: int
 
     def release(self) -> None:
-        """Free it."""
+        """Free the array."""
 
 
 class Backend(Protocol):
-    """Memory and kernels of one device (or of NumPy)."""
+    """Memory and kernels of one device, or of NumPy."""
 
     name: str
     is_numpy: bool
     threads: int
-    """Work-items that run side by side as threads of a processor do, with double precision; 0 where none do."""
+    """Work-items that run side by side as threads of a processor with f64; 0 for a device without them, such as a GPU."""
     sort_blocks: int
     tile_blocks: int
     startup_seconds: float
@@ -104,37 +104,38 @@ class Backend(Protocol):
 
     @property
     def compile_seconds(self) -> float:
-        """Seconds spent building kernels so far."""
+        """Seconds spent on building kernels so far."""
 
     def describe(self) -> dict[str, Any]:
-        """What runs the kernels, for `--json`."""
+        """The device and its settings, for `--json`."""
 
     def array(self, shape: tuple[int, ...], dtype: Any) -> Any:
-        """An array, not initialised, taken from the budget."""
+        """A new array, not initialised; its bytes are taken from the budget."""
 
     def write(self, array: Any, values: np.ndarray, offset: int = 0) -> None:
-        """Copy values into an array."""
+        """Copy values into an array, from the flat element `offset` on."""
 
     def mapped(self, array: Any) -> AbstractContextManager[np.ndarray]:
-        """An array that is not empty on the host, to be written without a copy where the device shares the host's memory.
+        """Write to an array on the host, without a copy if the device shares the host's memory. The array may not be empty.
 
-        What was in it may be gone; the device has what is in it at the end. Does not wait for kernels: none may use the array.
+        The old values may be lost, and the device gets the new ones at the end. This does not wait for kernels, so none may
+        use the array.
         """
 
     def mark(self) -> Callable[[], None]:
-        """What waits for all kernels launched so far, and for none that is launched later."""
+        """A function that waits for all kernels launched so far, but for none launched later."""
 
     def read(self, array: Any, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
-        """Copy an array out."""
+        """Copy an array to the host, from the flat element `offset` on."""
 
     def fill(self, array: Any, value: int) -> None:
-        """Set every element."""
+        """Set every element of an array."""
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
         """Run the kernel `name` over `size` rows, items or tiles."""
 
     def close(self) -> None:
-        """Free what the backend holds."""
+        """Free all that the backend holds."""
 
 
 class HostArray:
@@ -156,7 +157,7 @@ class HostArray:
 
 
 class TwinBackend:
-    """The NumPy twins: the specification, and the way to run where no OpenCL device works."""
+    """Runs the NumPy twins, which specify the kernels; slow, but it needs no OpenCL device."""
 
     name = "numpy"
     is_numpy = True
@@ -175,11 +176,11 @@ class TwinBackend:
         self.compile_seconds = 0.0
 
     def describe(self) -> dict[str, Any]:
-        """What runs the kernels."""
+        """The name and version of NumPy, for `--json`."""
         return {"backend": "numpy", "numpy": np.__version__}
 
     def array(self, shape: tuple[int, ...], dtype: Any) -> HostArray:
-        """An array taken from the budget."""
+        """A new array; its bytes are taken from the budget."""
         return HostArray(self.budget, shape, dtype)
 
     def write(self, array: HostArray, values: np.ndarray, offset: int = 0) -> None:
@@ -188,31 +189,31 @@ class TwinBackend:
         array.data.reshape(-1)[offset : offset + values.size] = values.reshape(-1)
 
     def mapped(self, array: HostArray) -> AbstractContextManager[np.ndarray]:
-        """The array itself."""
+        """The array itself, without a copy."""
         return nullcontext(array.data)
 
     def mark(self) -> Callable[[], None]:
-        """Kernels have run when `launch` returns."""
+        """A function that does nothing, since `launch` returns when the twin has run."""
         return lambda: None
 
     def read(self, array: HostArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
-        """Copy `array` out, from the flat element `offset` on."""
+        """Copy `array`, from the flat element `offset` on."""
         if out is None:
             return array.data.copy()
         out.reshape(-1)[:] = array.data.reshape(-1)[offset : offset + out.size]
         return out
 
     def fill(self, array: HostArray, value: int) -> None:
-        """Set every element."""
+        """Set every element of an array."""
         array.data.fill(value)
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
         """Run the twin `name`."""
         start = time.perf_counter()
-        with np.errstate(all="ignore"):  # kernels do not trap either: culling tests are written to fail on NaN
+        with np.errstate(all="ignore"):  # kernels do not trap either; culling tests are written to fail on NaN
             self._twins[name](size, *(a.data if isinstance(a, HostArray) else a for a in args))
         if self.profile is not None:
             self.profile[name] += time.perf_counter() - start
 
     def close(self) -> None:
-        """Nothing is held beyond the arrays."""
+        """Do nothing: the backend holds only arrays."""

@@ -1,4 +1,4 @@
-"""Which OpenCL devices there are, which of them work, and which one is taken."""
+"""List the OpenCL devices, test whether they work, and choose one."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ HINT = (
     "`--device numpy` (same results, far slower)"
 )
 
-# Contracted and separate multiply-add on vectors of 16: catches runtimes that cannot build for this processor (every kernel
-# of the PoCL wheels from pip fails on CPUs newer than their compiler), that fuse what must not be fused, or miss lanes.
+# Fused and separate multiply-add on vectors of 16. It catches runtimes that cannot build for this processor (PoCL's wheels on
+# CPUs newer than their compiler), that fuse operations they must not fuse, or that miss lanes.
 _SELF_TEST = """
 #pragma OPENCL FP_CONTRACT OFF
 __kernel void self_test(__global const float *a, __global const float *b, __global float *out) {
@@ -55,33 +55,33 @@ class DeviceInfo:
     self_test: str
     handle: cl.Device | None = field(default=None, repr=False, compare=False)
     context: cl.Context | None = field(default=None, repr=False, compare=False)
-    """The self-test's. PoCL's compiler starts again, for half a second, in the first context after the last one has gone."""
+    """The context of the self-test, kept alive: after the last context is gone, PoCL starts its compiler anew for the next."""
 
     @property
     def usable(self) -> bool:
-        """Whether the device passed (or was spared) the self-test."""
+        """Whether the device passed the self-test, or the test was not run."""
         return self.self_test in ("ok", "not run")
 
     def to_json(self) -> dict[str, Any]:
-        """All fields but the handle and the context."""
+        """All fields but the handle and the context, as JSON values."""
         fields = asdict(DeviceInfo(**{**self.__dict__, "handle": None, "context": None}))
         del fields["handle"], fields["context"]
         return fields
 
 
 def list_devices(self_test: bool = True) -> list[DeviceInfo]:
-    """Every device of every OpenCL platform, in the order of the loader.
+    """Every device of every OpenCL platform, in the order of the OpenCL loader.
 
     Parameters
     ----------
     self_test : bool
-        Build and run a small kernel on each device and compare its result with NumPy's.
+        Build and run a small kernel on each device, and compare its result with NumPy's.
     """
     import pyopencl as cl
 
     try:
         platforms = cl.get_platforms()
-    except cl.LogicError:  # PLATFORM_NOT_FOUND_KHR: no runtime installed
+    except cl.LogicError:  # PLATFORM_NOT_FOUND_KHR: no runtime is installed
         return []
     found: list[DeviceInfo] = []
     for platform in platforms:
@@ -125,7 +125,7 @@ def _describe(index: int, platform: Any, device: Any, self_test: bool) -> Device
 
 
 def run_self_test(context: cl.Context) -> str:
-    """`ok`, or one line that says what went wrong."""
+    """Run the self-test; returns `ok`, or one line about the failure."""
     import pyopencl as cl
 
     a = np.linspace(0.5, 3.0, 64, dtype=np.float32)
@@ -162,19 +162,19 @@ def _first_line(text: str) -> str:
 
 
 def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceInfo, str]:
-    """The device that `spec` names, and why.
+    """Choose the device that `spec` names; returns it with the reason.
 
     Parameters
     ----------
     spec : str or None
-        An index, `cpu`, `gpu`, a part of the device's or platform's name, or None: the first GPU that passed the
-        self-test, else PoCL's CPU device, else any other CPU device.
+        An index, `cpu`, `gpu`, or a part of the name of a device or platform. None, the default, takes the first GPU that
+        passed the self-test, else PoCL's CPU device, else any other CPU device.
 
     Raises
     ------
     DeviceError
-        When nothing matches or what matches failed its self-test; the message lists what is there. Never another device
-        than the one asked for.
+        If no device matches, or the one that matches failed its self-test; the message lists all devices. We never take
+        another device than the one asked for.
     """
     listing = "; ".join(f"[{d.index}] {d.name} ({d.platform}, {d.type}): {d.self_test}" for d in devices)
     if not devices:

@@ -1,4 +1,4 @@
-"""Finds the OpenCL sources and completes them: shared constants, `common.clh`, the other `.clh` helpers, the kernels' file."""
+"""Assemble OpenCL programs: shared constants, `common.clh`, the other `.clh` helpers, and the file of the kernel."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from flexgs_edge.errors import DeviceError
 from flexgs_edge.kernels.backend import KERNELS
 
 KERNEL_DIR_VARIABLE = "FLEXGS_KERNEL_DIR"
-"""Environment variable that names another kernel folder: the tests plant faults in a copy and expect to see them."""
+"""Environment variable with another kernel folder. Tests plant faults in a copy, and expect checks to notice."""
 
 _COMMON = "common.clh"
 _SHARED = (_COMMON, "sh.clh")
-"""Files without kernels, put before every kernel file."""
+"""Files of helpers, which come before every kernel file."""
 _TOGETHER = ("activate.cl", "project.cl", "sort.cl", "score.cl", "similarity.cl")
 _CODEC = ("code_chunks.cl", "encode_chunks.cl")
-"""One program too."""
+"""Files that together make one program of the codec."""
 _BLENDS = {spec.stats: name for name, spec in KERNELS.items() if spec.stats is not None}
-"""Kernels that the files of the blend make, by STATS."""
+"""Blend kernels by their kind of statistics, STATS; one file makes all of them."""
 _BLENDS_TOGETHER = (0, 2, 3, 4)
-"""What makes one program. Each program costs time to load and to build, however small it is:
+"""Blends that make one program together, since each program takes time to load and to build, however small it is:
 docs/results/tuning.md#programs"""
 
 
 def kernel_dir() -> Path:
     """The folder of the `.cl` files.
 
-    In this order: the folder that FLEXGS_KERNEL_DIR names; `cl_kernels` inside the installed package (a wheel maps it
-    there); `cl_kernels` beside the package (a checkout, an unpacked sdist, an editable install).
+    The order is: the folder that FLEXGS_KERNEL_DIR names; `cl_kernels` inside the installed package (a wheel puts it there);
+    `cl_kernels` beside the package (a checkout, an unpacked sdist, an editable install).
 
     Raises
     ------
     DeviceError
-        When that folder holds no `common.clh`.
+        If that folder holds no `common.clh`.
     """
     override = os.environ.get(KERNEL_DIR_VARIABLE)
     package = Path(__file__).resolve().parents[1]
@@ -53,7 +53,7 @@ def kernel_dir() -> Path:
 def float_literal(value: float) -> str:
     """A float32 as OpenCL C text that reads back to the same bits.
 
-    `value` is rounded to float32 here, once; nine significant digits are enough for any float32.
+    `value` is rounded to float32 here, once; nine significant digits suffice for any float32.
 
     >>> float_literal(0.3), float_literal(-126.0), float_literal(2.0**62)
     ('0.300000012f', '(-126.0f)', '4.61168602e+18f')
@@ -65,7 +65,7 @@ def float_literal(value: float) -> str:
 
 
 def integer_literal(value: int) -> str:
-    """An integer as OpenCL C text: an `int` where it fits, else a `uint`.
+    """An integer as OpenCL C text: an `int` if it fits, else a `uint`.
 
     >>> integer_literal(16), integer_literal(0xFFFFFFFF)
     ('16', '4294967295u')
@@ -80,7 +80,7 @@ def _signed(text: str) -> str:
 
 
 def shared_constants() -> Iterator[tuple[str, int | float]]:
-    """Name and value of every number in `flexgs_edge.constants`, in its order; `NAME_0`, `NAME_1`, ... for a tuple."""
+    """Yield name and value of every number in `flexgs_edge.constants`, in order; a tuple gives `NAME_0`, `NAME_1`, ..."""
     for name, value in vars(constants).items():
         if not name.isupper():
             continue
@@ -99,23 +99,23 @@ def constants_header() -> str:
 
 
 def load_source(name: str, stats: int | None = None, form: str = "cpu") -> str:
-    """The whole program text with the kernel file `name`: every `.clh` helper (`common.clh` first), and the kernels beside it.
+    """The program text of a kernel file: all `.clh` helpers (`common.clh` first), then the kernels.
 
-    `#line` directives make the compiler name the file and line that a person can open.
+    `#line` directives make the compiler name files and lines that a person can open.
 
     Parameters
     ----------
     name : str
         File name in the kernel folder, such as `project.cl`.
     stats : int, optional
-        The blend's kind, for its files.
+        Kind of statistics, for the files of blends.
     form : {"cpu", "gpu"}
-        Of the blends beside other kernels.
+        Form of the blends that are built together with other kernels.
 
     Raises
     ------
     DeviceError
-        When the folder or the file is missing.
+        If the folder or the file is missing.
     """
     folder = kernel_dir()
     parts = ['#line 1 "constants.py, as printed by flexgs_edge.kernels.cl_sources"\n', constants_header()]

@@ -1,4 +1,4 @@
-"""The choice between OpenCL kernels and their NumPy twins."""
+"""Open the backend that a user names: an OpenCL device, or the NumPy twins."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from flexgs_edge.memory.budget import MemoryBudget
 
 
 def open_backend(device: str | None, budget: MemoryBudget) -> Backend:
-    """The backend that `device` names.
+    """Open the backend that `device` names.
 
     Parameters
     ----------
     device : str or None
-        `numpy` for the twins; otherwise an OpenCL device as in `flexgs_edge.kernels.choose_device.choose_device`. There is no
-        silent fallback from one to the other.
+        `numpy` for the twins, else an OpenCL device as in `flexgs_edge.kernels.choose_device.choose_device`. We never fall
+        back from one to the other silently.
     budget : MemoryBudget
-        Every array of the backend is taken from it.
+        Counts every array of the backend.
 
     Raises
     ------
     DeviceError
-        When the device does not exist or failed its self-test.
+        If the device does not exist, or failed its self-test.
     """
     if device == "numpy":
         return TwinBackend(budget)

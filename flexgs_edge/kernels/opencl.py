@@ -1,4 +1,4 @@
-"""The OpenCL backend: builds the kernels for one device and launches them by name."""
+"""The OpenCL backend: build the kernels for one device, and launch them by name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flexgs_edge.kernels.session import DeviceArray, Session
 from flexgs_edge.memory.budget import MemoryBudget
 
 GPU_GROUP = 64
-"""Work-group of the kernels with a row a work-item on GPUs (divides the padding of planes)."""
+"""Size of a work-group on GPUs for kernels with one row a work-item; it divides the padding of planes."""
 
 
 class OpenCLBackend:
@@ -30,11 +30,11 @@ class OpenCLBackend:
     info : DeviceInfo
         The device.
     budget : MemoryBudget
-        Buffers are taken from it.
+        Counts all buffers.
     width : int, optional
-        Lanes of a vector, 16, 8, 4 or 1. Default: the device's native width on CPUs, 1 on GPUs.
+        Lanes of a vector: 16, 8, 4 or 1. By default, the device's native width on CPUs, and 1 on GPUs.
     form : {"cpu", "gpu"}, optional
-        Shape of the blend kernel: a work-item a tile, or a work-group a tile. Default: by the device's type.
+        Form of the blend kernel: one work-item a tile, or one work-group a tile. By default, it follows the device's type.
     """
 
     is_numpy = False
@@ -50,11 +50,11 @@ class OpenCLBackend:
         if self.width not in (16, 8, 4, 1) or (self.form == "gpu" and self.width != 1):
             raise DeviceError(f"vector width {self.width} of the {self.form} form: expected 16, 8, 4 or 1 (gpu: 1)")
         self.name = f"{info.name} ({info.platform})"
-        # Oclgrind's interpreter stops at instructions that only hint.
+        # Oclgrind's interpreter stops at instructions that are only hints.
         self._simulated = "oclgrind" in info.platform.lower()
-        # Blocks of the serial passes: enough to keep every unit busy to the end, few enough for short scans.
+        # Blocks of the serial passes: enough to keep all compute units busy, few enough for short scans.
         self.sort_blocks = self.tile_blocks = max(8 * info.compute_units, 16) if self.form == "cpu" else 64
-        # The codec's kernels take doubles, and put two numbers into one of twice their width.
+        # The codec's kernels take f64, and join two numbers in one of twice the width, which needs little endian.
         able = info.handle is not None and info.handle.double_fp_config != 0 and info.handle.endian_little
         self.threads = info.compute_units if self.form == "cpu" and able else 0
         self._kernels: dict[str, cl.Kernel] = {}
@@ -62,12 +62,12 @@ class OpenCLBackend:
 
     @property
     def compile_seconds(self) -> float:
-        """Seconds spent building programs so far."""
+        """Seconds spent on building programs so far."""
         return self.session.compile_seconds
 
     @property
     def profile(self) -> defaultdict[str, float] | None:
-        """Wall seconds by kernel when set (every launch then waits for the queue)."""
+        """Wall seconds by kernel; None (default) if not measured. Measuring makes every launch wait for the queue."""
         return self.session.profile
 
     @profile.setter
@@ -75,11 +75,11 @@ class OpenCLBackend:
         self.session.profile = value
 
     def describe(self) -> dict[str, Any]:
-        """What runs the kernels."""
+        """The device and its settings, for `--json`."""
         return {"backend": "opencl", "width": self.width, "form": self.form, **self.session.info.to_json()}
 
     def array(self, shape: tuple[int, ...], dtype: Any) -> DeviceArray:
-        """An array on the device, not initialised."""
+        """A new array on the device, not initialised."""
         return self.session.array(shape, dtype)
 
     def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0) -> None:
@@ -87,15 +87,15 @@ class OpenCLBackend:
         self.session.write(array, values, offset)
 
     def mapped(self, array: DeviceArray) -> AbstractContextManager[np.ndarray]:
-        """`array` on the host, to be written."""
+        """Write to `array` on the host; see `Backend.mapped`."""
         return self.session.mapped(array)
 
     def mark(self) -> Callable[[], None]:
-        """What waits for all kernels launched so far."""
+        """A function that waits for all kernels launched so far."""
         return self.session.mark()
 
     def read(self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
-        """Copy `array` to the host."""
+        """Copy `array` to the host, from the flat element `offset` on."""
         return self.session.read(array, out, offset)
 
     def fill(self, array: DeviceArray, value: int) -> None:
@@ -121,5 +121,5 @@ class OpenCLBackend:
             self.session.launch(name, self._kernels[name], size, local, args)
 
     def close(self) -> None:
-        """Wait for the queue; buffers are released by their owners."""
+        """Wait for the queue; the owners of buffers release them."""
         self.session.finish()

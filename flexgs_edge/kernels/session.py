@@ -1,4 +1,4 @@
-"""One OpenCL session: context, queue, built programs, kept kernels and counted buffers."""
+"""One OpenCL session: context, queue, built programs, kernels, and buffers counted in the budget."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCALARS = {"u": np.uint32, "i": np.int32, "f": np.float32, "b": None}
 
 
 class DeviceArray:
-    """A buffer on the device with the shape and dtype of the array in it."""
+    """A buffer on the device, with the shape and dtype of its array."""
 
     def __init__(self, session: Session, shape: tuple[int, ...], dtype: Any) -> None:
         self.shape = shape
@@ -29,7 +29,7 @@ class DeviceArray:
         self._session = session
         session.budget.take("a device buffer", self.nbytes)
         try:
-            # Zero-sized buffers are not allowed; nobody reads the spare bytes.
+            # OpenCL does not allow buffers of size zero; nobody reads the spare bytes.
             self.buffer = cl.Buffer(session.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 16))
         except (cl.MemoryError, cl.LogicError) as error:
             session.budget.give(self.nbytes)
@@ -54,7 +54,7 @@ class Session:
     info : DeviceInfo
         From `choose_device`.
     budget : MemoryBudget
-        Buffers are taken from it.
+        Counts all buffers.
     """
 
     def __init__(self, info: DeviceInfo, budget: MemoryBudget) -> None:
@@ -63,19 +63,19 @@ class Session:
         assert info.handle is not None
         self.context = info.context or cl.Context([info.handle])
         self.queue = cl.CommandQueue(self.context)
-        # Of its own: filling an array that no kernel uses must not wait for the kernels of others.
+        # A queue of its own: writing to an array that no kernel uses must not wait for other kernels.
         self._maps = cl.CommandQueue(self.context)
         self.compile_seconds = 0.0
         self.profile: defaultdict[str, float] | None = None
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
 
     def kernel(self, source: str, name: str, options: tuple[str, ...], signature: str) -> cl.Kernel:
-        """The kernel `name` of `source`, built with `options`; `signature` has one of u i f b an argument.
+        """The kernel `name` of `source`, built with `options`; `signature` has one letter (u i f b) for each argument.
 
         Raises
         ------
         DeviceError
-            With the device, the options and the compiler's words when the program does not build.
+            If the program does not build; the message has the device, the options and the compiler's words.
         """
         key = (source, options)
         if key not in self._programs:
@@ -98,7 +98,7 @@ class Session:
     def launch(
         self, label: str, kernel: cl.Kernel, size: tuple[int, ...], local: tuple[int, ...], args: tuple[Any, ...]
     ) -> None:
-        """Enqueue `kernel`; with `profile` set, wait and add its wall seconds under `label`."""
+        """Enqueue `kernel`; with `profile` set, also wait for it, and add its wall seconds under `label`."""
         start = time.perf_counter() if self.profile is not None else 0.0
         kernel(self.queue, size, local, *(a.buffer if isinstance(a, DeviceArray) else a for a in args))
         if self.profile is not None:
@@ -106,7 +106,7 @@ class Session:
             self.profile[label] += time.perf_counter() - start
 
     def array(self, shape: tuple[int, ...], dtype: Any) -> DeviceArray:
-        """An array on the device, not initialised."""
+        """A new array on the device, not initialised."""
         return DeviceArray(self, shape, dtype)
 
     def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0) -> None:
@@ -119,7 +119,7 @@ class Session:
 
     @contextmanager
     def mapped(self, array: DeviceArray) -> Iterator[np.ndarray]:
-        """`array`, which no kernel uses, on the host to be written: what is in it may be gone. The device has it afterwards."""
+        """Map `array` to the host for writing. Its old values may be lost, and no kernel may use it meanwhile."""
         flags = cl.map_flags.WRITE_INVALIDATE_REGION
         values, _ = cl.enqueue_map_buffer(self._maps, array.buffer, flags, 0, array.shape, array.dtype)
         try:
@@ -128,13 +128,13 @@ class Session:
             values.base.release(self._maps).wait()
 
     def mark(self) -> Callable[[], None]:
-        """What waits for everything enqueued so far."""
+        """A function that waits for everything enqueued so far."""
         marker: cl.Event = cl.enqueue_marker(self.queue)
         self.queue.flush()
         return marker.wait
 
     def read(self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
-        """Copy `array` (from the flat element `offset` on, as much as `out` holds) to the host, waiting for the queue."""
+        """Copy `array` to the host, from the flat element `offset` on, as much as `out` holds; waits for the queue."""
         out = np.empty(array.shape, array.dtype) if out is None else out
         if out.size:
             cl.enqueue_copy(self.queue, out, array.buffer, src_offset=offset * array.dtype.itemsize, is_blocking=True)
@@ -147,5 +147,5 @@ class Session:
         )
 
     def finish(self) -> None:
-        """Wait for everything enqueued."""
+        """Wait for everything that is enqueued."""
         self.queue.finish()

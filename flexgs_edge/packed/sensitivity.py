@@ -1,8 +1,8 @@
-"""`--bits auto`: which attributes bear 4 bits, found by the paper's sensitivity search.
+"""`--bits auto`: the paper's sensitivity search finds the attributes that can do with 4 bits.
 
-Everything is coded at 8 bits (positions at 16). Each attribute alone is then coded at 4: its loss is the rise of the mean
-squared error against the original's renders for each bit saved. Attributes move to 4 bits in ascending order of loss while
-the summed rise stays under the error of a 0.3 dB modelled drop.
+The start is 8 bits for every attribute (16 for positions). Then each attribute alone is coded at 4 bits. Its loss is the rise
+of the mean squared error against the original's renders, for each bit saved. Attributes move to 4 bits in ascending order of
+loss, as long as the summed rise stays below the error of a 0.3 dB modelled drop.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from flexgs_edge.scene.fields import FIELDS
 
 HIGH, LOW, POSITION = 8, 4, 16
 ALLOWED_DROP = 0.3
-"""Modelled drop in dB that the summed rises may cost."""
+"""Modelled drop in dB that all attributes at 4 bits may cost together."""
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """One attribute of the search.
+    """The sensitivity of one attribute.
 
     Parameters
     ----------
     attribute : str
         Name in `--bits`.
     rise : float
-        Rise of the mean squared error when it alone goes from 8 to 4 bits.
+        Rise of the mean squared error if only this attribute goes from 8 to 4 bits.
     saved_bits : float
-        Bits saved a Gaussian.
+        Bits saved for each Gaussian.
     moved : bool
-        It is coded at 4 bits.
+        The attribute is coded at 4 bits.
     """
 
     attribute: str
@@ -42,7 +42,7 @@ class Sensitivity:
 
     @property
     def loss(self) -> float:
-        """Rise for each bit saved a Gaussian: the order in which attributes move."""
+        """Rise of the error for each bit saved; attributes move in this order."""
         return self.rise / self.saved_bits
 
 
@@ -54,18 +54,18 @@ def search_bits(
     Parameters
     ----------
     error : callable
-        Mean squared error against the original's renders when coded with these bits.
+        Codes the scene with these bits, and gives the mean squared error against the original's renders.
     sh_degree : int
         SH degree of the scene.
     sh_share : float
-        Share of the Gaussians that have SH above degree 0.
+        Share of the Gaussians with SH above degree 0.
     allowed : float
-        Mean squared error of the allowed modelled drop (`render.quality.error_for_drop`).
+        Mean squared error of the allowed modelled drop (`flexgs_edge.quality.psnr.error_for_drop`).
 
     Returns
     -------
     tuple
-        The bits, and what was measured, least sensitive first.
+        The bits, and the sensitivities, least sensitive attribute first.
     """
     base = BitSpec(xyz=POSITION, dc=HIGH, scale=HIGH, rot=HIGH, opacity=HIGH, rest=HIGH)
     floor = error(base)
@@ -73,7 +73,7 @@ def search_bits(
     for field in FIELDS:
         width = field.width(sh_degree) * (sh_share if field.name == "sh_rest" else 1.0)
         if field.name == "means" or width == 0.0:
-            continue  # 16-bit positions are part of the method; at degree 0 there are no SH to save on
+            continue  # the method fixes positions at 16 bits; at degree 0 there are no SH to save bits on
         rise = max(error(replace(base, **{field.bits: LOW})) - floor, 0.0)
         measured.append(Sensitivity(field.bits, rise, (HIGH - LOW) * width, moved=False))
     measured.sort(key=lambda item: (item.loss, item.attribute))

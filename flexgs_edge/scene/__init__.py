@@ -1,1 +1,1 @@
-"""A set of Gaussians, wherever it came from: lazy sources, fields and checks."""
+"""A scene as a set of Gaussians, wherever it comes from: sources that are read in parts, fields and checks."""

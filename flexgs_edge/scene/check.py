@@ -1,4 +1,4 @@
-"""One pass over a scene before work starts: finite values, usable rotations, at least one Gaussian."""
+"""Check a scene before work starts: at least one Gaussian, finite values, usable rotations."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
 
 _TINY = np.finfo(np.float32).tiny
 SH_LARGEST = 1e15
-"""SH coefficients beyond this are invalid: squares of colours made of them leave float32, and infinity times no weight is NaN."""
+"""Larger SH coefficients are invalid: squares of their colours leave float32, and infinity times a weight of zero is NaN."""
 
 
 class _Faults:
-    """Rows at fault, counted by reason."""
+    """Invalid rows: how many for each reason, and the first of them."""
 
     def __init__(self) -> None:
         self.count, self.first = 0, -1
@@ -35,27 +35,28 @@ class _Faults:
 def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int = 65536) -> SceneSource:
     """Check every value of a scene, one chunk at a time.
 
-    Invalid are rows with NaN or infinity in any field, SH beyond `SH_LARGEST`, and quaternions whose norm is zero or outside what
-    float32 can normalise. Log-scales of -inf (flat splats) are valid: they read as the smallest finite one of the scene.
+    A row is invalid if a field has NaN or infinity, if an SH coefficient is beyond `SH_LARGEST`, or if the norm of its
+    quaternion is zero or outside what float32 can normalise. Log-scales of -inf (flat splats) are valid: they are read as the
+    smallest finite log-scale of the scene.
 
     Parameters
     ----------
     source : SceneSource
         The scene.
     drop_invalid : bool, optional
-        Leave invalid rows out instead of raising.
+        Leave invalid rows out. By default, they raise an error.
     chunk_rows : int, optional
-        Rows held at a time.
+        Rows held in memory at a time.
 
     Returns
     -------
     SceneSource
-        `source` itself, or a lazy source over it with a note on what was left out or clamped.
+        `source` itself, or a lazy source over it, with a note on the rows that were left out or clamped.
 
     Raises
     ------
     InputError
-        When the scene is empty or has invalid rows; says how many, in which fields, and the first row.
+        If the scene is empty or has invalid rows. The message tells how many, in which fields, and the first row.
     """
     if source.count == 0:
         raise InputError(f"{source.name}: the scene is empty: it has no Gaussians")
@@ -90,7 +91,7 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
 
 
 def _check_chunk(source: SceneSource, rows: slice, faults: _Faults) -> tuple[np.ndarray, np.ndarray]:
-    """Which rows of a chunk are invalid ([n] bool), and its log-scales."""
+    """Find the invalid rows of a chunk; returns [n] bool, and the chunk's log-scales."""
     bad = np.zeros(rows.stop - rows.start, bool)
     scales = np.empty((0, 0), np.float32)
     for field in FIELDS:
@@ -117,7 +118,7 @@ def _check_chunk(source: SceneSource, rows: slice, faults: _Faults) -> tuple[np.
 
 
 class _FlatSource(SceneSource):
-    """A source whose log-scales are at least `floor`."""
+    """A source whose log-scales are raised to at least `floor`."""
 
     def __init__(self, parent: SceneSource, floor: np.float32, count: int) -> None:
         self.parent, self.floor = parent, np.float32(floor)

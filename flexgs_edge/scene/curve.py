@@ -1,4 +1,4 @@
-"""The Morton curve: near on it is near in space."""
+"""The Morton curve, on which neighbours are near each other in space."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 
 
 def morton(cells: np.ndarray) -> np.ndarray:
-    """[n] u64 index on the Morton curve of `cells` ([3, n], 0 to 2^21 - 1): x has the highest bit of each three.
+    """[n] u64, Morton indices of `cells` ([3, n], 0 to 2^21 - 1); of each three bits, x has the highest.
 
     >>> morton(np.array([[1, 0], [0, 0], [0, 3]])).tolist()
     [4, 9]
@@ -21,8 +21,8 @@ def morton(cells: np.ndarray) -> np.ndarray:
 
 
 def near_rows(means: np.ndarray, storage: Storage = IN_MEMORY) -> np.ndarray:
-    """[n] i64: rows of `means` ([3, n]) along a Morton curve, so that neighbours on it are near each other."""
-    # By rank along each axis: a few far rows do not squeeze the rest into one cell.
+    """[n] i64, the rows of `means` ([3, n]) in an order along a Morton curve, in which neighbours are near each other."""
+    # Cells count ranks along each axis, so that a few far rows do not squeeze the rest into one cell.
     count = means.shape[1]
     cells, index = storage.empty(means.shape, np.int16), storage.empty((count,), np.uint64)
     for line, ranks in zip(means, cells, strict=True):
@@ -35,7 +35,7 @@ def near_rows(means: np.ndarray, storage: Storage = IN_MEMORY) -> np.ndarray:
 
 
 def _spread(bits: np.ndarray) -> np.ndarray:
-    """Two zero bits before every bit of a number of 21 bits."""
+    """Spread the bits of 21-bit numbers: two zero bits before each."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),

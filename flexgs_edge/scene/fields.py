@@ -1,4 +1,4 @@
-"""The attributes of a Gaussian as data: names, widths, spaces and PLY properties, spelled out here and nowhere else."""
+"""The table of a Gaussian's attributes: names, widths, meaning and PLY properties. No other place repeats them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ class Field:
     Parameters
     ----------
     name : str
-        The field's name in arrays and files of this project.
+        Name of the field in our arrays and files.
     space : str
-        What the stored numbers mean.
+        Meaning of the stored numbers, such as a logarithm.
     ply : tuple of str
-        INRIA's PLY property names, one a channel (for `sh_rest` a prefix: see `ply_names`).
+        Names of INRIA's PLY properties, one a channel (for `sh_rest` a prefix: see `ply_names`).
     bits : str
-        The field's name in `--bits` and in the container.
+        Name in `--bits` and in the container.
     """
 
     name: str
@@ -27,18 +27,18 @@ class Field:
     bits: str
 
     def width(self, sh_degree: int) -> int:
-        """Channels of this field in a scene of `sh_degree`."""
+        """Number of channels in a scene with this SH degree."""
         return 3 * sh_rest_count(sh_degree) if self.name == "sh_rest" else len(self.ply)
 
     def ply_names(self, sh_degree: int) -> tuple[str, ...]:
-        """PLY property names in channel order (`sh_rest` is channel-major: all red, all green, all blue)."""
+        """Names of PLY properties in channel order (`sh_rest` is channel-major: all red, all green, all blue)."""
         if self.name == "sh_rest":
             return tuple(f"f_rest_{i}" for i in range(self.width(sh_degree)))
         return self.ply
 
 
 def sh_rest_count(sh_degree: int) -> int:
-    """SH coefficients above degree 0, a colour channel.
+    """Number of SH coefficients above degree 0, for one colour channel.
 
     >>> [sh_rest_count(d) for d in range(5)]
     [0, 3, 8, 15, 24]
@@ -56,6 +56,6 @@ FIELDS: tuple[Field, ...] = (
     ),
     Field("quats", "rotation quaternion w x y z, any norm", ("rot_0", "rot_1", "rot_2", "rot_3"), "rot"),
 )
-"""In the order of INRIA's PLY."""
+"""All fields, in the order of INRIA's PLY."""
 
 FIELD: dict[str, Field] = {field.name: field for field in FIELDS}

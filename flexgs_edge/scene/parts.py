@@ -1,4 +1,4 @@
-"""Scenes of more Gaussians than there are: each in parts that look like it together, in tiles side by side; read lazily."""
+"""Enlarge a scene for tests and studies: split Gaussians into parts that look like the whole, and tile copies; lazily read."""
 
 from __future__ import annotations
 
@@ -12,31 +12,32 @@ from flexgs_edge.scene.rotations import turned
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
 OFFSET = 0.4
-"""How far the halves of a Gaussian are moved along its longest axis, in its standard deviations. Nearer halves look
-more like the whole, but overlap so much that they hardly count as two: docs/results/tuning.md#offset"""
+"""Distance of each half from the centre along the longest axis, in standard deviations. Nearer halves look more like the
+whole, but overlap so much that they hardly count as two: docs/results/tuning.md#offset"""
 ALONG = (1.0 - OFFSET**2) ** 0.5
-"""Factor on the longest standard deviation: variance less the square of the offset, so that the pair keeps the second moment."""
+"""Factor on the longest standard deviation: the pair of halves keeps the variance along that axis."""
 ACROSS = 1.04
-"""Factor on the two others. Renderers skip alphas below 1/255, which takes more of the fringe of a fainter Gaussian. A
-little width gives it back: docs/results/tuning.md#across"""
+"""Factor on the two other standard deviations. Renderers skip alphas below 1/255, which cuts more off fainter Gaussians; a
+little more width makes up for it: docs/results/tuning.md#across"""
 CENTRE = 0.1
-"""Share of the opacity that keeps the light through the middle; the rest keeps the sum of alphas:
+"""Weight of the opacity that keeps the light through the middle; the rest of the weight keeps the sum of alphas:
 docs/results/tuning.md#centre"""
 MOST_PARTS = 8
-"""Most parts of a Gaussian; beyond, scenes are tiled. More parts look too little like the whole:
+"""Most parts of a Gaussian; larger scenes are tiled. More parts look too little like the whole:
 docs/results/tuning.md#most_parts"""
 _LOGIT_MOST, _LOG_SCALE_MOST = 80.0, 80.0
-"""Beyond these a Gaussian is nothing or everything; exp stays finite."""
+"""Clamps on logits and log-scales: beyond them a Gaussian shows nothing or everything, and exp stays finite."""
 _OVERLAP = float(np.exp(-(OFFSET**2) / (2 * ALONG**2)))
-"""Of each half's opacity, what reaches the middle between the two."""
+"""Share of each half's opacity that reaches the middle between the two."""
 
 
 def half_logits(logits: np.ndarray) -> np.ndarray:
-    """Logits of the opacity of each half of Gaussians.
+    """Logits of the opacity of each half, given the logits of whole Gaussians.
 
-    Two rules pull apart, and neither does alone. Two halves of opacity h, of which `_OVERLAP` reaches the middle between them,
-    let the same light through there as a whole of opacity a if (1 - h overlap)^2 = 1 - a. Of an opaque whole that pair is too
-    much everywhere else. Of faint ones alphas simply add, and their sum along the axis stays if h = a / (2 ALONG).
+    We mix two rules, since neither is enough. Let a be the opacity of the whole and h that of a half, of which the share
+    `_OVERLAP` reaches the middle. The pair lets the same light through the middle if (1 - h overlap)^2 = 1 - a. But for an
+    opaque whole, this pair is too dense everywhere else. For faint Gaussians alphas simply add: their sum along the axis
+    stays if h = a / (2 ALONG).
 
     Parameters
     ----------
@@ -46,7 +47,7 @@ def half_logits(logits: np.ndarray) -> np.ndarray:
     Returns
     -------
     np.ndarray
-        f64.
+        f64, of the same shape.
 
     >>> half_logits(np.array([0.0])).round(3)
     array([-0.956])
@@ -54,18 +55,18 @@ def half_logits(logits: np.ndarray) -> np.ndarray:
     grown = np.exp(np.clip(logits, -_LOGIT_MOST, _LOGIT_MOST))
     clear = 1 / (1 + grown)
     opacity = grown * clear
-    middle = opacity / (1 + np.sqrt(clear)) / _OVERLAP  # 1 - sqrt(1 - a) without its cancellation
+    middle = opacity / (1 + np.sqrt(clear)) / _OVERLAP  # equals 1 - sqrt(1 - a), without cancellation
     half = CENTRE * middle + (1 - CENTRE) * opacity / (2 * ALONG)
     result: np.ndarray = np.log(half / (1 - half))
     return result
 
 
 class PartsSource(SceneSource):
-    """`count` Gaussians made of those of `parent`.
+    """`count` Gaussians, made by splitting and tiling those of `parent`.
 
-    Gaussian g of tile t is the virtual row v = t * parent.count + g. The `count` rows are dealt out evenly over the V virtual
-    ones: v has those from floor((v * count + phase) / V) on. So every row is known from its number alone, and any range in any
-    order gives the same bits. A Gaussian becomes k parts by halving: the first half becomes ceil(k / 2), the second the rest.
+    Gaussian g of tile t is the virtual row v = t * parent.count + g, of V in all. The rows are dealt out evenly: the parts of
+    v begin at row floor((v * count + phase) / V). So the number of a row tells all about it, and any range in any order has
+    the same bits. A Gaussian becomes k parts by halving: its first half becomes ceil(k / 2) parts, its second the rest.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ class PartsSource(SceneSource):
     count : int
         At least `parent.count`.
     shifts : np.ndarray
-        [T, 3] f64: where each tile stands, in scene units; a tile's share is count / T.
+        [T, 3] f64, the place of each tile, scene units; a tile has count / T rows.
     seed : int
         Chooses which Gaussians get one part more than others.
     """
@@ -90,7 +91,7 @@ class PartsSource(SceneSource):
         self.notes = parent.notes
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`; needs about 800 bytes a row beside the arrays and the parent's rows."""
+        """See `SceneSource.read`; needs about 800 bytes a row, beside the arrays and the rows of the parent."""
         rows, planes = self.begin_read(rows, fields, out)
         numbers = np.arange(rows.start, rows.stop) if isinstance(rows, slice) else rows
         if not len(numbers) or not fields:
@@ -116,37 +117,37 @@ class PartsSource(SceneSource):
         return planes
 
     def _start(self, virtual: np.ndarray) -> np.ndarray:
-        """The first row of a virtual row."""
+        """The first row of each virtual row."""
         start: np.ndarray = (virtual * self.count + self.phase) // self.virtual
         return start
 
 
 def _runs(tile: np.ndarray) -> list[tuple[int, int]]:
-    """Ranges of rows of the same tile ([n] i64, ascending)."""
+    """Split rows into ranges of the same tile ([n] i64, ascending)."""
     cuts = [0, *(np.flatnonzero(np.diff(tile)) + 1).tolist(), len(tile)]
     return list(zip(cuts[:-1], cuts[1:]))
 
 
 def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The different numbers of a sorted list, and for each entry its place among them."""
+    """The different numbers of a sorted list, and the place of each entry among them."""
     new = np.diff(rows, prepend=rows[0] - 1) != 0
     return rows[new], np.cumsum(new) - 1
 
 
 def _halve(wide: Planes, parts: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Make each column of `wide` (f64; log-scales and logits in place) the part `part` of `parts`.
+    """Turn each column of `wide` into one of its parts: number `part` of `parts`. Log-scales and logits (f64) change in place.
 
     Returns
     -------
     np.ndarray
-        [3, n] f64: how far it moves along its own axes, scene units.
+        [3, n] f64, the shift of each column along its own axes, scene units.
     """
     count, column = len(parts), np.arange(len(parts))
     offsets = np.zeros((3, count))
     scales, logits = wide.get("log_scales"), wide.get("opacity_logits")
     while (whole := parts == 1).sum() < count:
         first = (parts + 1) // 2
-        second = part >= first  # never where there is one part
+        second = part >= first  # False if there is only one part
         if scales is not None:
             longest = scales.argmax(axis=0)
             far = np.exp(np.minimum(scales[longest, column], _LOG_SCALE_MOST)) * OFFSET

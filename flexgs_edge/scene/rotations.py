@@ -1,4 +1,4 @@
-"""The 24 equal forms of a Gaussian, and the one of them that turns least."""
+"""Rotations of Gaussians: normal form, turns, and the choice among the 24 equal forms of one Gaussian."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from flexgs_edge.errors import InputError
 
 
 def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same covariances with axes renamed so that every rotation is as close to none as it can be.
+    """Permute and reverse the axes of Gaussians so that each rotation is as small as it can be; covariances stay the same.
 
-    A Gaussian stays the same when its axes change places or direction: q becomes q p with p one of the 24 rotations of
-    the cube, and the scales follow. The largest |w| among the 24 is the largest of: the largest component; the two
-    largest over sqrt(2); all four over 2. Float64, basic operations and sqrt only.
+    The form changes from q to q p, where p is one of the 24 rotations of the cube, and the scales follow. The largest |w|
+    among the 24 forms is the largest of three numbers: the largest component, the sum of the two largest over sqrt(2), and
+    the sum of all four over 2. We use float64, basic operations and sqrt only.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarra
     bad = np.flatnonzero(~((largest > 0) & np.isfinite(largest)))
     if len(bad):
         raise InputError(f"quats: {len(bad)} quaternions have no direction: use --drop-invalid")
-    wide = wide / largest  # their squares cannot overflow
+    wide = wide / largest  # so that squares cannot overflow
     square = wide * wide
     norm = np.sqrt((square[0] + square[1]) + (square[2] + square[3]))
     wide /= norm
@@ -41,7 +41,7 @@ def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarra
 
 
 def turned(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """[3, n] f64: vectors ([3, n]) turned by quaternions ([4, n], any norm but zero)."""
+    """[3, n] f64, vectors ([3, n]) rotated by quaternions ([4, n], any norm but zero)."""
     wide = np.asarray(quats, np.float64)
     w, axis = wide[0], wide[1:]
     across = 2 * np.cross(axis, vectors, axis=0) / (wide * wide).sum(axis=0)
@@ -50,14 +50,14 @@ def turned(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def tilted(quats: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """[4, n] f64: unit quaternions ([4, n]) after small turns about their own axes, `errors` [3, n] the turns' vector parts."""
+    """[4, n] f64, unit quaternions ([4, n]) after small turns about their own axes; `errors` [3, n]: the turns' vector parts."""
     unit = np.asarray(quats, np.float64)
     unit = unit / np.sqrt((unit * unit).sum(axis=0))
     return _times_conjugate(unit, np.stack([np.sqrt(1 - (errors * errors).sum(axis=0)), *-errors]))
 
 
 def _nearest_cube_rotation(quats: np.ndarray) -> np.ndarray:
-    """[4, n] f64: the cube's rotation u with the largest product u . q."""
+    """[4, n] f64, the rotation u of the cube with the largest product u . q."""
     size = np.abs(quats)
     sign = np.where(quats < 0, -1.0, 1.0)
     places = np.argsort(-size, axis=0, kind="stable")
@@ -77,7 +77,7 @@ def _nearest_cube_rotation(quats: np.ndarray) -> np.ndarray:
 
 
 def _times_conjugate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Product of `a` and the conjugate of `b`, [4, n] each."""
+    """Product of quaternions `a` and the conjugate of `b`, [4, n] each."""
     w, x, y, z = a
     bw, bx, by, bz = b[0], -b[1], -b[2], -b[3]
     return np.stack(
@@ -91,7 +91,7 @@ def _times_conjugate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _axes(quats: np.ndarray) -> np.ndarray:
-    """[3, n]: the old axis that each new axis is, for rotations of the cube conjugated."""
+    """[3, n], the old axis behind each new axis, for conjugates of rotations of the cube."""
     w, x, y, z = quats[0], -quats[1], -quats[2], -quats[3]
     columns = (
         (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
@@ -102,14 +102,19 @@ def _axes(quats: np.ndarray) -> np.ndarray:
 
 
 def normalize_quats(quats: np.ndarray) -> np.ndarray:
-    """Unit quaternions with w >= 0, the form that is coded.
+    """Unit quaternions with w >= 0, the form that files hold.
 
-    q / sqrt((w^2 + x^2) + (y^2 + z^2)) in float64, all four negated where w < 0, rounded to float32 once.
+    q / sqrt((w^2 + x^2) + (y^2 + z^2)) in float64, with all four signs changed if w < 0, rounded to float32 once.
 
     Parameters
     ----------
     quats : np.ndarray
         [4, n] f32, w x y z, none of them zero.
+
+    Returns
+    -------
+    np.ndarray
+        [4, n] f32.
     """
     wide = quats.astype(np.float64)
     square = wide * wide

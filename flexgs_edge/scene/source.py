@@ -1,4 +1,4 @@
-"""A scene as a lazy source: metadata at open, values by row range or row list into arrays that the caller owns."""
+"""The interface of scenes: metadata when opened, values by row range or row list, into arrays that the caller owns."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Planes = dict[str, np.ndarray]
 """Arrays by field name, each [width, n] f32."""
 
 Rows = slice | np.ndarray
-"""`slice(start, stop)` or a sorted int64 array."""
+"""`slice(start, stop)`, or a sorted int64 array."""
 
 _TURN_ROWS = 1024
-"""Rows turned from planes at a time: 250 kB at SH degree 3; columns of a whole chunk would leave the cache each time."""
+"""Rows transposed at a time: 250 kB at SH degree 3. The columns of a whole chunk would not stay in the processor's cache."""
 
 REST_WIDTHS: dict[int, int] = {3 * sh_rest_count(degree): degree for degree in range(MAX_SH_DEGREE + 1)}
 """SH degree by the number of `sh_rest` channels: 0, 9, 24, 45, 72."""
@@ -38,15 +38,15 @@ class SceneSource(ABC):
     sh_degree : int
         0 to 4.
     sh_count : int
-        Rows [0, sh_count) may have SH above degree 0, the rest have none (zeros). 0 at degree 0.
+        Only rows [0, sh_count) may have SH above degree 0; those of other rows are zero. 0 at degree 0.
     origin : np.ndarray
-        [3] f64, world: what was taken from the positions.
+        [3] f64, world: positions are relative to it.
     notes : tuple of str
-        What the reader left out or changed, for the summary.
+        Notes of the reader on values that it left out or changed, for the summary.
     valid : bool
-        No row can be one that `check_scene` refuses, so that it need not read them.
+        All rows are known to pass `check_scene`, which then need not read them.
     comments : tuple of str
-        What this program says of the values in the header of a PLY, or said there: of the grid that they lie on.
+        Comments of this program in the header of a PLY, such as the step sizes of the values' grid.
     """
 
     name: str
@@ -74,31 +74,31 @@ class SceneSource(ABC):
         Returns
         -------
         dict
-            {field: [width, n] f32}; the very arrays of `out` where given.
+            {field: [width, n] f32}, with the arrays of `out` themselves if given.
 
         Raises
         ------
         IndexError
-            When a row is outside [0, N).
+            If a row is outside [0, N).
         ValueError
-            When a field is unknown or an array of `out` does not fit.
+            If a field is unknown, or an array of `out` does not fit.
         """
 
     def read_table(self, rows: slice, out: np.ndarray) -> np.ndarray:
-        """Read all fields of some rows as INRIA's PLY has them, row by row.
+        """Read all fields of some rows in the layout of INRIA's PLY, row by row.
 
         Parameters
         ----------
         rows : slice
             `slice(start, stop)` without a step.
         out : np.ndarray
-            [at least n, columns] f32 of zeros in columns 3 to 5: may be filled.
+            [at least n, columns] f32, with zeros in columns 3 to 5; it may be filled.
 
         Returns
         -------
         np.ndarray
             [n, columns] f32, C-contiguous, valid until the next call: means, three zeros (normals), the other fields in the
-            order of `FIELDS`. The first rows of `out`, or an array that the source has at hand.
+            order of `FIELDS`. It is the first rows of `out`, or an array of the source.
         """
         planes = self.read(rows, [field.name for field in FIELDS])
         part = out[: rows.stop - rows.start]
@@ -110,33 +110,33 @@ class SceneSource(ABC):
         return part
 
     def width(self, field: str) -> int:
-        """Channels of `field` in this scene."""
+        """Number of channels of `field` in this scene."""
         return FIELD[field].width(self.sh_degree)
 
     def select(self, rows: np.ndarray) -> SceneSource:
-        """The rows `rows` ([n] int64, any order, kept as given) as a source; nothing is read."""
+        """A source of the given rows ([n] int64, in any order, which is kept); nothing is read yet."""
         return SelectSource(self, rows)
 
     def chunks(self, rows: int) -> Iterator[slice]:
-        """Row ranges of at most `rows` that cover the scene in order."""
+        """Yield row ranges of at most `rows` rows that cover the scene in order."""
         if rows < 1:
             raise ValueError(f"chunks of {rows} rows: expected at least 1")
         for start in range(0, self.count, rows):
             yield slice(start, min(start + rows, self.count))
 
     def begin_read(self, rows: Rows, fields: Sequence[str], out: Planes | None) -> tuple[Rows, Planes]:
-        """Check the arguments of `read` and allocate what `out` lacks (for readers of new formats).
+        """Check the arguments of `read`, and allocate the arrays that `out` lacks. Readers of formats call this first.
 
         Returns
         -------
         rows : slice or np.ndarray
-            With plain bounds (0 <= start <= stop <= N), or int64.
+            A slice with 0 <= start <= stop <= N, or int64.
         planes : dict
             One array [width, n] f32 a field, in the order of `fields`.
         """
         rows, size = normalize_rows(rows, self.count)
         if isinstance(rows, np.ndarray):
-            span = as_range(rows)  # a slice needs no gathering, which is slow
+            span = as_range(rows)  # a slice is read without gathering, which is slow
             rows = rows if span is None else span
         planes: Planes = {}
         for field in fields:
@@ -153,7 +153,7 @@ class SceneSource(ABC):
 
 
 def normalize_rows(rows: Rows, count: int) -> tuple[Rows, int]:
-    """Plain form of `rows` and how many they are; raises `IndexError` outside [0, count).
+    """`rows` in plain form, and their number; raises `IndexError` for rows outside [0, count).
 
     >>> normalize_rows(slice(2, None), 5)
     (slice(2, 5, None), 3)
@@ -181,7 +181,7 @@ def as_range(rows: np.ndarray) -> slice | None:
 
 
 def read_all(source: SceneSource, storage: Storage) -> Planes:
-    """All values of a scene, {field: [width, N] f32}, in arrays of `storage`."""
+    """Read all values of a scene into arrays of `storage`: {field: [width, N] f32}."""
     planes = {field: storage.empty((source.width(field), source.count), np.float32) for field in FIELD}
     if not storage.spills:
         return source.read(slice(0, source.count), list(FIELD), planes)
@@ -200,18 +200,18 @@ class MemorySource(SceneSource):
         {field: [width, N] f32}; every field of the table. `sh_rest` ([0, N]) may be missing at degree 0.
         C-contiguous float32 arrays are used as they are, never copied or changed.
     sh_degree : int, optional
-        Default: from the width of `sh_rest`.
+        By default, it follows from the width of `sh_rest`.
     origin : array_like, optional
-        [3] f64, world. Default zeros.
+        [3] f64, world; zeros by default.
     name : str, optional
         For messages.
     sh_count : int, optional
-        Rows from here on have no SH above degree 0 (must be zeros). Default: N, or 0 at degree 0.
+        Rows from here on have no SH above degree 0, and zeros in their place. By default N, or 0 at degree 0.
 
     Raises
     ------
     InputError
-        When a field is missing, unknown or of the wrong shape.
+        If a field is missing, unknown or of the wrong shape.
     """
 
     def __init__(
@@ -281,16 +281,16 @@ class MemorySource(SceneSource):
 
 
 class SelectSource(SceneSource):
-    """Some rows of another source, in the order given (a selection of a selection reads the first source).
+    """Some rows of another source, in the given order. A selection of a selection reads the first source.
 
     Parameters
     ----------
     parent : SceneSource
-        Where the values come from.
+        The source of the values.
     rows : np.ndarray
-        [n] integers in [0, parent.count), any order, repeats allowed.
+        [n] integers in [0, parent.count), in any order, repeats allowed.
     notes : tuple of str, optional
-        Added to the parent's.
+        Added to the parent's notes.
     """
 
     def __init__(self, parent: SceneSource, rows: np.ndarray, notes: tuple[str, ...] = ()) -> None:
@@ -301,14 +301,14 @@ class SelectSource(SceneSource):
             plain, parent = parent.rows[plain], parent.parent
         sh_rows = np.flatnonzero(plain < parent.sh_count)
         self.parent: SceneSource = parent
-        # Half the bytes where they do: the list lives as long as the source.
+        # int32 if it suffices, for half the bytes: the list lives as long as the source.
         self.rows: np.ndarray = plain.astype(np.int32 if parent.count < 2**31 else np.int64)
         self.name, self.count, self.sh_degree = parent.name, plain.size, parent.sh_degree
         self.sh_count = int(sh_rows[-1]) + 1 if sh_rows.size else 0
         self.origin, self.notes = parent.origin, notes
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`; rows out of order cost a second copy of what is read."""
+        """See `SceneSource.read`; if the rows are out of order, the values read are copied once more."""
         rows, planes = self.begin_read(rows, fields, out)
         chosen = self.rows[rows].astype(np.int64)
         consecutive = as_range(chosen)
@@ -318,7 +318,7 @@ class SelectSource(SceneSource):
             self.parent.read(chosen, fields, planes)
         else:
             order = np.argsort(chosen, kind="stable")
-            for field, plane in planes.items():  # one field at a time: the copy is the widest field, not all of them
+            for field, plane in planes.items():  # one field at a time, so that the copy holds only one
                 plane[:, order] = self.parent.read(chosen[order], [field])[field]
         return planes
 
@@ -331,12 +331,12 @@ def by_chunk(rows: Rows, starts: np.ndarray) -> Iterator[tuple[int, Rows, slice]
     rows : slice or np.ndarray
         As `SceneSource.begin_read` gives them.
     starts : np.ndarray
-        [c] i64: first row of every chunk.
+        [c] i64, the first row of every chunk.
 
     Yields
     ------
     tuple
-        The chunk, the rows in it, and their place in the output.
+        The number of the chunk, the rows in it, and their place in the output.
     """
     if isinstance(rows, slice):
         at = rows.start
@@ -346,7 +346,7 @@ def by_chunk(rows: Rows, starts: np.ndarray) -> Iterator[tuple[int, Rows, slice]
             yield chunk, slice(at, stop), slice(at - rows.start, stop - rows.start)
             at = stop
         return
-    # Runs of equal chunks, not bins: a list that is not sorted only costs more reading.
+    # Cut where the chunk changes: a list that is not sorted then only costs more reads.
     if len(rows) == 0:
         return
     chunks = np.searchsorted(starts, rows, side="right") - 1
