@@ -1,4 +1,4 @@
-// Stored attributes -> what every view needs: 3D covariance (or its factor) and log2 of the opacity. Once a scene, not once a view.
+// Stored attributes -> the 3D covariance (or its factor) and log2 of the opacity. Runs once a scene, since no view changes them.
 // Twin: flexgs_edge.kernels.twins.activate
 
 __kernel void activate(
@@ -18,7 +18,7 @@ __kernel void activate(
 
   FW w = LOADF(quats, i), x = LOADF(quats, stride + i);
   FW y = LOADF(quats, 2 * (size_t)stride + i), z = LOADF(quats, 3 * (size_t)stride + i);
-  // Divide by the largest component first: squares of tiny or huge quaternions would leave float32's range.
+  // Divide by the largest component first, since squares of tiny or huge quaternions would leave float32's range.
   FW big = fmax(fmax(fabs(w), fabs(x)), fmax(fabs(y), fabs(z)));
   w = w / big;
   x = x / big;
@@ -42,8 +42,8 @@ __kernel void activate(
 
   FW xx = dot3(m00, m01, m02, m00, m01, m02), xy, xz, yy, yz, zz;
   if (antialiased) {
-    // Modified Gram-Schmidt on the rows: the factor is that of a matrix within a few ulp of M, whatever its rank. A row without
-    // length gives no direction to take away; the limit is far from where devices differ in flushing to zero.
+    // Modified Gram-Schmidt on the rows: the factor is that of a matrix within a few ulp of M, whatever its rank. A row of length
+    // zero has no direction to subtract. The limit is far above the numbers that some devices flush to zero.
     FW inv0 = pick(MASK(xx > (FW)FACTOR_MIN), (FW)1.0f / sqrt(xx), (FW)0.0f);
     FW ux = m00 * inv0, uy = m01 * inv0, uz = m02 * inv0;
     xx = sqrt(xx);

@@ -1,19 +1,19 @@
-// Gradients of a view's squared error, from sums over its pixels to the stored values of every Gaussian; and the descent along
-// them: Adam over values of any kind, and those values on their grids for the next view.
+// Gradients of a view's squared error, from sums over its pixels to the stored values of every Gaussian. Also the descent along
+// them: a step of Adam on the values, and their rounding to the grid for the next view.
 // Twins: flexgs_edge.kernels.twins.backward
 
 #define CAM(k) ((FW)camera[k])
 #define GRADIENT_SUMS 9    // of blend with STATS 5
 #define LN2 ((FW)(1.0f / LOG2_E))
 
-// Rows of a gradient (and of everything that goes along with it): means 0, log-scales 3, quaternion 6, logit 10, constant 11, SH 14.
+// First planes of each value in a gradient and its companions: means 0, log-scales 3, quaternion 6, logit 10, constant 11, SH 14.
 #define AT_SCALE 3
 #define AT_QUAT 6
 #define AT_LOGIT 10
 #define AT_DC 11
 #define AT_SH 14
 
-// Into the rows that have a gradient; the others stay as they are.
+// Stores into the rows that have a gradient; the other rows stay as they are.
 #define KEEP(plane, value)                                         \
   {                                                                \
     __global float *at = gradient + (size_t)(plane) * s + i;       \
@@ -48,10 +48,10 @@ __kernel void project_backward(
     for (int k = 0; k < GRADIENT_SUMS; ++k) {
       const long sum = there ? sums[row * GRADIENT_SUMS + k] : 0;
       some |= sum != 0;
-      // Minus two: the sums are of residuals, whose squares are the error.
+      // Times minus two: the sums are of residuals, and the error is the sum of their squares.
       lanes[k][l] = convert_float(sum) * (float)(k < 4 ? -2.0f / FIXED_WEIGHT : -2.0f / FIXED_MOMENT);
     }
-    // Records of rows that are not shown are not written.
+    // Rows that the view does not show have no record.
     for (int f = 0; f < 9; ++f) lanes[GRADIENT_SUMS + f][l] = some ? records[row * 16 + f] : 0.0f;
     seen_lanes[l] = some ? 1.0f : 0.0f;
   }
@@ -62,7 +62,7 @@ __kernel void project_backward(
 #define SUM(k) LOADF(lanes[k], 0)
 #define RECORD(f) LOADF(lanes[GRADIENT_SUMS + (f)], 0)
 
-  // Colours: the constant, SH, and the direction that SH depend on.
+  // Colours: the constant, SH, and the direction on which SH depend.
   const FW px = LOADF(means, i), py = LOADF(means, s + i), pz = LOADF(means, 2 * s + i);
   FW dx = px - CAM(21), dy = py - CAM(22), dz = pz - CAM(23);
   const FW norm = (FW)1.0f / sqrt(dot3(dx, dy, dz, dx, dy, dz));
@@ -71,7 +71,7 @@ __kernel void project_backward(
   dz = dz * norm;
   FW colour[3];
   for (int c = 0; c < 3; ++c) {
-    // A colour cut off at zero does not move.
+    // A colour that is clipped at zero has no gradient.
     colour[c] = pick(MASK(RECORD(6 + c) > (FW)0.0f), SUM(c), (FW)0.0f);
     KEEP(AT_DC + c, (FW)SH_C0 * colour[c]);
   }
@@ -100,14 +100,14 @@ __kernel void project_backward(
       tz = fma(along, sz, tz);                                                                             \
     }
     FOR_EACH_SLOPE(degree, dx, dy, dz, ADD_SLOPE)
-    // Only what is across the direction turns it.
+    // Only the part across the direction turns it.
     const FW along = dot3(dx, dy, dz, tx, ty, tz);
     tx = fma(-along, dx, tx) * norm;
     ty = fma(-along, dy, ty) * norm;
     tz = fma(-along, dz, tz) * norm;
   }
 
-  // Axes and the projection of the factor R diag(exp s), as activate.cl and project.cl write them.
+  // Axes, and the projection of the factor R diag(exp s), in the written forms of activate.cl and project.cl.
   const FW s0 = fexp2(LOADF(log_scales, i) * (FW)LOG2_E);
   const FW s1 = fexp2(LOADF(log_scales, s + i) * (FW)LOG2_E);
   const FW s2 = fexp2(LOADF(log_scales, 2 * s + i) * (FW)LOG2_E);
@@ -136,12 +136,12 @@ __kernel void project_backward(
   const FW j00 = CAM(12) * iz, j02 = -(j00 * uc), j11 = CAM(13) * iz, j12 = -(j11 * vc);
   const FW t00 = fma(j02, CAM(6), j00 * CAM(0)), t01 = fma(j02, CAM(7), j00 * CAM(1)), t02 = fma(j02, CAM(8), j00 * CAM(2));
   const FW t10 = fma(j12, CAM(6), j11 * CAM(3)), t11 = fma(j12, CAM(7), j11 * CAM(4)), t12 = fma(j12, CAM(8), j11 * CAM(5));
-  // Rows of the projection in the Gaussian's own axes, then times its deviations.
+  // Rows of the projection in the Gaussian's own axes; then they are multiplied by its standard deviations.
   const FW h00 = dot3(t00, t01, t02, r00, r10, r20), h01 = dot3(t00, t01, t02, r01, r11, r21), h02 = dot3(t00, t01, t02, r02, r12, r22);
   const FW h10 = dot3(t10, t11, t12, r00, r10, r20), h11 = dot3(t10, t11, t12, r01, r11, r21), h12 = dot3(t10, t11, t12, r02, r12, r22);
   const FW g00 = h00 * s0, g01 = h01 * s1, g02 = h02 * s2, g10 = h10 * s0, g11 = h11 * s1, g12 = h12 * s2;
 
-  // With S the second moments and A the conic, the gradient of the 2D covariance is A S A / 2, and that of the rows g is A S A g.
+  // With the second moments S and the conic A, the gradient of the 2D covariance is A S A / 2, and that of the rows g is A S A g.
   const FW ca = RECORD(2) * ((FW)2.0f * LN2), cb = RECORD(3) * LN2, cc = RECORD(4) * ((FW)2.0f * LN2);
   const FW sxx = SUM(6), sxy = SUM(7), syy = SUM(8);
   const FW p00 = fma(ca, sxx, cb * sxy), p01 = fma(ca, sxy, cb * syy), p10 = fma(cb, sxx, cc * sxy), p11 = fma(cb, sxy, cc * syy);
@@ -150,7 +150,7 @@ __kernel void project_backward(
   FW v10 = fma(u01, g00, u11 * g10), v11 = fma(u01, g01, u11 * g11), v12 = fma(u01, g02, u11 * g12);
   const FW slope = SUM(3);
   if (antialiased) {
-    // log of the opacity's factor: half the logs of the areas before and after the dilation.
+    // Log of the opacity's factor: half the difference of the logs of the areas before and after the dilation.
     const FW nx = fma(g01, g12, -(g02 * g11)), ny = fma(g02, g10, -(g00 * g12)), nz = fma(g00, g11, -(g01 * g10));
     const FW before = dot3(nx, ny, nz, nx, ny, nz);
     const FW share = pick(MASK(before > (FW)FACTOR_MIN), slope / before, (FW)0.0f);
@@ -165,7 +165,7 @@ __kernel void project_backward(
   KEEP(AT_SCALE + 1, fma(v01, g01, v11 * g11));
   KEEP(AT_SCALE + 2, fma(v02, g02, v12 * g12));
 
-  // Small turns about the Gaussian's own axes: the skew part of h v s; then as changes of the quaternion, which has any norm.
+  // Small turns about the Gaussian's own axes are the skew part of h v s. They become changes of the quaternion, of any norm.
   v00 = v00 * s0, v01 = v01 * s1, v02 = v02 * s2, v10 = v10 * s0, v11 = v11 * s1, v12 = v12 * s2;
   const FW turn_x = fma(h02, v01, h12 * v11) - fma(h01, v02, h11 * v12);
   const FW turn_y = fma(h00, v02, h10 * v12) - fma(h02, v00, h12 * v10);
@@ -179,7 +179,7 @@ __kernel void project_backward(
   const FW opacity = (FW)1.0f / ((FW)1.0f + fexp2(LOADF(logits, i) * (FW)-LOG2_E));
   KEEP(AT_LOGIT, slope * ((FW)1.0f - opacity));
 
-  // The projection's rows, then camera space: by the centre, and by the Jacobian where it is not held at its clamp.
+  // From the projection's rows to camera space: through the centre, and through the Jacobian unless it is clamped.
   const FW w00 = dot3(r00, r01, r02, v00, v01, v02), w01 = dot3(r10, r11, r12, v00, v01, v02), w02 = dot3(r20, r21, r22, v00, v01, v02);
   const FW w10 = dot3(r00, r01, r02, v10, v11, v12), w11 = dot3(r10, r11, r12, v10, v11, v12), w12 = dot3(r20, r21, r22, v10, v11, v12);
   const FW e00 = dot3(w00, w01, w02, CAM(0), CAM(1), CAM(2)), e02 = dot3(w00, w01, w02, CAM(6), CAM(7), CAM(8));
@@ -195,7 +195,7 @@ __kernel void project_backward(
   KEEP(2, dot3(CAM(2), CAM(5), CAM(8), cx, cy, cz) + tz);
 }
 
-// One step of Adam (Kingma & Ba 2015) for the rows that a view has touched; the others keep their running means as they are.
+// One step of Adam (Kingma & Ba 2015) for the rows that a view has touched; other rows keep their running means.
 __kernel void adam(
     const uint stride,
     const uint planes,
@@ -234,10 +234,10 @@ __kernel void adam(
   }
 }
 
-// Value to the nearest multiple of a step; a step of 0 leaves it.
+// Rounds a value to the nearest multiple of a step; a step of 0 leaves it as it is.
 inline FW on_grid(FW value, float step) { return step > 0.0f ? rint(value / (FW)step) * (FW)step : value; }
 
-// Values as a file of these steps would give them back (flexgs_edge.grid.from_grid), into the planes that views are drawn from.
+// Writes the values that a file of these steps would decode to (flexgs_edge.grid.values.from_grid) into the planes that views draw.
 __kernel void snap(
     const uint stride,
     const uint degree,

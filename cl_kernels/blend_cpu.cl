@@ -1,9 +1,9 @@
 // Front-to-back blending of one tile by one work-item: explicit vectors over 4x4 blocks, no __local, no barriers.
-// Far faster on CPUs than a work-item a pixel. Same bits as blend_gpu.cl and at every W.
+// On CPUs this is far faster than a work-item for each pixel. It gives the bits of blend_gpu.cl at every W.
 // Twin: flexgs_edge.kernels.twins.blend
 //
-// A pixel that has ended keeps its transmittance with the sign flipped: then T (1 - alpha) < TRANSMITTANCE_MIN holds for every
-// later splat and no extra state is needed.
+// A pixel that has ended keeps its transmittance with the sign flipped. Then T (1 - alpha) < TRANSMITTANCE_MIN holds for every
+// later splat, and no other state is needed.
 
 #define BLOCK_VECTORS (16 / W)   // vectors of a 4x4 block
 #define BLOCKS 16                // blocks of a tile
@@ -28,7 +28,7 @@ inline FW lane_x_at(int v) { return lane_x(); }
 inline int any_alive(FW t) {
 #if W == 16
   const long8 bits = as_long8(AS_I(t));
-  // Sign bits of both halves of each long; a clear one is a pixel still open.
+  // Sign bits of both halves of each long; a clear sign bit means that the pixel is still open.
   const long8 open = ~bits & (long8)(0x8000000080000000UL);
   const long4 a = open.lo | open.hi;
   const long2 b = a.lo | a.hi;
@@ -41,7 +41,7 @@ inline int any_alive(FW t) {
 #define SUMS (STATS == 1 ? 1 : STATS == 2 ? 2 : STATS == 3 ? 4 : STATS == 4 ? 6 : 9)
 #if defined(cl_khr_int64_base_atomics) && defined(__ENDIAN_LITTLE__)
 #pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
-// The same words in one step: sums below zero take two with 32 bits.
+// Adds to the words in one step, where 64-bit atomics exist.
 inline void add_sum(__global uint *words, float value, float scale, float largest) {
   atom_add((volatile __global long *)words, (long)clamp(value * scale, -largest, largest));
 }
@@ -50,7 +50,7 @@ inline void add_sum(__global uint *words, float value, float scale, float larges
 #endif
 #define ADD_SUM(k, v, scale) add_sum(sums + (size_t)pair.x * (2 * SUMS) + 2 * (k), tree_sum(v), scale, largest)
 
-// The fixed pairwise tree over the 16 lanes of a block: l + (l + 8), then + 4, + 2, + 1.
+// Sums the 16 lanes of a block by a fixed pairwise tree: l + (l + 8), then + 4, + 2, + 1.
 #if W == 16
 #define FOLD(v) const CAT(LANE_T, 8) h = v[0].lo + v[0].hi; const CAT(LANE_T, 4) f = h.lo + h.hi
 #elif W == 8
@@ -69,7 +69,7 @@ inline float tree_sum(const FW *v) {
 #undef LANE_T
   return (f.s0 + f.s2) + (f.s1 + f.s3);
 }
-// Lanes hold -1 for each hit.
+// Counts hits; a lane holds -1 for each.
 inline uint lane_count(const IW *v) {
 #define LANE_T int
   FOLD(v);
@@ -77,7 +77,7 @@ inline uint lane_count(const IW *v) {
   return (uint)-((f.s0 + f.s2) + (f.s1 + f.s3));
 }
 
-// A tile of an image, block by block.
+// Loads a tile of an image, block by block.
 inline void load_blocks(__global const float *image, uint tiles_x, int height, int tile_px, int tile_py, FW *r, FW *g, FW *b) {
   const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
   for (int block = 0; block < BLOCKS; ++block) {
@@ -134,7 +134,7 @@ __kernel void BLEND(
       const int b = k / BLOCK_VECTORS, v = k % BLOCK_VECTORS;
       FW x = lane_x_at(v) + (FW)(float)(tile_px + BLOCK * (b & 3)), y = lane_y(v) + (FW)(float)(tile_py + BLOCK * (b >> 2));
       red[k] = green[k] = blue[k] = (FW)0.0f;
-      // Pixels outside the image have ended: they count no hits.
+      // Pixels outside the image count as ended, so that they have no hits.
       trans[k] = pick(MASK(x < (FW)(float)width) & MASK(y < (FW)(float)height), (FW)1.0f, (FW)-1.0f);
     }
   }
@@ -150,7 +150,7 @@ __kernel void BLEND(
   FW rest_r[BLOCKS * BLOCK_VECTORS], rest_g[BLOCKS * BLOCK_VECTORS], rest_b[BLOCKS * BLOCK_VECTORS];
   load_blocks(rest, tiles_x, height, tile_px, tile_py, rest_r, rest_g, rest_b);
 #if STATS == 5
-  // Gradients ask for one number of what is still to come in a pixel: its product with the residual. It goes on in the place of red.
+  // Gradients need one number of the light that is still to come in a pixel: its product with the residual. It is kept in red.
   if (!resume)
     for (int k = 0; k < BLOCKS * BLOCK_VECTORS; ++k)
       red[k] = fma(whole_b[k], rest_b[k], fma(whole_g[k], rest_g[k], whole_r[k] * rest_r[k]));
@@ -160,7 +160,7 @@ __kernel void BLEND(
   ends += (size_t)(blocks - 1) * get_global_size(0);
   const uint first = tile ? ends[tile - 1] : 0u, last = ends[tile];
   uint live = 0xFFFFu;
-  // Pixels of block columns and rows, once a tile instead of once a splat and block.
+  // Pixels of block columns and rows, computed once a tile and not for each splat and block.
 #if W == 1
   float x_of[TILE];
   for (int x = 0; x < TILE; ++x) x_of[x] = (float)(tile_px + x);
@@ -184,12 +184,12 @@ __kernel void BLEND(
     }
     const uint2 pair = pairs[n];
     const size_t ahead = pairs[min(n + AHEAD, last - 1)].x;
-    // Records and sums lie in row order, so a tile's are all over the memory: without this the blend waits for them.
+    // Records and sums lie in row order, so those of a tile are all over the memory: without this hint, the blend waits for them.
     FETCH(records + ahead * 16);
 #if STATS
     FETCH(sums + ahead * (2 * SUMS));
 #if STATS == 5
-    FETCH(sums + ahead * (2 * SUMS) + 2 * SUMS - 1);  // of a row of 72 bytes the end may lie in the next line
+    FETCH(sums + ahead * (2 * SUMS) + 2 * SUMS - 1);  // a row of 72 bytes may end in the next cache line
 #endif
 #endif
     uint mask = pair.y & live;
@@ -214,7 +214,7 @@ __kernel void BLEND(
     while (mask) {
       const int b = 31 - (int)clz(mask & (0u - mask));
       mask &= mask - 1;
-      // W 8 or 4: without it the compiler works lane_y out anew for each vector.
+      // For W of 8 or 4: without it, the compiler computes lane_y anew for each vector.
 #pragma unroll
       for (int v = 0; v < BLOCK_VECTORS; ++v) {
         const int k = b * BLOCK_VECTORS + v;
@@ -236,16 +236,16 @@ __kernel void BLEND(
         weights[v] += weight;
 #endif
 #if STATS == 2 || STATS == 4
-        // What the pixel would change by without this splat: its own light goes, what lies behind it gets brighter. As one
-        // product: fewer operations than the plain form, and as exact where nearly all of the light is there.
+        // The change of the pixel without this splat: its own light goes, and the light behind it gets brighter. Written as one
+        // product, which takes fewer operations than the plain form, and is as exact where nearly all of the light has come.
         const FW ratio = weight / trans[k];
         const FW er = fma(cr, trans[k], red[k] - whole_r[k]), eg = fma(cg, trans[k], green[k] - whole_g[k]);
         const FW eb = fma(cbl, trans[k], blue[k] - whole_b[k]);
         errors[v] += ratio * ratio * fma(eb, eb, fma(eg, eg, er * er));
         squares[v] = fma(weight, weight, squares[v]);
 #elif STATS == 5
-        // The same light times the residual, unless alpha is held at its cap: the exponent's gradient. Its moments about the
-        // splat's centre are the gradients of the centre and of the conic.
+        // That light times the residual is the gradient of the exponent, unless alpha is capped. Its moments about the splat's
+        // centre are the gradients of the centre and of the conic.
         const FW own_light = fma(cbl, rest_b[k], fma(cg, rest_g[k], cr * rest_r[k]));
         const FW light = (weight / trans[k]) * fma(own_light, before, -red[k]);
         red[k] = fma(-weight, own_light, red[k]);

@@ -1,6 +1,6 @@
-// Front-to-back blending of one tile by one 16x16 work-group, a pixel a work-item, splats fetched in batches into local memory.
-// Same arguments, same written forms and same bits as blend_cpu.cl. W must be 1. No return before a barrier, no doubles,
-// 256 work-items and less than 16 KiB of local memory, so that small GPUs can run it.
+// Front-to-back blending of one tile by one 16x16 work-group, one work-item a pixel; splats come in batches through local memory.
+// It has the arguments, the written forms and the bits of blend_cpu.cl. W must be 1. No return before a barrier and no doubles.
+// It takes 256 work-items and less than 16 KiB of local memory, so that small GPUs can run it.
 // Twin: flexgs_edge.kernels.twins.blend
 
 #if W != 1
@@ -63,7 +63,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
   __local float parts[SUMS][256];
   __local uint counts;
 #endif
-  // Work-items follow the blocks: item p is pixel p % 16 of block p / 16, which is also the layout of `state`.
+  // Work-items follow the blocks: item p is pixel p % 16 of block p / 16. `state` has the same layout.
   const int p = get_local_id(0), b = p >> 4, lane = p & 15;
   const uint tile = get_group_id(0);
   const int px = (int)(tile % tiles_x) * TILE + BLOCK * (b & 3) + (lane & 3);
@@ -84,7 +84,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
 #if STATS > 2
   const float rest_r = rest[here], rest_g = rest[plane + here], rest_b = rest[2 * plane + here];
 #if STATS == 5
-  // See blend_cpu.cl.
+  // As in blend_cpu.cl: red keeps the product of the light to come with the residual.
   if (!resume) red = fma(image[2 * plane + here], rest_b, fma(image[plane + here], rest_g, image[here] * rest_r));
 #endif
 #endif
@@ -101,7 +101,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
     barrier(CLK_LOCAL_MEM_FENCE);
     if (t > 0.0f) open = 1;
     barrier(CLK_LOCAL_MEM_FENCE);
-    const int go_on = open;   // the same for the whole group: nobody writes `open` before the next barrier
+    const int go_on = open;   // the same for the whole group, since nobody writes `open` before the next barrier
     if (!go_on) break;
     for (uint n = 0; n < size; ++n) {
       float weight = 0.0f, alpha = 0.0f;
@@ -131,7 +131,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
       const float own_light = fma(splats[n][8], rest_b, fma(splats[n][7], rest_g, splats[n][6] * rest_r));
       const float light = (weight / t) * fma(own_light, before, -red);
       red = fma(-weight, own_light, red);
-      const float error = alpha < ALPHA_MAX ? light : 0.0f;   // the slope
+      const float error = alpha < ALPHA_MAX ? light : 0.0f;   // gradient of the exponent
 #endif
 #if STATS == 2
       parts[0][p] = error;
@@ -149,7 +149,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
 #endif
       barrier(CLK_LOCAL_MEM_FENCE);
       if (hit) atomic_inc(&counts);
-      // Each lane over the blocks in order, then the pairwise tree over lanes: the CPU form's order and its fused steps.
+      // Each lane sums over the blocks in order, then the pairwise tree over lanes: the order and fused steps of blend_cpu.cl.
       float sum[SUMS];
       for (int c = 0; c < SUMS; ++c) sum[c] = 0.0f;
       if (p < 16)

@@ -1,13 +1,13 @@
-// Decodes chunks of a version 2 file (docs/format.md), or counts their symbols, one work-item a chunk: octree, repeats, and every
-// channel pass by pass.
-// Specification: flexgs_edge.codec (walk, contexts, groups, ports, rans), whose numbers these are to the last bit. Sums are
-// doubles that hold all of their integers exactly, whatever the order; divisions too are rounded as those of float32.
+// Decodes version 2 chunks (docs/format.md), or counts their symbols, one work-item a chunk: octree, repeats, and every channel
+// pass by pass.
+// Specification: flexgs_edge.codec.v2 (walk, contexts, groups, ports, rans), with the same numbers to the last bit. Sums are
+// doubles, which hold all of their integers exactly in any order. Divisions are rounded as in float32.
 //
-// Rows lie in the order of the passes, so that whatever a pass reads or writes is contiguous: row (2j + 1) 2^k of n at
-// place((n, k)) + j. `known` alone is in row order: the rows decoded so far, which every pass interleaves with its own.
+// Rows lie in the order of the passes, so that each pass reads and writes contiguous memory: row (2j + 1) 2^k of n is at
+// place((n, k)) + j. Only `known` is in row order: the rows decoded so far, which every pass interleaves with its own.
 //
-// A damaged stream gives a status, never an access out of bounds: contexts are below the counts that the host checked, symbols
-// come from tables of the right size, words are followed by RANS_LANES spare ones, and nodes are counted before they are written.
+// A damaged stream gives a status, never an access out of bounds. The host checks that contexts are below the counts, and tables
+// have the right size. RANS_LANES spare words follow the words, and nodes are counted before they are written.
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 
 #if W == 1
@@ -30,23 +30,23 @@ typedef ulong16 UL16;
 
 #define PAD 16  // spare numbers before the rows that neighbours are looked up in
 #define TERMS 13
-#define FETCH_ROWS 4096  // where a batch has as many rows, most lines of the tables are looked at
+#define FETCH_ROWS 4096  // a batch of so many rows looks at most lines of the tables
 #define ROUND 6755399441055744.0  // 1.5 * 2^52
 
-// Numbers of an alphabet's record.
+// Places in the record of an alphabet.
 enum {
   START_LOW, START_HIGH, SHIFT, SYMBOLS, MEAN_CUTS, ERROR_CUTS, RESIDUAL, FEATURES,
   MEAN_CUT = 8, ERROR_CUT = 23, SLOT = 38, ENTRY = SLOT + 64, MEAN_WEIGHT = ENTRY + 64, ERROR_WEIGHT = MEAN_WEIGHT + 17,
   FIRST_SLOT = ERROR_WEIGHT + 17, SLOTS, FIRST_COUNT, RECORD
 };
-// Of a chunk's.
+// Places in the info record of a chunk.
 enum { ROWS, LANE_COUNT, WORDS, STATUS, FOUND, FOUND_HIGH, WANTED, AT, INFO };
 enum { GOOD, NO_WORDS, NO_CHILDREN, NODES, REPEATS, CODES, DEGREES, LANES_END, NO_ROOM };
-// Planes of numbers that a chunk needs.
+// Work planes of a chunk.
 enum { X, Y, Z, KNOWN, OTHER = KNOWN + 1, VALUE, SPARE, NEAR, NEAR_SH, BASE, STEADY = BASE + 21, BEFORE = STEADY + 7, FLOATS = BEFORE + 7 };
 enum { ROUNDED, RAW, SUBSET, CAME_FROM, INTS };
 enum { CONTEXT, SYMBOL, CHILDREN, CHILDREN_NEXT, BYTES };
-// Base channels in order, and the features of those that others are predicted from.
+// Base channels in order, and the features of those that predict others.
 enum { OPACITY = 3, DEGREE = 7, CHANNELS = 11 };
 
 typedef struct {
@@ -61,7 +61,7 @@ typedef struct {
   __global int *ints;
   __global float *floats;
   uint clipped;
-  // When counting instead: symbols of all batches, raw bytes, and alphabet, size and escapes of every batch.
+  // For counting: symbols of all batches, raw bytes, and alphabet, size and escapes of every batch.
   bool counting;
   __global uint *counts, *batches;
   __global uchar *log_contexts, *log_symbols, *log_raw;
@@ -94,16 +94,16 @@ inline bool failed(Chunk *c, uint status, long found, int wanted) {
 inline FW divide(FW a, FW b) { return AS(float, AS(double, a) / AS(double, b)); }
 inline FW one_if(IW mask) { return pick(mask, (FW)1.0f, (FW)0.0f); }
 
-// Of |x| < 2^51.
+// Floor of |x| < 2^51.
 inline DW round_down_wide(DW x) {
   DW r = (x + (DW)ROUND) - (DW)ROUND;
   return r - ((r > x) ? (DW)1.0 : (DW)0.0);
 }
 
-// 1 for a state below the floor. In numbers, since one in eight states is, which no processor can guess.
+// 1 for a state below the floor. Computed without a branch: one in eight states is empty, which no processor can predict.
 inline uint is_empty(uint state) { return (state / RANS_FLOOR - 1) >> 31; }
 
-// One batch: symbols of `count` contexts.
+// Decodes one batch: a symbol for each of `count` contexts.
 inline bool get_batch(Chunk *c, uint alphabet, uint count) {
   __global const int *slot_of = c->records + alphabet * RECORD + SLOT, *entry_of = slot_of + (ENTRY - SLOT);
   __global const uchar *slots = c->slots;
@@ -111,7 +111,7 @@ inline bool get_batch(Chunk *c, uint alphabet, uint count) {
   __global const ushort *words = c->words;
   const uint lanes = c->lanes, end = c->end;
   uint at = c->at;
-  // The tables, which predictions have pushed out of the near caches.
+  // Fetch the tables, which the predictions have pushed out of the near caches.
   if (count >= FETCH_ROWS) {
     __global const int *record = c->records + alphabet * RECORD;
     for (int slot = 0; slot < record[SLOTS]; slot += 64) FETCH(slots + record[FIRST_SLOT] + slot);
@@ -137,7 +137,7 @@ inline bool get_batch(Chunk *c, uint alphabet, uint count) {
   return true;
 }
 
-// `count` numbers of `bits` equally likely bits.
+// Decodes `count` numbers of `bits` bits, all values equally likely.
 inline bool get_raw(Chunk *c, uint count, uint bits, __global uint *out) {
   for (uint i = 0; i < count; ++i) out[i] = 0;
   for (uint from = 0; from < bits; from += 8) {
@@ -162,7 +162,7 @@ inline uint passes(uint rows) {
   const uint blocks = (rows - 1) / COARSE_ROWS;
   return blocks ? 32 - clz(blocks) : 0;
 }
-// Where the rows at odd multiples of 2^k begin, which is how many come before them; and how many there are.
+// The place of the rows at odd multiples of 2^k, which is the number of rows before them; and the number of these rows.
 inline uint begin_of(uint rows, uint k) { return ((rows - 1) >> (k + 1)) + 1; }
 inline uint size_of(uint rows, uint k) { return (((rows - 1) >> k) + 1) >> 1; }
 inline uint place_of(uint row, uint rows, uint top) {
@@ -175,7 +175,7 @@ inline void repeat_ends(__global float *known, uint count) {
   for (uint i = 0; i < 4; ++i) known[count + i] = known[count - 1];
 }
 
-// Weights of the neighbours and nearness of `count` of the rows, which `subset` lists.
+// Weights of the neighbours, and distance features, of `count` of the rows, which `subset` lists.
 inline void plan_passes(const Chunk *c, uint count, uint reach, __global ushort *weights, __global float *near) {
   __global const int *subset = c->ints + (size_t)SUBSET * c->stride;
   __global float *known[3] = {plane(c, KNOWN) + PAD, plane(c, OTHER) + PAD, plane(c, VALUE) + PAD};
@@ -213,7 +213,7 @@ inline void plan_passes(const Chunk *c, uint count, uint reach, __global ushort 
   }
 }
 
-// Contexts of a pass, and in groups of residuals what is to be added to the symbols.
+// Contexts of a pass; for groups of residuals, also the base to add to the symbols.
 inline void predict(const Chunk *c, uint alphabet, const Terms *terms, uint begin, uint size, uint reach, __global const ushort *weights,
                     __global const float *known, __global float *mean_out) {
   __global const int *record = c->records + alphabet * RECORD;
@@ -246,14 +246,14 @@ inline void predict(const Chunk *c, uint alphabet, const Terms *terms, uint begi
       mean += (DW)to_mean[i] * value;
       error += (DW)to_error[i] * value;
     }
-    // The error may leave the range of ints, where its cuts are: below it, no cut is reached.
+    // The error may leave the range of int, where its cuts lie. Below that range, no cut is reached.
     DW level = round_down_wide(error * (DW)(1.0 / 1024.0));
     level = (level > (DW)2147483647.0) ? (DW)2147483647.0 : level;
     FW inside = (FW)1.0f;
     if (error_cuts && record[ERROR_CUT] == INT_MIN) inside = AS(float, (level < (DW)-2147483648.0) ? (DW)0.0 : (DW)1.0);
     level = (level < (DW)-2147483648.0) ? (DW)-2147483648.0 : level;
     const IW error_level = AS(int, level);
-    // Counted in floats: Oclgrind takes the truth of a vector for 255.
+    // Counted in floats, since Oclgrind takes the truth of a vector for 255.
     FW place = (FW)0.0f;
     for (uint i = 0; i < error_cuts; ++i) place += one_if(MASK(error_level >= (IW)record[ERROR_CUT + i]));
     place *= inside;
@@ -273,7 +273,7 @@ inline void predict(const Chunk *c, uint alphabet, const Terms *terms, uint begi
 
 inline FW magnitude(FW x) { return AS_F(AS_I(x) & (IW)0x7fffffff); }
 
-// Codes and values of a pass from its symbols, and from raw bits where there are any.
+// Codes and values of a pass, from its symbols and its raw bits if there are any.
 inline bool finish_pass(Chunk *c, uint alphabet, uint size) {
   __global const int *record = c->records + alphabet * RECORD;
   __global const uchar *symbol = c->bytes + (size_t)SYMBOL * c->stride;
@@ -316,7 +316,7 @@ inline bool finish_pass(Chunk *c, uint alphabet, uint size) {
   return wrong ? failed(c, CODES, 0, alphabet) : true;
 }
 
-// Symbols of a pass from its codes, counted and noted.
+// Symbols of a pass from its codes; counts and logs them.
 inline bool count_pass(Chunk *c, uint alphabet, uint size, __global const int *from, uint step) {
   __global const int *record = c->records + alphabet * RECORD;
   __global const uchar *context = c->bytes + (size_t)CONTEXT * c->stride;
@@ -363,7 +363,7 @@ inline bool count_pass(Chunk *c, uint alphabet, uint size, __global const int *f
   return true;
 }
 
-// Known rows and those of the pass in turn.
+// Merges the known rows with those of the pass, by turns.
 inline void interleave(__global const float *known, uint before, __global const float *value, uint size, __global float *to) {
   for (uint j = 0; j < size; j += W) {
     const CAT(UL, W) both = AS(ulong, AS_U(LOAD(known, j))) | AS(ulong, AS_U(LOAD(value, j))) << 32;
@@ -380,8 +380,8 @@ inline void interleave_codes(__global const float *known, uint before, __global 
   if (before > size) to[2 * size] = (int)known[size];
 }
 
-// One channel of `count` rows. Written where wanted, in the order of the passes: values and means of the neighbours in 1/256,
-// and the distance of the two (without means: magnitudes).
+// Codes one channel of `count` rows. If wanted, it writes in the order of the passes: values and means of the neighbours in 1/256,
+// and the distance of both (magnitudes if there are no means).
 inline bool get_channel(Chunk *c, uint alphabet, uint count, uint reach, __global const ushort *weights, const Terms *terms,
                         __global float *value_out, __global float *mean_out, __global float *away_out, __global int *out) {
   const uint top = passes(count);
@@ -394,7 +394,7 @@ inline bool get_channel(Chunk *c, uint alphabet, uint count, uint reach, __globa
     const bool first = k == (int)top;
     const uint begin = first ? 0 : begin_of(count, k), size = first ? ((count - 1) >> top) + 1 : size_of(count, k);
     if (!first) repeat_ends(known, begin);
-    // In one place: compilers put its body wherever it is called.
+    // Called in one place only, since compilers copy its body to every call.
     predict(c, alphabet, terms, begin, size, first ? 0 : reach, weights, known, mean_out);
     const uint offset = first ? 0 : 1 << k, step = first ? k : k + 1;
     if (c->counting) {
@@ -410,7 +410,7 @@ inline bool get_channel(Chunk *c, uint alphabet, uint count, uint reach, __globa
         STORE(magnitude(mean_out ? v - LOAD(mean_out, begin + j) : v), away_out, begin + j);
       }
     }
-    // Codes come into the order of rows with their values, but for those that values do not hold.
+    // Codes get into row order together with their values, except for codes that values do not hold.
     if (c->clipped && !scattered && !c->counting) {
       for (uint j = 0; j < begin; ++j) out[j << (k + 1)] = (int)known[j];
       scattered = true;
@@ -443,7 +443,7 @@ inline uint every_third(ulong bits) {
   return (uint)(bits | bits >> 32) & 0x1fffff;
 }
 
-// Cells of all rows (into the first of two planes), and their coordinates.
+// Decodes the cells of all rows (into the first of two planes), and their coordinates.
 inline bool get_positions(Chunk *c, uint rows, uint depth, __global ulong *cells, __global int *out) {
   __global uchar *context = c->bytes + (size_t)CONTEXT * c->stride, *symbol = c->bytes + (size_t)SYMBOL * c->stride;
   __global uchar *children = c->bytes + (size_t)CHILDREN * c->stride, *grown_children = children + c->stride;
@@ -505,7 +505,7 @@ inline bool get_positions(Chunk *c, uint rows, uint depth, __global ulong *cells
   return true;
 }
 
-// Base channel `channel` from the channels of `sources` (numbers of base channels, in the order of the format).
+// Codes the base channel `channel`, predicted from the channels of `sources` (numbers of base channels, in the format's order).
 inline bool get_base(Chunk *c, uint channel, uint rows, __global const ushort *weights, uint sources, uint source_count, __global int *out) {
   Terms terms;
   terms.count = 0;
@@ -520,7 +520,7 @@ inline bool get_base(Chunk *c, uint channel, uint rows, __global const ushort *w
                      kept ? value + 2 * c->stride : 0, out + channel * c->stride);
 }
 
-// Sums over the degree below, and the base channels that SH are predicted from, for the rows that have `degree`; their number.
+// Prepares a degree: sums over the degree below, and base channels that predict SH, for rows with `degree`; returns their number.
 inline uint begin_degree(Chunk *c, uint rows, uint before_count, int degree, __global const int *degrees, __global ushort *weights) {
   __global int *subset = c->ints + (size_t)SUBSET * c->stride, *came_from = c->ints + (size_t)CAME_FROM * c->stride;
   const uint stride = c->stride;
@@ -558,7 +558,7 @@ inline uint begin_degree(Chunk *c, uint rows, uint before_count, int degree, __g
   return count;
 }
 
-// One coefficient of a degree: Y, Co, Cg. Before: sums of |Cg|, |Y|, |Co| so far, then Y, |Y|, Co, |Co| of this coefficient.
+// Codes one coefficient: Y, Co, Cg. Features: sums of |Cg|, |Y|, |Co| so far, then Y, |Y|, Co, |Co| of this coefficient.
 inline bool get_coefficient(Chunk *c, uint alphabet, uint count, __global const ushort *weights, uint colour_stride, __global int *out) {
   const uint places[3][7] = {{3}, {11, 3, 9, 10}, {3, 13, 14, 9, 10, 11, 12}};
   const uint sizes[3] = {1, 4, 7};
@@ -583,13 +583,13 @@ inline bool get_coefficient(Chunk *c, uint alphabet, uint count, __global const 
   return true;
 }
 
-// All channels: into `out`, or from there when counting.
+// Codes all channels: decodes into `out`, or counts from there.
 inline bool get_channels(Chunk *c, uint rows, int sh_degree, bool base_only, __global ushort *weights, __global int *out) {
   const uint stride = c->stride;
   __global int *subset = c->ints + (size_t)SUBSET * stride;
   for (uint i = 0; i < rows; ++i) subset[i] = (int)i;
   plan_passes(c, rows, 4, weights, plane(c, NEAR));
-  // What each channel is predicted from: four bits a channel, and how many.
+  // The channels that predict each channel: four bits for each of them, lowest first.
   const uint sources[CHANNELS] = {0, 0x0, 0x10, 0x210, 0x2103, 0x34, 0x54, 0x6543, 0x210, 0x210, 0x210};
   const uint counts[CHANNELS] = {0, 1, 2, 3, 4, 2, 2, 4, 3, 3, 3};
   __global int *degrees = out + DEGREE * stride;
@@ -624,8 +624,8 @@ inline bool get_channels(Chunk *c, uint rows, int sh_degree, bool base_only, __g
   return true;
 }
 
-// Decodes chunks, or counts the symbols of their channels (positions aside). One kernel for both directions, although each leaves
-// arrays of the other alone: it is most of what the codec adds to a start without compiled kernels.
+// Decodes chunks, or counts the symbols of their channels (without positions). One kernel serves both directions, although each
+// leaves the other's arrays alone: a second one would make a start without compiled kernels slower.
 __kernel void code_chunks(
     const uint counting,               // 1: counts, 0: decodes
     const uint stride,                 // numbers of a plane: rows of the largest chunk, and 96 more
@@ -663,7 +663,7 @@ __kernel void code_chunks(
   const size_t i = get_global_id(0);
   __global int *about = info + i * INFO;
   const uint rows = about[ROWS];
-  if (rows == 0) return;  // the host found its head damaged
+  if (rows == 0) return;  // the host found the head of this chunk damaged
   Chunk c;
   c.stride = stride;
   c.records = records;

@@ -1,4 +1,4 @@
-// Bit-packed codes -> float32 planes: low + code * step, two roundings, the same bits as NumPy.
+// Bit-packed codes -> float32 planes: low + code * step with two roundings, the same bits as NumPy.
 // Twin: flexgs_edge.kernels.twins.dequantize
 
 __kernel void dequantize(

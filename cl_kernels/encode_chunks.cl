@@ -1,5 +1,5 @@
-// rANS streams of chunks of a version 2 file, one work-item a chunk: backwards through the batches, and in each through its rounds.
-// Specification: flexgs_edge.codec.rans.Encoder.
+// Codes rANS streams of version 2 chunks, one work-item a chunk: backwards through the batches, and through the rounds of each.
+// Specification: flexgs_edge.codec.v2.rans.Encoder.
 
 __kernel void encode_chunks(
     const uint most,                   // symbols of the largest chunk

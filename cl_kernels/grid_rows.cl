@@ -1,6 +1,6 @@
-// Codes of chunks that code_chunks left -> rows of INRIA's PLY in float32, one work-item a chunk.
-// Specification: flexgs_edge.grid.from_grid. Every operation is rounded once, none is fused; the root is that of a double, which
-// rounds to the right float32.
+// Codes that code_chunks left on the device -> rows of INRIA's PLY in float32, one work-item a chunk.
+// Specification: flexgs_edge.grid.values.from_grid. Every operation is rounded once and none is fused. The square root is taken in
+// double, and rounds to the right float32.
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 
 enum { POSITION_STEP, SCALE_STEP, ROTATION_STEP, OPACITY_STEP, COLOUR_STEPS };

@@ -1,7 +1,7 @@
-// One view of a chunk of Gaussians: splat records, depth keys and how many tiles each splat may touch.
+// Projects a chunk of Gaussians for one view: splat records, depth keys, and the number of tiles that each splat may touch.
 // Twin: flexgs_edge.kernels.twins.project
 
-// Camera, 32 floats (see sh.clh too): R row-major 0-8, t 9-11, fx fy cx cy 12-15, near 16, Jacobian clamp x lo hi, y lo hi 17-20,
+// The camera, 32 floats (see also sh.clh): R row-major 0-8, t 9-11, fx fy cx cy 12-15, near 16, Jacobian clamp x lo hi, y lo hi 17-20,
 // position 21-23, width height 24-25, dilation 26.
 #define CAM(k) ((FW)camera[k])
 
@@ -47,8 +47,8 @@ __kernel void project(
   FW cyy = LOADF(cov, 3 * s + i), cyz = LOADF(cov, 4 * s + i), czz = LOADF(cov, 5 * s + i);
   FW a, b, c, det;
   if (antialiased) {
-    // Rows of projection times factor; their cross product is the area before the dilation. From a, b and c it would be rounding
-    // alone for needles: of 100 to 300 pixels, factors were off by 0.15 at most and 0.017 in the mean; this way by 7e-6 and 8e-8.
+    // Rows of projection times factor. Their cross product is the area before the dilation. Computed from a, b and c instead, the
+    // area of a needle would be nothing but rounding.
     FW g00 = dot3(cxx, cxy, cxz, t00, t01, t02), g01 = fma(cyz, t02, cyy * t01), g02 = czz * t02;
     FW g10 = dot3(cxx, cxy, cxz, t10, t11, t12), g11 = fma(cyz, t12, cyy * t11), g12 = czz * t12;
     FW nx = fma(g01, g12, -(g02 * g11)), ny = fma(g02, g10, -(g00 * g12)), nz = fma(g00, g11, -(g01 * g10));
@@ -59,7 +59,7 @@ __kernel void project(
     det = before + fma(a + c, CAM(26), CAM(26) * CAM(26));
     a += CAM(26);
     c += CAM(26);
-    FW share = before / det;  // at most 1: the sum above rounds to `before` at the least
+    FW share = before / det;  // at most 1: the sum above rounds to at least `before`
     shown &= MASK(share >= (FW)SHARE_MIN);
     level = fma((FW)0.5f, flog2(larger(share, (FW)SHARE_MIN)), level);
     shown &= MASK(level >= (FW)-(LOG2_255 + EXTENT_SLACK));
@@ -73,7 +73,7 @@ __kernel void project(
     v1 = dot3(cxy, cyy, cyz, t10, t11, t12);
     v2 = dot3(cxz, cyz, czz, t10, t11, t12);
     c = dot3(t10, t11, t12, v0, v1, v2) + CAM(26);
-    // ac - b^2 with the rounding error of b^2 added back: plain float32 loses needles here.
+    // ac - b^2 with the rounding error of b^2 added back, since plain float32 loses needles here.
     FW bb = b * b;
     det = fma(a, c, -bb) + fma(-b, b, bb);
   }
@@ -87,10 +87,10 @@ __kernel void project(
     FW mid = (FW)0.5f * (a + c);
     FW spread = sqrt(fmax((FW)0.1f, mid * mid - det));
     radius = ceil((FW)SIGMA_RADIUS_INRIA * sqrt(mid + spread));
-    reach_x = radius + (FW)TILE;  // rounded out to tiles below
+    reach_x = radius + (FW)TILE;  // rounded out to whole tiles below
     reach_y = reach_x;
   }
-  // Written so that NaN and infinity fail the tests.
+  // Written so that NaN and infinity fail all tests.
   shown &= MASK(det > (FW)0.0f) & MASK(det < (FW)INFINITY) & MASK(a < (FW)INFINITY) & MASK(c < (FW)INFINITY);
   shown &= MASK(mx + reach_x >= (FW)-1.0f) & MASK(mx - reach_x <= width);
   shown &= MASK(my + reach_y >= (FW)-1.0f) & MASK(my - reach_y <= height);
@@ -104,7 +104,7 @@ __kernel void project(
   out[3] = -(b + b) * k;
   out[4] = a * k;
   out[5] = level;
-  // What the tile stage needs: where the ellipse's right end lies, its half height, axis slope b/c, 1/c, det/c and level.
+  // Numbers for the tile lists: x of the ellipse's right end, its half height, axis slope b/c, 1/c, det/c and level.
   FW ic = (FW)1.0f / c;
   out[9] = (b / a) * half_width;
   out[10] = half_height;
@@ -121,7 +121,7 @@ __kernel void project(
     y0 = floor((my - radius) * (FW)(1.0f / TILE));
     y1 = floor((my + radius + (FW)(TILE - 1)) * (FW)(1.0f / TILE)) - (FW)1.0f;
   } else {
-    // Twice the slack of the spans in tiles.cl: this is the bound that the pair buffer is sized by.
+    // Twice the slack of the spans in tiles.cl, since this bound sets the size of the pair buffer.
     FW sx = (FW)2.0f * fma(half_width, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
     FW sy = fma(half_height, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
     x0 = floor(ceil(mx - half_width - sx) * (FW)(1.0f / TILE));

@@ -1,4 +1,4 @@
-// Reductions over views that follow the blend: residual images, costs of dropping SH degrees, SH terms of the colour refit.
+// Reductions after a blend: residual images, costs of dropping SH degrees, and SH terms of the colour refit.
 // Twins: flexgs_edge.kernels.twins.score
 
 // target - image, pixel by pixel.
@@ -16,14 +16,14 @@ __kernel void residual(
 #endif
 }
 
-// Sum number `plane` of W rows as float; 0 in lanes from `count` on, whose rows belong to other chunks.
+// Sum `plane` of W rows as float; 0 in lanes from `count` on, whose rows belong to other chunks.
 inline FW sum_value(__global const long *sums, uint planes, uint plane, size_t row, int count, float unit) {
   float lanes[W];
   for (int l = 0; l < W; ++l) lanes[l] = l < count ? convert_float(sums[(row + l) * planes + plane]) : 0.0f;
   return LOADF(lanes, 0) * (FW)unit;
 }
 
-// acc[i] += value in fixed point: sums over views in any order give the same bits, unless they leave 64 bits: there they stay.
+// acc[i] += value in fixed point. Sums over views have the same bits in any order, unless they reach the 64-bit limits: they stay there.
 inline void add_long(__global long *acc, size_t i, FW value) {
   value = fmin(fmax(value * (FW)FIXED_WEIGHT, (FW)-FIXED_LARGEST), (FW)FIXED_LARGEST);
 #if W == 1
@@ -33,8 +33,8 @@ inline void add_long(__global long *acc, size_t i, FW value) {
 #endif
 }
 
-// `view_direction` of rows that this view sees. A row at the camera's own position has none: NaN, which times its weight of 0
-// would still be NaN.
+// `view_direction` of rows that this view sees. A row at the camera's own position has no direction: NaN, which would stay NaN also
+// with its weight of 0.
 inline void seen_direction(IW some, __global const float *camera, __global const float *means, size_t s, size_t i, FW *x, FW *y,
                            FW *z) {
   view_direction(camera, LOADF(means, i), LOADF(means, s + i), LOADF(means, 2 * s + i), x, y, z);
@@ -43,8 +43,8 @@ inline void seen_direction(IW some, __global const float *camera, __global const
   *z = pick(some, *z, (FW)0.0f);
 }
 
-// For every lower degree L: with d the colour that the bands above L add in this view and w2 the sum of squared weights,
-// moments w2 d (three channels) and w2 |d|^2. From them the cost of dropping the bands with the weighted mean kept.
+// For every lower degree L, let d be the colour that the bands above L add in this view, and w2 the sum of squared weights. Adds the
+// moments w2 d (three channels) and w2 |d|^2. They give the cost of dropping the bands if the weighted mean colour is kept.
 __kernel void sh_costs(
     const uint count,                   // rows of this chunk
     const uint stride,
@@ -81,8 +81,8 @@ __kernel void sh_costs(
   }
 }
 
-// Adds one view to the sums of the colour refit: for every basis function k (k = 0: the constant), Y_k sum(alpha T r) of three
-// channels and |Y_k| sum(alpha T). Float sums, view after view for each row: the order of the views is part of the result.
+// Adds one view to the sums of the colour refit. For every basis function k (k = 0: the constant): Y_k sum(alpha T r) of three
+// channels, and |Y_k| sum(alpha T). These are float sums, view after view, so the order of the views is part of the result.
 __kernel void sh_residual(
     const uint count,                   // rows of this chunk
     const uint stride,

@@ -1,7 +1,7 @@
-// SSIM (Wang et al. 2004) of two images of one channel: windowed moments along columns, then along rows.
+// SSIM (Wang et al. 2004) of two one-channel images: windowed moments along columns, then along rows.
 // Twins: flexgs_edge.kernels.twins.similarity
 
-// Windowed a, b, a a, b b and a b along the columns, of every element whose window is inside.
+// Moments of a, b, a a, b b and a b, windowed along the columns, for every element whose window is inside the image.
 __kernel void ssim_columns(
     const uint count,                   // elements of a plane of moments: (height - SSIM_WINDOW + 1) stride
     const uint stride,                  // elements of a row, a multiple of 16
@@ -29,7 +29,7 @@ __kernel void ssim_columns(
   STOREF(mab, moments, i + 4 * (size_t)plane);
 }
 
-// The moments windowed along the rows, and SSIM. The last SSIM_WINDOW - 1 elements of a row take from the next one: not to be used.
+// The moments windowed along the rows, and SSIM. The last SSIM_WINDOW - 1 elements of a row read the next row: do not use them.
 __kernel void ssim_rows(
     const uint count,
     const uint plane,                   // at least count + SSIM_WINDOW - 1

@@ -1,5 +1,5 @@
-// Stable least-significant-digit radix sort of the shown splats by depth, and the scan that it shares with the tile lists.
-// A work-item walks one contiguous block of elements in order, so equal keys keep their order whatever the number of blocks.
+// Stable radix sort (least significant digit first) of the shown splats by depth, and the scan that the tile lists use too.
+// A work-item walks one contiguous block of elements in order, so that equal keys keep their order for any number of blocks.
 // Twins: flexgs_edge.kernels.twins.sort
 
 #define DIGIT_BITS 11
@@ -11,7 +11,7 @@ inline void block_range(uint count, uint *start, uint *end) {
   *end = (uint)((ulong)count * (block + 1) / blocks);
 }
 
-// Histogram of the first digit; culled splats are left out, which makes the first pass compact as well.
+// Histogram of the first digit. Culled splats are left out here, so the first pass also compacts.
 __kernel void sort_count_first(
     const uint count,
     __global const uint *keys,        // [N]
@@ -87,9 +87,9 @@ __kernel void sort_scatter(
   }
 }
 
-// Offsets of every cell and block, cell by cell and block by block within a cell, in place; values[blocks * cells] receives the
-// total. One work-item: 65 k counters take 40 us, less than a second launch.
-// Each block has a row of its own: with the blocks of a cell side by side two cores would fight over every cache line.
+// Offsets of every cell and block, in place: cell by cell, and block by block within a cell. values[blocks * cells] gets the total.
+// One work-item is enough: a second launch would cost more than its counting.
+// Each block has a row of its own. If the blocks of a cell lay side by side, two cores would fight over every cache line.
 __kernel void exclusive_scan(
     const uint cells,
     const uint blocks,

@@ -1,13 +1,13 @@
-// Tile lists in depth order: which splats may show in which tile, and in which of its sixteen 4x4 blocks.
-// A counting sort by tile; a work-item walks one contiguous block of the depth-ordered splats.
+// Tile lists in depth order: the splats that may show in each tile, and in which of its sixteen 4x4 blocks.
+// It is a counting sort by tile; a work-item walks one contiguous block of the depth-ordered splats.
 // Twins: flexgs_edge.kernels.twins.tiles
 
 #define BANDS 16   // block rows (4 pixels high) worked on at a time: four rows of tiles
 #define EMPTY_FIRST (1 << 28)
 #define EMPTY_LAST (-1)
 
-// First and last block column of a splat in W block rows from `band` on; an empty row has first > last.
-// On the ellipse the right end over a row lies at its overall extreme, clamped into the row (it is convex); so does the left.
+// First and last block column of a splat in W block rows from `band` on; in an empty row, first > last.
+// The ellipse is convex. So its right end within a row lies at its overall right end, clamped into the row; likewise the left.
 inline void block_spans(__global const float *r, int band, float width, IW *first, IW *last) {
   const FW my = (FW)r[1], hh = (FW)r[10], slope = (FW)r[11];
   FW top = TO_F((LANE_INDEX + (IW)band) * (IW)BLOCK) - my;
@@ -26,8 +26,8 @@ inline void block_spans(__global const float *r, int band, float width, IW *firs
   *last = picki(some, whole(x1) >> 2, (IW)EMPTY_LAST);
 }
 
-// The 16-bit block mask of a tile: bit 4 * row + column. `first` and `last` are the spans of the tile's four block rows.
-// Four lanes whatever W is: a tile has four block rows.
+// The 16-bit block mask of a tile, bit 4 * row + column. `first` and `last` are the spans of the tile's four block rows.
+// A tile has four block rows, so there are four lanes for any W.
 inline uint tile_mask(int4 first, int4 last, int tile_x) {
   const int4 from = max(first - 4 * tile_x, (int4)0), to = min(last - 4 * tile_x, (int4)3);
   const uint4 upto = ((uint4)(2u) << as_uint4(max(to, (int4)0))) - 1u, below = ((uint4)(1u) << as_uint4(min(from, (int4)4))) - 1u;
@@ -35,14 +35,14 @@ inline uint tile_mask(int4 first, int4 last, int tile_x) {
   return (rows.s0 | rows.s1) | (rows.s2 | rows.s3);
 }
 
-// The row of tiles at a height in pixels, held in the image. A splat that ends between two pixels may get a row too many: spans of
-// block rows there are empty.
+// The row of tiles at a height in pixels, clamped to the image. A splat that ends between two pixels may get one row too many, in
+// which the spans of its block rows are empty.
 inline int tile_row(float y, float height) {
   const float last = height - 1.0f;
   return (int)(y > 0.0f ? y < last ? y : last : 0.0f) / TILE;
 }
 
-// Calls EACH(tile, mask) for every tile that the splat may show in.
+// Calls EACH(tile, mask) for every tile in which the splat may show.
 #define FOR_EACH_TILE(EACH)                                                                                     \
   __global const float *r = records + (size_t)ids[n] * 16;                                                      \
   if (inria_extent) {                                                                                           \
@@ -83,7 +83,7 @@ inline void splat_range(uint from, uint count, uint *start, uint *end) {
   *end = from + (uint)((ulong)count * (block + 1) / blocks);
 }
 
-// How many drafts each block of splats may write: bounds are counted by `project`, with room to spare.
+// Counts the drafts that each block of splats may write: an upper bound, from the bounds that `project` counted.
 __kernel void tile_room(
     const uint from,                  // first splat of the batch in depth order
     const uint count,                 // splats of the batch
@@ -103,7 +103,7 @@ inline size_t draft_start(__global const uint *room) {
   return start;
 }
 
-// Spans are worked out once, here; `tile_scatter` only moves what this wrote.
+// Computes the spans, once; `tile_scatter` then only moves the drafts.
 __kernel void tile_count(
     const uint from,
     const uint count,
