@@ -109,8 +109,8 @@ class ScratchStorage(Storage):
         kind = file_system_of(self.folder)
         if kind in _IN_MEMORY:
             raise InputError(
-                f"--scratch {folder}: this folder is a {kind}, which lies in memory itself: scratch files there would count "
-                "against the limit that they are to keep; name a folder on a disk"
+                f"--scratch {folder}: this folder is on a {kind}, which lies in memory: scratch files there would count "
+                "against the memory limit; name a folder on a disk"
             )
         try:
             with tempfile.TemporaryFile(dir=self.folder):

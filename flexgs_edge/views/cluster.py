@@ -174,7 +174,7 @@ class Cluster:
                     done += 1
                 return
             except CancelledError:
-                LOG.warning("all workers that held the scene were lost: it is sent again")
+                LOG.warning("all workers with the scene were lost; it is sent to others")
             except self._lost as error:
                 raise DeviceError(
                     f"--cluster: workers died while they drew ({error}); is their memory too small?"

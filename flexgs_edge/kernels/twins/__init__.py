@@ -1,6 +1,6 @@
-"""NumPy twins of the OpenCL kernels: same names, same argument order (after the launch size), same bits.
+"""NumPy twins of the OpenCL kernels: the same names, the same arguments after the launch size, and the same bits.
 
-The twins are the specification of the kernels, and what `--device numpy` runs.
+The twins are the specification of the kernels. `--device numpy` runs them; they are far slower.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ def activate(
     cov: np.ndarray,
     log2_opacity: np.ndarray,
 ) -> None:
-    """Stored attributes to 3D covariance or its factor ([6, stride]) and log2 of the opacity ([stride], -inf below ALPHA_MIN)."""
+    """Compute the 3D covariance or its factor ([6, stride]), and log2 of the opacity ([stride], -inf below ALPHA_MIN)."""
     s0, s1, s2 = (fexp2(row * f32(LOG2_E)) for row in log_scales)
     big = np.fmax(np.fmax(np.abs(quats[0]), np.abs(quats[1])), np.fmax(np.abs(quats[2]), np.abs(quats[3])))
     w, x, y, z = (row / big for row in quats)
@@ -41,7 +41,7 @@ def activate(
 
 
 def _factor(m0: Triple, m1: Triple, m2: Triple) -> list[np.ndarray]:
-    """Lower triangle (xx yx zx yy zy zz) of the F with F F^T = M M^T, from the rows of M."""
+    """Lower triangle F (xx yx zx yy zy zz) with F F^T = M M^T, from the rows of M."""
     xx = dot3(*m0, *m0)
     u = _direction(m0, xx)
     yx, zx = dot3(*m1, *u), dot3(*m2, *u)

@@ -12,18 +12,18 @@ f32 = np.float32
 Values = Union[np.ndarray, "np.floating[Any]"]
 """An array of float32, or one float32."""
 Triple = tuple[np.ndarray, ...]
-"""x, y and z of many rows."""
+"""x, y and z of several rows."""
 
 _TIE_BITS = np.int64(0x1FFFFFFF)
 _TIE = np.int64(0x10000000)
 
 
 def fma(a: Values, b: Values, c: Values) -> np.ndarray:
-    """`a * b + c` rounded once to float32.
+    """`a * b + c`, rounded once to float32.
 
-    The product of two float32 is exact in float64; the sum is rounded to float64 and then to float32. Rounding twice goes wrong
-    only where the float64 lies midway between two float32 and was itself rounded: there it is nudged towards the exact sum.
-    Gap: results below 2^-126 may be off by one denormal step.
+    float64 holds the product of two float32 exactly. The sum is rounded to float64 and then to float32. Two roundings go wrong
+    only if the float64 lies midway between two float32 and was itself rounded; then we nudge it towards the exact sum.
+    Results below 2^-126 may still be off by one denormal step.
     """
     product = np.multiply(a, b, dtype=np.float64)
     total = np.asarray(product + c)
@@ -38,14 +38,14 @@ def fma(a: Values, b: Values, c: Values) -> np.ndarray:
 
 
 def fexp2(x: np.ndarray) -> np.ndarray:
-    """2^x, as `fexp2` in common.clh: NaN passes."""
+    """2^x, as `fexp2` in common.clh; NaN gives NaN."""
     within = np.where(x > f32(EXP2_HIGH), f32(EXP2_HIGH), x)
     within = np.where(within < f32(EXP2_LOW), f32(EXP2_LOW), within)
     return np.where(x == x, fexp2_within(within), x)
 
 
 def fexp2_within(x: np.ndarray) -> np.ndarray:
-    """2^x of EXP2_LOW <= x <= EXP2_HIGH, as `fexp2_within` in common.clh."""
+    """2^x for EXP2_LOW <= x <= EXP2_HIGH, as `fexp2_within` in common.clh."""
     t = x + f32(EXP2_MAGIC)
     i = np.left_shift(t.view(np.int32), 23)
     f = x - (t - f32(EXP2_MAGIC))
@@ -72,7 +72,7 @@ def dot3(*parts: np.ndarray) -> np.ndarray:
 
 
 def splat_exponent(*parts: np.ndarray) -> np.ndarray:
-    """log2 of a splat's alpha, of (dx, dy, ca, cb, cc, level) given in this order, as `splat_exponent` in common.clh."""
+    """log2 of a splat's alpha from (dx, dy, ca, cb, cc, level), in this order, as `splat_exponent` in common.clh."""
     dx, dy, ca, cb, cc, level = parts
     row, slope = fma(-(cc * dy), dy, level), fma(ca, dx, cb * dy)
     exponent = fma(-slope, dx, row)

@@ -1,4 +1,4 @@
-"""Twins of `cl_kernels/backward.cl`: gradients of stored values from a view's sums, steps along them, values on their grids."""
+"""Twins of `cl_kernels/backward.cl`: gradients of stored values from a view's sums, steps along them, rounding to the grid."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flexgs_edge.kernels.twins.arithmetic import Triple, dot3, f32, fexp2, fma
 from flexgs_edge.kernels.twins.project import sh_basis
 
 AT_SCALE, AT_QUAT, AT_LOGIT, AT_DC, AT_SH = 3, 6, 10, 11, 14
-"""First plane of each kind of value in a gradient, after the means."""
+"""First plane of each kind of value in a gradient; the means come before them."""
 
 _LN2 = f32(1) / f32(LOG2_E)
 
@@ -92,7 +92,7 @@ def project_backward(
     touched: np.ndarray,
     gradient: np.ndarray,
 ) -> None:
-    """Gradients ([14 + 3 K, stride]) of the rows of a chunk that have any, and which rows have ([stride] 1 or 0)."""
+    """Gradients ([14 + 3 K, stride]) of the rows that the view touches, and a mark of these rows ([stride], 1 or 0)."""
     fixed = sums.view(np.int64)[base : base + count, :, 0]
     seen = np.zeros(stride, bool)
     seen[:count] = (fixed != 0).any(axis=1)
@@ -120,7 +120,7 @@ def _colours(
     record: np.ndarray,
     moments: np.ndarray,
 ) -> tuple[np.ndarray, Triple]:
-    """Gradients of the constant and of SH ([3 + 3 K, n]), and of the centre through the direction."""
+    """Gradients of the constant and of SH ([3 + 3 K, n]), and of the centre through the direction of view."""
     dx, dy, dz = (means[k] - cam[21 + k] for k in range(3))
     norm = f32(1) / np.sqrt(dot3(dx, dy, dz, dx, dy, dz))
     dx, dy, dz = dx * norm, dy * norm, dz * norm
@@ -230,7 +230,7 @@ def adam(
     second: np.ndarray,
     values: np.ndarray,
 ) -> None:
-    """One step of Adam for the touched rows: running means, powers of the decays and values change in place."""
+    """One step of Adam for the touched rows; running means, powers of the decays and values change in place."""
     rows = np.flatnonzero(touched > 0)
     one, least = f32(1), f32(GRADIENT_MIN)
     decays = f32(decay_first), f32(decay_second)
@@ -266,7 +266,7 @@ def snap(
     sh_dc: np.ndarray,
     sh_rest: np.ndarray,
 ) -> None:
-    """Values ([14 + 3 K, stride]) as a file of these steps gives them back; a step of 0 leaves them."""
+    """Round values ([14 + 3 K, stride]) to those that a file of these steps decodes to; a step of 0 leaves them as they are."""
     means[:] = _on_grid(values[:AT_SCALE], steps[0])
     log_scales[:] = _on_grid(values[AT_SCALE:AT_QUAT], steps[1])
     w, x, y, z = values[AT_QUAT:AT_LOGIT]

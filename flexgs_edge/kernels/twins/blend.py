@@ -1,6 +1,6 @@
 """Twin of `cl_kernels/blend_cpu.cl` and `blend_gpu.cl`.
 
-Works on all 4x4 blocks of a group of tiles at once: step k blends the k-th splat of every block that has one.
+All 4x4 blocks of a group of tiles are blended at once: step k blends the k-th splat of every block that has one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from flexgs_edge.constants import (
 from flexgs_edge.kernels.twins.arithmetic import f32, fexp2_within, fma, splat_exponent
 
 TILES_AT_ONCE = 256
-"""Bounds the twin's memory: block lists and, for statistics, one float a pixel of each listed block."""
+"""Tiles of a group. It bounds the twin's memory: block lists and, for statistics, one float a pixel of each listed block."""
 
 _LANE = np.arange(BLOCK * BLOCK)
 _LANE_X, _LANE_Y = (_LANE % BLOCK).astype(f32), (_LANE // BLOCK).astype(f32)
@@ -32,7 +32,7 @@ _LANE_X, _LANE_Y = (_LANE % BLOCK).astype(f32), (_LANE // BLOCK).astype(f32)
 
 @dataclass
 class _Lists:
-    """Splats of each block: entries [starts[u], starts[u] + counts[u]) of block u index `pair`."""
+    """The splats of each block: those of block u are entries [starts[u], starts[u] + counts[u]) of `pair`."""
 
     pair: np.ndarray
     starts: np.ndarray
@@ -49,9 +49,10 @@ def _block_lists(tile: np.ndarray, masks: np.ndarray, tiles: int) -> _Lists:
 
 @dataclass
 class _Entries:
-    """What the statistics need of every list entry and lane: hits, weights, and the squared error of removal.
+    """Statistics of every list entry and lane: hits, weights, and the squared error of removal.
 
-    Gradients: `error` is that of the exponent, and `place` ([2, entries, 16]) where the pixel lies from the splat's centre.
+    For gradients, `error` is the gradient of the exponent, and `place` ([2, entries, 16]) is the pixel relative to the
+    splat's centre.
     """
 
     hit: np.ndarray
@@ -61,7 +62,7 @@ class _Entries:
 
 
 def _fixed(lanes: np.ndarray, unit: float, tiles: int) -> np.ndarray:
-    """[pairs] i64 of [pairs, 16] lanes: the pairwise tree, then fixed point, at most a tile's part of what 64 bits hold."""
+    """[pairs] i64, sums of [pairs, 16] lanes: the pairwise tree, then fixed point, clamped to a tile's part of 64 bits."""
     largest = f32(FIXED_LARGEST / 2.0 ** tiles.bit_length())
     eight = lanes[:, :8] + lanes[:, 8:]
     four = eight[:, :4] + eight[:, 4:]
@@ -76,15 +77,15 @@ PLANES = {
     4: ("weight", "red", "green", "blue", "error", "square"),
     5: ("red", "green", "blue", "slope", "x", "y", "xx", "xy", "yy"),
 }
-"""What the fixed-point sums of each kind of statistics hold."""
+"""Planes of the fixed-point sums, for each kind of statistics."""
 
 
 UNITS = {"error": FIXED_ERROR, "square": FIXED_ERROR} | dict.fromkeys(PLANES[5][4:], FIXED_MOMENT)
-"""Of the planes whose unit is not 1 / FIXED_WEIGHT."""
+"""Units of the planes whose unit is not 1 / FIXED_WEIGHT."""
 
 
 def _add_moments(lanes: dict[str, np.ndarray], pair: np.ndarray, slope: np.ndarray, place: np.ndarray) -> None:
-    """Gradients of the exponent times the pixel's place, in the kernel's order."""
+    """Add gradients of the exponent, times powers of the pixel's place, in the kernel's order."""
     dx, dy = place
     slope_x, slope_y = slope * dx, slope * dy
     for name, part in (("slope", slope), ("x", slope_x), ("y", slope_y)):
@@ -103,7 +104,7 @@ def _add_sums(
     hits: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Adds to hits and to the fixed-point sums, in the kernel's order: lanes over blocks, then the tree over lanes.
+    """Add to hits and to the fixed-point sums, in the kernel's order: lanes over blocks, then the tree over lanes.
 
     `rest` is the residual, [3, units, 16].
     """
@@ -154,9 +155,9 @@ def blend(
     rest: np.ndarray | None = None,
     stats: int = 0,
 ) -> None:
-    """Blend the tile lists into `state`, and into `image` ([3, padded height, padded width]) at the end.
+    """Blend the tile lists into `state`, and in the end into `image` ([3, padded height, padded width]).
 
-    Statistics of more than hits and weights read a finished `image` instead.
+    For statistics beyond hits and weights, `image` is finished already, and only read.
     """
     tile_ends = np.concatenate([[0], ends[(blocks - 1) * size[0] : blocks * size[0]].astype(np.int64)])
     background = np.array([background_r, background_g, background_b], f32)
@@ -179,7 +180,7 @@ def blend(
         own_rest = None if rest is None else rest.reshape(image.shape)[:, ys, xs]
         whole = image[:, ys, xs] if stats in (2, 4, 5) else None
         if stats == 5 and not resume and whole is not None and own_rest is not None:
-            # What is still to come in a pixel, times the residual, goes on in the place of red.
+            # The light still to come in a pixel, times the residual, is kept in the place of red.
             red, green, blue = whole
             colour[0] = fma(blue, own_rest[2], fma(green, own_rest[1], red * own_rest[0]))
         entries = _blend_blocks(lists, part[:, 0], records, (px, py), colour, trans, stats, whole, own_rest)
@@ -205,7 +206,7 @@ def _blend_blocks(
     whole: np.ndarray | None,
     rest: np.ndarray | None,
 ) -> _Entries | None:
-    """Blend every block's list into `colour` and `trans`; returns what the statistics need when asked for."""
+    """Blend every block's list into `colour` and `trans`; returns the entries for statistics if they are asked for."""
     shape = (len(lists.pair) if stats else 0, 16)
     entries = _Entries(
         np.zeros(shape, bool),
@@ -225,7 +226,7 @@ def _blend_blocks(
         dx, dy = pixels[0][units] - r[:, 0:1], pixels[1][units] - r[:, 1:2]
         exponent = splat_exponent(dx, dy, r[:, 2:3], r[:, 3:4], r[:, 4:5], r[:, 5:6])
         seen = exponent >= f32(LOG2_ALPHA_MIN)
-        # The kernel has anything where nothing is seen, and uses it nowhere.
+        # The kernel's value is undefined where a splat is not seen, and is not used there.
         alpha = np.where(seen, fexp2_within(np.where(seen, exponent, f32(0))), f32(0))
         t = trans[units]
         after = fma(-alpha, t, t)

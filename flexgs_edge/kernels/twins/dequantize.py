@@ -19,7 +19,7 @@ def dequantize(
     step: np.ndarray,
     values: np.ndarray,
 ) -> None:
-    """Rows [first, first + rows) of every channel into `values` ([channels, stride])."""
+    """Dequantize rows [first, first + rows) of every channel into `values` ([channels, stride])."""
     row = np.arange(first, first + rows, dtype=np.int64)
     group = ((row + 1) * groups - 1) // count
     at, shift = row * bits >> 3, row * bits & 7

@@ -72,7 +72,7 @@ def _bounds(
     radius: np.ndarray,
     cam: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Tiles of the bounding box, and whether there are any."""
+    """Number of tiles of the bounding box, and whether there are any."""
     per_tile, spans = f32(1.0 / TILE), []
     for centre, half_extent, slack_factor, pixels in ((mx, half[0], f32(2), cam[24]), (my, half[1], f32(1), cam[25])):
         if inria_extent:
@@ -92,7 +92,7 @@ def _bounds(
 def _from_covariance(
     cov: np.ndarray, t0: Triple, t1: Triple, dilation: np.float32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """a, b, c and the determinant of the dilated 2D covariance."""
+    """Entries a, b, c and the determinant of the dilated 2D covariance, from the 3D covariance."""
     cxx, cxy, cxz, cyy, cyz, czz = cov
     v0 = (dot3(cxx, cxy, cxz, *t0), dot3(cxy, cyy, cyz, *t0), dot3(cxz, cyz, czz, *t0))
     a, b = dot3(*t0, *v0) + dilation, dot3(*t1, *v0)
@@ -105,7 +105,7 @@ def _from_covariance(
 def _from_factor(
     factor: np.ndarray, t0: Triple, t1: Triple, dilation: np.float32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The same from the covariance's triangular factor, and the determinant before the dilation as a share of that after it."""
+    """As `_from_covariance`, from the triangular factor; also the determinant before the dilation as a share of that after it."""
     fxx, fyx, fzx, fyy, fzy, fzz = factor
     g0, g1 = ((dot3(fxx, fyx, fzx, *t), fma(fzy, t[2], fyy * t[1]), fzz * t[2]) for t in (t0, t1))
     cross = tuple(fma(g0[k], g1[m], -(g0[m] * g1[k])) for k, m in ((1, 2), (2, 0), (0, 1)))
@@ -133,7 +133,7 @@ def project(
     keys: np.ndarray,
     bounds: np.ndarray,
 ) -> None:
-    """Splat records ([N, 16]), depth keys and bounds ([N]) of rows [base, base + count)."""
+    """Project rows [base, base + count) to splat records ([N, 16]), depth keys and bounds ([N])."""
     cam = camera
     px, py, pz = means[:, :count]
     z = fma(cam[8], pz, fma(cam[6], px, cam[7] * py)) + cam[11]

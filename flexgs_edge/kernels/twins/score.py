@@ -1,4 +1,4 @@
-"""Twins of `cl_kernels/score.cl`: residual images, moments of dropped SH degrees, sums of the colour refit."""
+"""Twins of `cl_kernels/score.cl`: residual images, moments of dropped SH degrees, and sums of the colour refit."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def sh_costs(
     sums: np.ndarray,
     moments: np.ndarray,
 ) -> None:
-    """Moments w2 d and w2 |d|^2 of the colour d above each lower degree ([degree, 4, stride] i64)."""
+    """Add the moments w2 d and w2 |d|^2, with d the colour of the SH above each lower degree ([degree, 4, stride] i64)."""
     w2 = _sum_values(sums[base : base + count, plane], 1.0 / FIXED_ERROR)
     some = np.flatnonzero(w2 > 0)
     basis = sh_basis(degree, *_directions(camera, means[:, some]))
@@ -76,7 +76,7 @@ def sh_residual(
     sums: np.ndarray,
     normal: np.ndarray,
 ) -> None:
-    """Adds Y_k sum(alpha T r) and |Y_k| sum(alpha T) of one view to `normal` ([K + 1, 4, stride])."""
+    """Add Y_k sum(alpha T r) and |Y_k| sum(alpha T) of one view to `normal` ([K + 1, 4, stride])."""
     span = slice(base, base + count)
     weight, *seen = (_sum_values(sums[span, c], 1.0 / FIXED_WEIGHT) for c in range(4))
     some = np.flatnonzero(weight > 0)

@@ -1,4 +1,4 @@
-"""Twins of `cl_kernels/similarity.cl`: SSIM of two images of one channel."""
+"""Twins of `cl_kernels/similarity.cl`: SSIM of two one-channel images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def ssim_columns(
     b: np.ndarray,
     moments: np.ndarray,
 ) -> None:
-    """Windowed a, b, a a, b b and a b along the columns ([5, plane])."""
+    """Moments of a, b, a a, b b and a b, windowed along the columns ([5, plane])."""
     sums = moments[:, :count]
     sums[:] = 0
     for k in range(SSIM_WINDOW):
@@ -31,7 +31,7 @@ def ssim_columns(
 def ssim_rows(
     size: tuple[int, ...], count: int, plane: int, taps: np.ndarray, moments: np.ndarray, similar: np.ndarray
 ) -> None:
-    """SSIM of every element ([count]) from the moments windowed along the rows as well."""
+    """SSIM of every element ([count]), from the moments, windowed along the rows too."""
     m = np.zeros((5, count), f32)
     for k in range(SSIM_WINDOW):
         m += taps[k] * moments[:, k : k + count]

@@ -10,7 +10,7 @@ DIGITS = 1 << 11
 
 
 def block_of(count: int, blocks: int) -> np.ndarray:
-    """[count] block of each element: block b holds [count * b // blocks, count * (b + 1) // blocks)."""
+    """[count], the block of each element: block b holds [count * b // blocks, count * (b + 1) // blocks)."""
     return ((np.arange(count, dtype=np.int64) + 1) * blocks - 1) // max(count, 1)
 
 
@@ -30,7 +30,7 @@ def _scatter(cells: np.ndarray, offsets: np.ndarray, pairs: tuple[tuple[np.ndarr
 def sort_count_first(
     size: tuple[int, ...], count: int, keys: np.ndarray, bounds: np.ndarray, counts: np.ndarray, pairs: np.ndarray
 ) -> None:
-    """Histogram of the first digit ([blocks, DIGITS]) and tiles of each block's shown splats."""
+    """Histogram of the first digit ([blocks, DIGITS]), and the bounds of each block's shown splats, summed."""
     shown, blocks = np.flatnonzero(keys[:count] != CULLED), size[0]
     block = block_of(count, blocks)[shown]
     _count(block * DIGITS + keys[shown] % DIGITS, counts, blocks)
@@ -40,7 +40,7 @@ def sort_count_first(
 def sort_scatter_first(
     size: tuple[int, ...], count: int, keys: np.ndarray, offsets: np.ndarray, keys_out: np.ndarray, ids_out: np.ndarray
 ) -> None:
-    """First pass: keys and rows of the shown splats, by the lowest digit."""
+    """The first pass: keys and rows of the shown splats, sorted by the lowest digit."""
     shown, blocks = np.flatnonzero(keys[:count] != CULLED), size[0]
     cells = block_of(count, blocks)[shown] * DIGITS + keys[shown] % DIGITS
     _scatter(cells, offsets, ((keys[shown], keys_out), (shown.astype(np.uint32), ids_out)))
@@ -69,7 +69,7 @@ def sort_scatter(
 
 
 def exclusive_scan(size: tuple[int, ...], cells: int, blocks: int, values: np.ndarray) -> None:
-    """Offsets of [blocks, cells] counts, cell by cell, in place; the total behind them."""
+    """Turn [blocks, cells] counts into offsets, cell by cell, in place; the total comes after them."""
     counts = values[: blocks * cells].reshape(blocks, cells)
     total = np.cumsum(counts.T.reshape(-1), dtype=np.uint32)
     values[blocks * cells] = total[-1]

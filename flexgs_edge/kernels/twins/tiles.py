@@ -1,4 +1,4 @@
-"""Twins of `cl_kernels/tiles.cl`: tile lists in depth order with block masks."""
+"""Twins of `cl_kernels/tiles.cl`: tile lists in depth order, with block masks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _BANDS = np.arange(TILE // BLOCK, dtype=np.int32)
 
 
 def block_spans(records: np.ndarray, bands: np.ndarray, width: np.float32) -> tuple[np.ndarray, np.ndarray]:
-    """First and last block column ([m, 4] i32) of splats ([m, 16]) over four block rows each ([m, 4]); first > last: none."""
+    """First and last block column ([m, 4] i32) of splats ([m, 16]) over four block rows each ([m, 4]); empty if first > last."""
     mx, my, turn, hh, slope, ic, root_scale, level = (records[:, k : k + 1] for k in (0, 1, 9, 10, 11, 12, 13, 14))
     top = (bands * BLOCK).astype(f32) - my
     slack = fma(hh, f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))
@@ -72,13 +72,13 @@ def list_pairs(
 def tile_room(
     size: tuple[int, ...], start: int, count: int, ids: np.ndarray, bounds: np.ndarray, room: np.ndarray
 ) -> None:
-    """Drafts that each block of the depth-ordered splats [start, start + count) may write, into `room[0]`."""
+    """Most drafts of each block of the depth-ordered splats [start, start + count), into `room[0]`."""
     blocks = block_of(count, size[0])
     room[0] = np.bincount(blocks, weights=bounds[ids[start : start + count]], minlength=size[0]).astype(np.uint32)
 
 
 def _draft_places(room: np.ndarray) -> np.ndarray:
-    """[n] i64: where the drafts of all blocks lie, block by block."""
+    """[n] i64, the places of all drafts, block by block."""
     starts = np.cumsum(room[0], dtype=np.int64) - room[0]
     return _expand(starts, starts + room[1].astype(np.int64) - 1)[1]
 
@@ -96,7 +96,7 @@ def tile_count(
     drafts: np.ndarray,
     counts: np.ndarray,
 ) -> None:
-    """Drafts (row, tile, mask) of the splats [start, start + count), and how many there are by tile and block of splats."""
+    """Drafts (row, tile, mask) of the splats [start, start + count), and their counts by tile and block of splats."""
     batch = ids[start : start + count]
     splat, tile, mask = list_pairs(batch, records, f32(width), f32(height), inria_extent)
     block = block_of(count, size[0])[splat]
@@ -108,7 +108,7 @@ def tile_count(
 def tile_scatter(
     size: tuple[int, ...], tiles: int, room: np.ndarray, drafts: np.ndarray, offsets: np.ndarray, pairs: np.ndarray
 ) -> None:
-    """Writes (row, mask) tile by tile in depth order; `offsets` end up at each cell's end."""
+    """Write (row, mask) tile by tile in depth order; `offsets` become the ends of the cells."""
     row, tile, mask = drafts[_draft_places(room)].T
     order = np.argsort(tile, kind="stable")
     pairs[: len(order), 0] = row[order]
