@@ -1,7 +1,7 @@
 """All numbers that kernels, twins and formats share, each with its reason and origin.
 
-Every number is rounded to float32 once and printed into the OpenCL programs (`flexgs_edge.kernels.cl_sources`). A test reads
-the values back from the device.
+Every number is rounded to float32 once and printed into the OpenCL programs (`flexgs_edge.kernels.cl_sources`). A test
+reads the values back from the device.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Final
 TILE: Final = 16
 """Side of a tile in pixels, as in the reference rasteriser; a tile's list of splats then fits a core's L1 cache."""
 BLOCK: Final = 4
-"""Side of the 4x4 pixel blocks of a tile; a bit of a pair's 16-bit mask switches each block on or off. A vector of 16 lanes
-draws one block: small splats leave fewer lanes idle than rows of 16 pixels would."""
+"""Side of the 4x4 pixel blocks of a tile; a bit of a pair's 16-bit mask switches each block on or off. A vector of 16
+lanes draws one block: small splats leave fewer lanes idle than rows of 16 pixels would."""
 LANES: Final = 64
 """Planes on the device are padded to a multiple of this many elements. Vectors then never read past the end, and
 work-groups of 64 fit a GPU."""
@@ -25,14 +25,14 @@ DEFAULT_NEAR: Final = 0.2
 DILATION: Final = 0.3
 """Added to both diagonal terms of the 2D covariance, in px^2, so that no splat gets thinner than a pixel."""
 SHARE_MIN: Final = 1.0 / 255.0**2
-"""Smallest ratio det before / det after the dilation that can show: opacity is at most 1, and its factor is the square root.
-The reference program floors the factor at 0.005 instead. That leaves splats of opacity above 0.784 at alpha 0.0039 to
-0.005."""
+"""Smallest ratio det before / det after the dilation that can show: opacity is at most 1, and its factor is the square
+root. The reference program floors the factor at 0.005 instead. That leaves splats of opacity above 0.784 at alpha
+0.0039 to 0.005."""
 FACTOR_MIN: Final = 1e-30
 """Rows of a covariance's factor with a squared length (scene units^2) below this count as zero."""
 JACOBIAN_MARGIN: Final = 0.15
-"""The Jacobian is taken at a point clamped to the image plus this share of its width (height) on each side. For a centred
-principal point, that is 1.3 times the half field of view."""
+"""The Jacobian is taken at a point clamped to the image plus this share of its width (height) on each side. For a
+centred principal point, that is 1.3 times the half field of view."""
 SIGMA_RADIUS_INRIA: Final = 3.0
 """Sigmas of `--extent inria`: a splat reaches ceil(3 sigma), rounded out to whole tiles."""
 
@@ -53,8 +53,8 @@ LOG2_ALPHA_MAX: Final = -0.0144997
 
 # --- extents ----------------------------------------------------------------------------------
 EXTENT_SLACK: Final = 4e-6
-"""Added to the ellipse's level in log2 units. It covers the rounding of log2, exp2 and the exponent sum (each below 1e-6),
-so that no pixel with alpha >= 1/255 is left out."""
+"""Added to the ellipse's level in log2 units. It covers the rounding of log2, exp2 and the exponent sum (each below
+1e-6), so that no pixel with alpha >= 1/255 is left out."""
 SPAN_SLACK: Final = 2e-3
 """Pixels added to both ends of a block row's span: 16 ulp at pixel 2000."""
 SPAN_SLACK_RELATIVE: Final = 2e-6
@@ -131,14 +131,15 @@ DEQUANTIZE_ROWS: Final = 64
 # --- reductions -------------------------------------------------------------------------------
 FIXED_WEIGHT: Final = 2.0**32
 FIXED_ERROR: Final = 2.0**40
-"""Units of the 64-bit fixed-point sums over tiles and views, of weights and of squared errors. Any order of additions gives
-the same bits. The weight of a pixel is at most 1. Errors get finer units, since small splats decide what is pruned first."""
+"""Units of the 64-bit fixed-point sums over tiles and views, of weights and of squared errors. Any order of additions
+gives the same bits. The weight of a pixel is at most 1. Errors get finer units, since small splats decide what is
+pruned first."""
 FIXED_MOMENT: Final = 2.0**26
-"""Units of the gradient's moments about a splat's centre, in pixels and squared pixels. The sum wraps only beyond 1.3e11: a
-splat that fills an image of 2000 pixels a side, which lacks a tenth of its light everywhere."""
+"""Units of the gradient's moments about a splat's centre, in pixels and squared pixels. The sum wraps only beyond
+1.3e11: a splat that fills an image of 2000 pixels a side, which lacks a tenth of its light everywhere."""
 GRADIENT_MIN: Final = 1e-15
-"""Gradients and their running means below this count as zero. Squares of smaller ones are not normal numbers, and devices
-treat these differently."""
+"""Gradients and their running means below this count as zero. Squares of smaller ones are not normal numbers, and
+devices treat these differently."""
 FIXED_LARGEST: Final = 2.0**62
 """Values are clamped to this before they become integers: the sum of one view, or of all tiles of a view."""
 
@@ -177,8 +178,8 @@ VOLUME_POWER: Final = 0.1
 GROUP_ROWS: Final = 512
 """Rows of a quantization group. The paper's 1000 groups take 528 kB for any number of rows."""
 DEFAULT_BASE_PSNR: Final = 34.0
-"""Assumed PSNR in dB of a model against its photos, if there are none. It is cautious: most models have less, and lose less.
-A higher value can put the target out of reach, a lower one loses too much of a good model:
+"""Assumed PSNR in dB of a model against its photos, if there are none. It is cautious: most models have less, and lose
+less. A higher value can put the target out of reach, a lower one loses too much of a good model:
 docs/results/tuning.md#default_base_psnr"""
 DEFAULT_HOLDOUT: Final = 8
 """Every 8th view by name is held out, the field's convention since Mip-NeRF 360."""

@@ -43,8 +43,8 @@ def check_writable(path: str | os.PathLike[str], force: bool = False) -> Path:
 def atomic_write(path: str | os.PathLike[str], force: bool = False) -> Iterator[BinaryIO]:
     """Yield a binary file that gets the name `path` only if the block ends without an error.
 
-    The file can be read and seeked. After any error (Ctrl-C included), no partial file is left, and an earlier file of that
-    name stays as it was.
+    The file can be read and seeked. After any error (Ctrl-C included), no partial file is left, and an earlier file of
+    that name stays as it was.
 
     Parameters
     ----------
@@ -110,8 +110,8 @@ def check_folder(path: str | os.PathLike[str], force: bool = False) -> Path:
 def atomic_folder(path: str | os.PathLike[str], force: bool = False) -> Iterator[Path]:
     """Yield an empty folder; its files get to `path` only if the block ends without an error.
 
-    After any error (Ctrl-C included), nothing is left behind. A new `path` appears as a whole. If the folder exists (with
-    `force`, it may have contents), the finished files replace files of the same names, and all others stay.
+    After any error (Ctrl-C included), nothing is left behind. A new `path` appears as a whole. If the folder exists
+    (with `force`, it may have contents), the finished files replace files of the same names, and all others stay.
     """
     target = check_folder(path, force)
     # Inside a folder that exists, since its parent may not be writable, or may be on another disk.
@@ -146,7 +146,8 @@ def _merge(source: Path, target: Path) -> None:
 def temporary_name(output: Path, force: bool, word: str | None = None) -> Iterator[Path]:
     """Yield a name in a temporary folder beside `output`; the file there becomes `output` if the block ends without an error.
 
-    The folder is always removed. If `word` is given, the folder is named by it, and one left by a killed run is removed first.
+    The folder is always removed. If `word` is given, the folder is named by it, and one left by a killed run is removed
+    first.
     """
     target = check_writable(output, force)
     folder = target.with_name(f".flexgs-out-{word or secrets.token_hex(8)}")

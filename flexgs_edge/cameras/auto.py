@@ -1,10 +1,10 @@
 """Place cameras automatically around a scene that has none, so that the Gaussians are seen as in training.
 
-Two things in a trained scene tell where its cameras stood. SH above degree 0 start at zero and grow only along directions that
-cameras looked from. So view-dependent colour is strong towards the training cameras, and fades elsewhere. And cameras
-stood in the open, with matter in sight. Candidates form a lattice in and around the scene. A coarse grid of optical depth
-removes those in opaque matter. Then we pick views one by one for what they add. Objects get rings outside, and surroundings
-get views inside out.
+Two things in a trained scene tell where its cameras stood. SH above degree 0 start at zero and grow only along
+directions that cameras looked from. So view-dependent colour is strong towards the training cameras, and fades
+elsewhere. And cameras stood in the open, with matter in sight. Candidates form a lattice in and around the scene. A
+coarse grid of optical depth removes those in opaque matter. Then we pick views one by one for what they add. Objects
+get rings outside, and surroundings get views inside out.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ MARGIN = 1.2
 POSITIONS = 400
 """Number of best candidates from which views are made."""
 SHOWN_SHARE = {True: 0.5, False: 0.65}
-"""Places that show less than this share of the best place, in all directions together, are left out. Inside a room one sees
-all walls, from outside only half of them. If SH tell directions (True), they tell this too."""
+"""Places that show less than this share of the best place, in all directions together, are left out. Inside a room one
+sees all walls, from outside only half of them. If SH tell directions (True), they tell this too."""
 QUICK = 5
 """Every 5th witness judges all candidates, and all witnesses judge the better ones: faster, with the same views."""
 DIRECTIONS = 192
@@ -183,9 +183,9 @@ def _choose(
 def up_axis(places: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, str]:
     """The direction of up ([3] f64, a coordinate axis), and its name.
 
-    People walk around a scene more than they climb, and look down on it more than up. So up is y or z, whichever the places
-    ([n, 3]) and directions ([n, 3]) vary least along, and it points against the mean direction. If views are level, up is -y
-    or +z, by the conventions of COLMAP and NeRF.
+    People walk around a scene more than they climb, and look down on it more than up. So up is y or z, whichever the
+    places ([n, 3]) and directions ([n, 3]) vary least along, and it points against the mean direction. If views are
+    level, up is -y or +z, by the conventions of COLMAP and NeRF.
     """
     mean = directions.mean(axis=0)
     spread = places.std(axis=0) / max(float(places.std()), 1e-300) + 2 * mean * mean

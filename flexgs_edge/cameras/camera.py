@@ -32,7 +32,8 @@ class Camera:
     cx, cy : float
         Principal point, pixels, integer pixel centres: (W - 1) / 2 is the middle.
     distortion : str, optional
-        A lens distortion that was ignored. The pose serves for scores, but photos of this camera do not match its renders.
+        A lens distortion that was ignored. The pose serves for scores, but photos of this camera do not match its
+        renders.
     dilation : float
         Added to both diagonal terms of the 2D covariance, px^2.
     """
@@ -60,7 +61,8 @@ class Camera:
     @property
     def center(self) -> np.ndarray:
         """[3] f64, the camera's place in the world."""
-        # Not by the transpose: files keep rotations to six digits, which 1e6 units from the origin is an error of a unit.
+        # Not by the transpose: files keep rotations to six digits, which 1e6 units from the origin is an error of a
+        # unit.
         place: np.ndarray = np.linalg.solve(self.rotation, -self.translation)
         return place
 

@@ -1,7 +1,7 @@
 """Read transforms.json of NeRF and nerfstudio: poses camera to world in OpenGL's axes, and intrinsics.
 
-Poses are taken as they stand in the file. nerfstudio writes `dataparser_transforms.json` beside a trained model. If it is
-there, we move the poses into the frame of the training, which is also the frame of an exported PLY.
+Poses are taken as they stand in the file. nerfstudio writes `dataparser_transforms.json` beside a trained model. If it
+is there, we move the poses into the frame of the training, which is also the frame of an exported PLY.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def read_transforms(path: str | os.PathLike[str], ignore_distortion: bool = Fals
     """Read a transforms.json in the file's order.
 
     Names are the frames' `file_path`, without the folder that all of them share. Pixel centres of the file lie at
-    integer + 0.5, so half a pixel is subtracted from the principal point; by default it is the image's middle. If the size
-    is missing, it is taken from the frame's photo (`file_path` with or without extension).
+    integer + 0.5, so half a pixel is subtracted from the principal point; by default it is the image's middle. If the
+    size is missing, it is taken from the frame's photo (`file_path` with or without extension).
 
     Parameters
     ----------
@@ -52,7 +52,8 @@ def read_transforms(path: str | os.PathLike[str], ignore_distortion: bool = Fals
     Raises
     ------
     InputError
-        If the file cannot be read, a size is not found, or a lens is distorted; the message names commands that undistort.
+        If the file cannot be read, a size is not found, or a lens is distorted; the message names commands that
+        undistort.
     FormatError
         If the file breaks its format; the message names file, frame and key.
     """
@@ -109,7 +110,8 @@ class _Similarity:
         scale = entry.finite("scale", "a factor above 0")
         if scale <= 0:
             raise entry.fail("scale", "a factor above 0", f"{scale:g}")
-        # nerfstudio's `transform` and `scale` start at the frame of the original capture, but our poses come after `applied_*`.
+        # nerfstudio's `transform` and `scale` start at the frame of the original capture, but our poses come after
+        # `applied_*`.
         if top.has("applied_transform"):
             applied, moved = _rigid(top, "applied_transform")
             linear = linear @ applied.T

@@ -183,8 +183,9 @@ def _grid(
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """First corner, cell side, and optical depth of each cell along its side, with a rim of empty cells.
 
-    The matter of a splat is its opacity times its mean cross-section. If a splat is wider than a cell, its matter is spread
-    over points drawn from it, and cut if even these would fill more than a cell each. Each row stands for `share` rows.
+    The matter of a splat is its opacity times its mean cross-section. If a splat is wider than a cell, its matter is
+    spread over points drawn from it, and cut if even these would fill more than a cell each. Each row stands for
+    `share` rows.
     """
     means = sample["means"].astype(np.float64)
     low, high = np.quantile(means, BOX, axis=1)

@@ -1,7 +1,7 @@
 """The frame of `.fgs` files of both versions: a preamble, sections that end in a checksum, and chunks listed in a table.
 
-Every byte lies under a checksum, or has only one allowed value. We allocate nothing for sizes in a header before they agree
-with the size of the file.
+Every byte lies under a checksum, or has only one allowed value. We allocate nothing for sizes in a header before they
+agree with the size of the file.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Search one number, such as the prune rate, with few and costly measurements.
 
-A measurement takes seconds, and sizes are known only from finished files. We look for the place on a line where the excess
-turns positive. The excess is assumed to rise along the line, not quite smoothly. The answer is always a measured point.
+A measurement takes seconds, and sizes are known only from finished files. We look for the place on a line where the
+excess turns positive. The excess is assumed to rise along the line, not quite smoothly. The answer is always a measured
+point.
 """
 
 from __future__ import annotations
@@ -102,7 +103,8 @@ def search_line(
 def _weighed(steps: list[Step]) -> list[tuple[int, float]]:
     """(rate, excess) of the steps; after several on one side, the other side counts half for each beyond the first.
 
-    This is the Illinois rule. The log of a loss is curved, so that plain false position would approach the target slowly.
+    This is the Illinois rule. The log of a loss is curved, so that plain false position would approach the target
+    slowly.
     """
     side = steps[-1].holds
     streak = next((i for i, step in enumerate(reversed(steps)) if step.holds != side), len(steps))

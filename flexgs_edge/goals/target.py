@@ -1,7 +1,7 @@
 """Targets of a search: a largest loss of quality, or a largest size.
 
-A target gives each measured point its `excess`: by how much the point misses. Zero or less holds. The excess rises smoothly
-with compression, so that the search may interpolate in it.
+A target gives each measured point its `excess`: by how much the point misses. Zero or less holds. The excess rises
+smoothly with compression, so that the search may interpolate in it.
 """
 
 from __future__ import annotations

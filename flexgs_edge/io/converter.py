@@ -1,7 +1,7 @@
 """Run the converter package gaussforge (extra `[formats]`) in a child process.
 
-The converter is native code and holds whole files. The end of its process frees that memory, and a crash there becomes an
-error here.
+The converter is native code and holds whole files. The end of its process frees that memory, and a crash there becomes
+an error here.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ def check_converter(path: str | os.PathLike[str]) -> None:
 
 def convert(path: str | os.PathLike[str], source: Path, source_format: str, target: Path, target_format: str) -> None:
     """Convert a file; `path` is the user's file, named in messages."""
-    # Absolute paths, since a name with a leading dash is an option. We capture the output: the converter prints progress.
+    # Absolute paths, since a name with a leading dash is an option. We capture the output: the converter prints
+    # progress.
     command = [sys.executable, "-c", _CHILD, os.path.abspath(source), source_format, str(target), target_format]
     done = subprocess.run(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False

@@ -1,7 +1,7 @@
 """Read and write scenes in formats of other projects, through the converter package gaussforge (extra `[formats]`).
 
-The converter is native code and holds whole files, so it runs in a process of its own. The end of that process frees its
-memory, its output stays out of ours, and a crash becomes an ordinary error. The processes exchange an INRIA PLY.
+The converter is native code and holds whole files, so it runs in a process of its own. The end of that process frees
+its memory, its output stays out of ours, and a crash becomes an ordinary error. The processes exchange an INRIA PLY.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ OPACITY_LIMIT = 7.0
 def read_foreign(path: str | os.PathLike[str]) -> SceneSource:
     """Open a `.spz`, `.sog` or `.compressed.ply` scene.
 
-    The file is expanded into a temporary PLY of about 248 bytes a Gaussian, in the folder that TMPDIR names. The PLY lives as
-    long as the source. During expansion, the converter holds the whole scene in memory.
+    The file is expanded into a temporary PLY of about 248 bytes a Gaussian, in the folder that TMPDIR names. The PLY
+    lives as long as the source. During expansion, the converter holds the whole scene in memory.
 
     Raises
     ------
@@ -60,8 +60,8 @@ def read_foreign(path: str | os.PathLike[str]) -> SceneSource:
 def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: bool = False) -> tuple[str, ...]:
     """Write a scene as `.spz`, `.sog` or `.compressed.ply`, with the losses of that format.
 
-    This needs a temporary PLY of about 248 bytes a Gaussian beside the file. `.sog` clusters the SH, which takes about a
-    minute for 100 000 Gaussians.
+    This needs a temporary PLY of about 248 bytes a Gaussian beside the file. `.sog` clusters the SH, which takes about
+    a minute for 100 000 Gaussians.
 
     Returns
     -------
@@ -131,8 +131,8 @@ def near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
 def _sh_places(format: Format, degree: int) -> np.ndarray:
     """[3 K] i64, the place where each SH coefficient must stand so that the converter writes it to its right place.
 
-    Version 0.6.0 writes SH of `.compressed.ply` with red, green, blue by turns, but all versions read them channel by channel.
-    To find out, we convert one Gaussian with a ramp of coefficients there and back.
+    Version 0.6.0 writes SH of `.compressed.ply` with red, green, blue by turns, but all versions read them channel by
+    channel. To find out, we convert one Gaussian with a ramp of coefficients there and back.
     """
     width = FIELD["sh_rest"].width(degree)
     planes = {field.name: np.zeros((field.width(degree), 1), np.float32) for field in FIELDS}
@@ -163,8 +163,8 @@ class _WrappedSource(SceneSource):
 class _WorldSource(_WrappedSource):
     """A scene as the converter needs it: world positions in float32, and unit quaternions.
 
-    The other formats have no digits for an origin. The converter does not normalise quaternions, and `.sog` files would get
-    wrong rotations.
+    The other formats have no digits for an origin. The converter does not normalise quaternions, and `.sog` files would
+    get wrong rotations.
     """
 
     def __init__(self, parent: SceneSource) -> None:

@@ -24,8 +24,8 @@ class Format:
     max_degree : int
         Highest SH degree.
     sorted : bool
-        Rows must come in an order in which neighbours are near each other: 256 rows share a range, and the converter does
-        not sort. Unsorted positions would be several times worse.
+        Rows must come in an order in which neighbours are near each other: 256 rows share a range, and the converter
+        does not sort. Unsorted positions would be several times worse.
     shuffled : bool
         The converter sorts rows by itself.
     probed : bool

@@ -29,17 +29,17 @@ _GAP = 64
 _ORIGIN_ROWS = 65536
 _ORIGIN_QUANTILES = (0.05, 0.95)
 _ORIGIN_FAR = 16.0
-"""Scenes nearer to zero than so many extents keep origin 0: their numbers stay exact, and they can be written as INRIA's
-float properties (many viewers cannot read double). At this distance, float32 has lost 4 of its 24 bits."""
+"""Scenes nearer to zero than so many extents keep origin 0: their numbers stay exact, and they can be written as
+INRIA's float properties (many viewers cannot read double). At this distance, float32 has lost 4 of its 24 bits."""
 
 
 class PlySource(SceneSource):
     """A PLY in INRIA's layout: any property order, byte order and float width; SH degree 0 to 4.
 
-    Binary files are read by row ranges. plyfile loads ascii files as a whole, and also files with lists in or before the
-    vertices. `choose_origin` takes the origin from a sample of the positions. We subtract it in float64, before positions are
-    rounded to float32. Mip-Splatting's `filter_3D` is applied to scales and opacities; `settings` then name the model as
-    antialiased.
+    Binary files are read by row ranges. plyfile loads ascii files as a whole, and also files with lists in or before
+    the vertices. `choose_origin` takes the origin from a sample of the positions. We subtract it in float64, before
+    positions are rounded to float32. Mip-Splatting's `filter_3D` is applied to scales and opacities; `settings` then
+    name the model as antialiased.
 
     Parameters
     ----------
@@ -51,7 +51,8 @@ class PlySource(SceneSource):
     InputError
         If the file cannot be read.
     FormatError
-        If it breaks the format or is not a Gaussian scene; the message names the header line, the property or the bytes.
+        If it breaks the format or is not a Gaussian scene; the message names the header line, the property or the
+        bytes.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -71,7 +72,7 @@ class PlySource(SceneSource):
             raise InputError(f"{path}: cannot read the scene ({error.strerror})") from error
         self.count = header.vertex.count
         self.sh_count = self.count if self.sh_degree else 0
-        self.origin = np.zeros(3)  # for the sample, which needs world positions
+        self.origin = np.zeros(3)  # the positions of the sample are relative to the world
         self.origin = choose_origin(self._sample())
 
     def _sample(self) -> np.ndarray:
@@ -120,9 +121,9 @@ def _smooth(block: np.ndarray) -> dict[str, np.ndarray]:
 def choose_origin(positions: np.ndarray) -> np.ndarray:
     """Choose an origin for positions, so that float32 keeps their digits.
 
-    Per axis, the 5 % and 95 % quantiles of the finite positions give a centre and an extent. The grid is the largest extent,
-    rounded up to a power of two (1 if there is none). The origin is the grid point nearest to the centre. It is 0 if the
-    centre is within 16 grid steps of zero on every axis: such scenes lose too little to be moved.
+    Per axis, the 5 % and 95 % quantiles of the finite positions give a centre and an extent. The grid is the largest
+    extent, rounded up to a power of two (1 if there is none). The origin is the grid point nearest to the centre. It is
+    0 if the centre is within 16 grid steps of zero on every axis: such scenes lose too little to be moved.
 
     Parameters
     ----------
@@ -200,7 +201,8 @@ class _FileRows:
         low, high = int(rows.min()), int(rows.max())
         if high - low < len(block):
             return _gather(self._range(file, low, block[: high - low + 1]), rows - low)
-        # Rows far apart. Wanted rows close together are read with the rows between; if none lie between, straight to their place.
+        # Rows far apart. Wanted rows close together are read with the rows between; if none lie between, straight to
+        # their place.
         found, space = block[: len(rows)], block[len(rows) :]
         breaks = np.diff(rows, prepend=rows[0] - 2 * _GAP)
         starts = np.flatnonzero((breaks < 1) | (breaks > _GAP))
@@ -244,7 +246,8 @@ def _stamp(file: BinaryIO) -> tuple[int, int, int]:
 class _HeaderThenData:
     """The stream that plyfile reads: our own header (plyfile refuses UTF-8 comments), then the data, as text for ascii files.
 
-    A plain byte stream would not do for ascii: plyfile wraps it and reads ahead, so that the bytes left could not be checked.
+    A plain byte stream would not do for ascii: plyfile wraps it and reads ahead, so that the bytes left could not be
+    checked.
     """
 
     def __init__(self, header: PlyHeader, file: BinaryIO) -> None:
@@ -286,8 +289,8 @@ def write_ply(
 ) -> tuple[str, ...]:
     """Write a scene in INRIA's layout: x y z, nx ny nz (zeros), f_dc, f_rest, opacity, scale, rot; little endian.
 
-    Properties are `float`. Positions are world positions. If the origin is not zero, they are `double`, since float32 would
-    lose the digits that the origin kept. The source's `comments` are written to the header.
+    Properties are `float`. Positions are world positions. If the origin is not zero, they are `double`, since float32
+    would lose the digits that the origin kept. The source's `comments` are written to the header.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Write the SH of `.spz` files again, with a finer step than the converter's.
 
-The format stores each coefficient as a byte, (code - 128) / 128, and leaves the rounding to the writer. The converter keeps 5
-bits of degree 1 and 4 bits of the others, which causes nearly all of the loss. SH come last in the stream, so we copy the
-stream and replace them. Layout: magic, version, count, SH degree, 12 bits behind the point, flags and a zero (16 bytes); then
-arrays with these bytes a Gaussian: positions 9, opacity 1, colour 3, scales 3, rotation 3 (version 2) or 4 (version 3), and
-SH by Gaussian, coefficient, channel. All of it is one gzip stream.
+The format stores each coefficient as a byte, (code - 128) / 128, and leaves the rounding to the writer. The converter
+keeps 5 bits of degree 1 and 4 bits of the others, which causes nearly all of the loss. SH come last in the stream, so
+we copy the stream and replace them. Layout: magic, version, count, SH degree, 12 bits behind the point, flags and a
+zero (16 bytes); then arrays with these bytes a Gaussian: positions 9, opacity 1, colour 3, scales 3, rotation 3
+(version 2) or 4 (version 3), and SH by Gaussian, coefficient, channel. All of it is one gzip stream.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.scene.source import SceneSource
 
 SH_STEP = 8
-"""Step of the codes, in units of 1/128: half of the converter's own step above degree 1. A smaller step costs more bytes
-than it is worth: docs/results/tuning.md#sh_step"""
+"""Step of the codes, in units of 1/128: half of the converter's own step above degree 1. A smaller step costs more
+bytes than it is worth: docs/results/tuning.md#sh_step"""
 CONVERTER_STEP = 16
 _HEADER = struct.Struct("<IIIBBBB")
 _MAGIC = 0x5053474E

@@ -118,8 +118,8 @@ class Backend(Protocol):
     def mapped(self, array: Any) -> AbstractContextManager[np.ndarray]:
         """Write to an array on the host, without a copy if the device shares the host's memory. The array may not be empty.
 
-        The old values may be lost, and the device gets the new ones at the end. This does not wait for kernels, so none may
-        use the array.
+        The old values may be lost, and the device gets the new ones at the end. This does not wait for kernels, so none
+        may use the array.
         """
 
     def mark(self) -> Callable[[], None]:

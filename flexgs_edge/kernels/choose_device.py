@@ -19,8 +19,8 @@ HINT = (
     "`--device numpy` (same results, far slower)"
 )
 
-# Fused and separate multiply-add on vectors of 16. It catches runtimes that cannot build for this processor (PoCL's wheels on
-# CPUs newer than their compiler), that fuse operations they must not fuse, or that miss lanes.
+# Fused and separate multiply-add on vectors of 16. It catches runtimes that cannot build for this processor (PoCL's
+# wheels on CPUs newer than their compiler), that fuse operations they must not fuse, or that miss lanes.
 _SELF_TEST = """
 #pragma OPENCL FP_CONTRACT OFF
 __kernel void self_test(__global const float *a, __global const float *b, __global float *out) {
@@ -167,8 +167,8 @@ def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceIn
     Parameters
     ----------
     spec : str or None
-        An index, `cpu`, `gpu`, or a part of the name of a device or platform. None, the default, takes the first GPU that
-        passed the self-test, else PoCL's CPU device, else any other CPU device.
+        An index, `cpu`, `gpu`, or a part of the name of a device or platform. None, the default, takes the first GPU
+        that passed the self-test, else PoCL's CPU device, else any other CPU device.
 
     Raises
     ------

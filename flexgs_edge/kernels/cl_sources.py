@@ -31,8 +31,8 @@ docs/results/tuning.md#programs"""
 def kernel_dir() -> Path:
     """The folder of the `.cl` files.
 
-    The order is: the folder that FLEXGS_KERNEL_DIR names; `cl_kernels` inside the installed package (a wheel puts it there);
-    `cl_kernels` beside the package (a checkout, an unpacked sdist, an editable install).
+    The order is: the folder that FLEXGS_KERNEL_DIR names; `cl_kernels` inside the installed package (a wheel puts it
+    there); `cl_kernels` beside the package (a checkout, an unpacked sdist, an editable install).
 
     Raises
     ------

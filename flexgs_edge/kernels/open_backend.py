@@ -12,8 +12,8 @@ def open_backend(device: str | None, budget: MemoryBudget) -> Backend:
     Parameters
     ----------
     device : str or None
-        `numpy` for the twins, else an OpenCL device as in `flexgs_edge.kernels.choose_device.choose_device`. We never fall
-        back from one to the other silently.
+        `numpy` for the twins, else an OpenCL device as in `flexgs_edge.kernels.choose_device.choose_device`. We never
+        fall back from one to the other silently.
     budget : MemoryBudget
         Counts every array of the backend.
 

@@ -34,7 +34,8 @@ class OpenCLBackend:
     width : int, optional
         Lanes of a vector: 16, 8, 4 or 1. By default, the device's native width on CPUs, and 1 on GPUs.
     form : {"cpu", "gpu"}, optional
-        Form of the blend kernel: one work-item a tile, or one work-group a tile. By default, it follows the device's type.
+        Form of the blend kernel: one work-item a tile, or one work-group a tile. By default, it follows the device's
+        type.
     """
 
     is_numpy = False

@@ -1,8 +1,8 @@
 """Read scratch files past the kernel's page cache (O_DIRECT), if the cache does not hold the pages already.
 
-Under a memory cap, each page read through the cache counts against the cap, evicts another page and is copied. If we read
-more in turn than fits, pages are evicted before we need them again. A read past the cache leaves cached pages alone:
-docs/results/tuning.md#disks
+Under a memory cap, each page read through the cache counts against the cap, evicts another page and is copied. If we
+read more in turn than fits, pages are evicted before we need them again. A read past the cache leaves cached pages
+alone: docs/results/tuning.md#disks
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import BinaryIO
 import numpy as np
 
 BUFFER_BYTES = 1 << 21
-"""Bytes of the buffer of each thread that reads past the cache: one huge page. Disks fill scattered small pages more slowly:
-docs/results/tuning.md#disks"""
+"""Bytes of the buffer of each thread that reads past the cache: one huge page. Disks fill scattered small pages more
+slowly: docs/results/tuning.md#disks"""
 _HELD = threading.local()
 
 
@@ -71,7 +71,8 @@ def _buffer() -> memoryview:
 def is_cached(address: int, size: int) -> bool:
     """Whether the page cache seems to hold `size` bytes of a file mapped at `address`; True if the system does not tell.
 
-    We ask for the first and the last page only, since neighbours come and go together. A wrong answer costs time, no data.
+    We ask for the first and the last page only, since neighbours come and go together. A wrong answer costs time, no
+    data.
     """
     library = _library()
     if library is None:

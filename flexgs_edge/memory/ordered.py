@@ -13,8 +13,8 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 class OrderedPlanes:
     """Columns of planes in another order, read in parts.
 
-    Planes in memory are indexed when they are read. Planes in files are reordered first, one by one; otherwise every part
-    would read pages all over every plane.
+    Planes in memory are indexed when they are read. Planes in files are reordered first, one by one; otherwise every
+    part would read pages all over every plane.
 
     Parameters
     ----------
@@ -52,8 +52,8 @@ class OrderedPlanes:
 def stable_order(keys: np.ndarray, storage: Storage = IN_MEMORY, rows: int = 1 << 22) -> np.ndarray:
     """Argsort as `np.argsort(keys, kind="stable")`, with about `rows` keys in memory at a time.
 
-    We split the keys by value into parts of about equal size, estimated from a sample, and sort one part after the other.
-    Equal keys always fall into one part.
+    We split the keys by value into parts of about equal size, estimated from a sample, and sort one part after the
+    other. Equal keys always fall into one part.
 
     Returns
     -------

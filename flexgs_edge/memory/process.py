@@ -72,7 +72,8 @@ class AnonymousPeak:
 def available_memory(proc: str | Path = "/proc", groups: str | Path = "/sys/fs/cgroup") -> int:
     """Memory that this process can still get, in bytes; 1 GiB if the system does not tell.
 
-    A limit of a control group (a container, a service) counts too: beyond it the kernel kills the process, with no error.
+    A limit of a control group (a container, a service) counts too: beyond it the kernel kills the process, with no
+    error.
     """
     free = 2**30
     with suppress(OSError):
@@ -110,9 +111,9 @@ def _left_in_groups(proc: Path, groups: Path) -> Iterator[int]:
 def return_freed_memory() -> None:
     """Make glibc return large freed arrays to the system; does nothing with another C library.
 
-    By default, each freed mapped array raises the size from which glibc maps (up to 32 MiB). Then arrays of several threads
-    leave holes in heaps, and the peak rises. Lower limits than ours cost time: the kernel clears each page that is mapped
-    again. Call this before any large allocation: docs/results/tuning.md#memory
+    By default, each freed mapped array raises the size from which glibc maps (up to 32 MiB). Then arrays of several
+    threads leave holes in heaps, and the peak rises. Lower limits than ours cost time: the kernel clears each page that
+    is mapped again. Call this before any large allocation: docs/results/tuning.md#memory
     """
     with suppress(OSError, AttributeError):
         mallopt = ctypes.CDLL(None).mallopt

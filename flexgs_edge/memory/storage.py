@@ -20,8 +20,8 @@ from flexgs_edge.units import format_size
 _SMALL = 1 << 16
 """Arrays smaller than so many bytes always stay in memory; a file for each would cost more than it saves."""
 WHOLE_BYTES = 1 << 26
-"""Least size of a plane, in bytes, that may be read as a whole to take rows in any order. Otherwise each row would be a read
-of its own: docs/results/tuning.md#disks"""
+"""Least size of a plane, in bytes, that may be read as a whole to take rows in any order. Otherwise each row would be a
+read of its own: docs/results/tuning.md#disks"""
 WHOLE_SHARE = 16
 """Such a plane may be as large as this part of the limit (one in 16), if that is more."""
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -83,8 +83,8 @@ IN_MEMORY = Storage()
 class ScratchStorage(Storage):
     """Allocates arrays in mapped files of a folder.
 
-    The files have no names, so their disk space is free again however the process ends. Their blocks are reserved before use,
-    so that a full disk raises an error instead of a signal in the middle of a copy.
+    The files have no names, so their disk space is free again however the process ends. Their blocks are reserved
+    before use, so that a full disk raises an error instead of a signal in the middle of a copy.
 
     Parameters
     ----------
@@ -96,7 +96,8 @@ class ScratchStorage(Storage):
     Raises
     ------
     InputError
-        If the folder does not exist, cannot be written to, or lies in memory (a tmpfs would take the memory it should save).
+        If the folder does not exist, cannot be written to, or lies in memory (a tmpfs would take the memory it should
+        save).
     """
 
     spills = True
@@ -146,8 +147,8 @@ class ScratchStorage(Storage):
         held.storage, held.file = self, file
         self.count(size)
         if hasattr(mmap, "MADV_RANDOM"):
-            # The kernel may read ahead in an array with one plane. With several planes, a part of the rows is a piece of
-            # each plane, and reading ahead would read the file many times over. `fetch` asks for the pieces instead:
+            # The kernel may read ahead in an array with one plane. With several planes, a part of the rows is a piece
+            # of each plane, and reading ahead would read the file many times over. `fetch` asks for the pieces instead:
             # docs/results/tuning.md#disks
             held.madvise(mmap.MADV_SEQUENTIAL if len(shape) == 1 else mmap.MADV_RANDOM)
         values = np.frombuffer(held, dtype).reshape(shape)

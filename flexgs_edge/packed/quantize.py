@@ -4,8 +4,8 @@ Source: FlexGaussian (ACM MM 2025), section on MPQ. For a group with smallest va
 
     step = (hi - lo) / (2^bits - 1)        code = rint((x - lo) / step), clipped        x' = lo + code * step
 
-All numbers are stored and computed in float32. x' takes one multiplication and one addition that are never fused, so that
-every device gives the same bits.
+All numbers are stored and computed in float32. x' takes one multiplication and one addition that are never fused, so
+that every device gives the same bits.
 """
 
 from __future__ import annotations
@@ -208,8 +208,8 @@ def dequantize_part(array: QuantizedArray, first: int, rows: slice, out: np.ndar
 def largest_error(array: QuantizedArray) -> np.ndarray:
     """Bound on the error |x' - x| of the quantizer, per channel and group.
 
-    It is half a step, plus the float32 roundings of the step (times the largest code), of (x - lo) / step, of code * step
-    and of the sum. Each rounding is at most 2^-24 of the largest number in it.
+    It is half a step, plus the float32 roundings of the step (times the largest code), of (x - lo) / step, of code *
+    step and of the sum. Each rounding is at most 2^-24 of the largest number in it.
 
     Returns
     -------
@@ -292,8 +292,8 @@ def _quantize_stream(
 ) -> dict[str, QuantizedArray]:
     """Quantize the rows that `read` gives, in runs of whole groups of at most `chunk_rows` rows.
 
-    A larger group is read twice, in pieces: once for its range, once for its codes. `layouts` has the channels and bits of
-    every field.
+    A larger group is read twice, in pieces: once for its range, once for its codes. `layouts` has the channels and bits
+    of every field.
     """
     arrays = {name: _empty_array(rows, channels, bits, groups) for name, (channels, bits) in layouts.items()}
     names = [name for name, array in arrays.items() if array.channels]

@@ -1,7 +1,7 @@
 """Mean squared error (MSE) of images, and the decibels from it: PSNR, drop, fidelity and modelled drop.
 
-Images are clamped to [0, 1] and compared as floats, over all pixels and channels. Identical images have no PSNR: it is `None`
-here and null in JSON, never infinity.
+Images are clamped to [0, 1] and compared as floats, over all pixels and channels. Identical images have no PSNR: it is
+`None` here and null in JSON, never infinity.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
 
 ROWS, BANDS = 128, 2
-"""Image rows of one step of the squared error, and steps that run in parallel. They bound the f64 copies to a few MB for
-pictures of any height."""
+"""Image rows of one step of the squared error, and steps that run in parallel. They bound the f64 copies to a few MB
+for pictures of any height."""
 MSE_FLOOR = 1e-12
 """Smallest MSE in a difference of two PSNRs; smaller ones (120 dB) are beyond the precision of float32 renders."""
 

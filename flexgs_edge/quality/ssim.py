@@ -25,8 +25,8 @@ def ssim_bytes(width: int, height: int) -> int:
 def ssims(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
     """SSIM of pairs of images of one size, mean over pixels and channels (Wang et al. 2004).
 
-    It takes a Gaussian window of sigma 1.5, population covariance, a data range of 1, and only windows inside the image.
-    scikit-image gives the same with `gaussian_weights=True, use_sample_covariance=False, data_range=1`.
+    It takes a Gaussian window of sigma 1.5, population covariance, a data range of 1, and only windows inside the
+    image. scikit-image gives the same with `gaussian_weights=True, use_sample_covariance=False, data_range=1`.
 
     Parameters
     ----------

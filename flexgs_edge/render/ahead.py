@@ -1,7 +1,7 @@
 """Project the next views together with the current one, so that a streamed scene is read once for several views.
 
-A scene in scratch files costs a read per view. Here each chunk that is read is also projected for the views that come next.
-Their splats wait in a scratch file: 76 bytes a splat, where reading a row again takes 236 (at SH degree 3).
+A scene in scratch files costs a read per view. Here each chunk that is read is also projected for the views that come
+next. Their splats wait in a scratch file: 76 bytes a splat, where reading a row again takes 236 (at SH degree 3).
 Reading again would also cost that much for every row that the view does not show.
 """
 

@@ -1,8 +1,8 @@
 """Bounds of a chunk, to skip chunks that a view cannot see: a box around its means, and how far its splats reach.
 
-A chunk may be skipped only if `project` would cull each of its rows. A splat reaches at most s f sqrt(1 + u^2) / z pixels for
-its largest standard deviation s, plus the dilation. Multiplied by z, each side of the picture becomes a half-space in scene
-units. A linear function is largest at a corner of the box, so the corners decide.
+A chunk may be skipped only if `project` would cull each of its rows. A splat reaches at most s f sqrt(1 + u^2) / z
+pixels for its largest standard deviation s, plus the dilation. Multiplied by z, each side of the picture becomes a
+half-space in scene units. A linear function is largest at a corner of the box, so the corners decide.
 """
 
 from __future__ import annotations

@@ -253,8 +253,8 @@ class DeviceScene:
     def chunks(self, wanted: Callable[[ChunkBounds], bool] | None = None) -> Iterator[Chunk]:
         """Yield the chunks in row order; a streamed chunk is valid until the next one is asked for.
 
-        A streamed chunk loads while the one before it is drawn. If its bounds are known and not `wanted`, it is skipped and
-        not read.
+        A streamed chunk loads while the one before it is drawn. If its bounds are known and not `wanted`, it is skipped
+        and not read.
         """
         if not self.resident and not self._streamed:
             self._decide()

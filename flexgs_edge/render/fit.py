@@ -54,7 +54,8 @@ class Fit:
     first_share : int
         A compact view first gets room for one in so many of the scene's rows.
     spare_share : int
-        Chunks of a compact scene stay on the backend only if one in so many bytes of the limit is free. At 1, none stays.
+        Chunks of a compact scene stay on the backend only if one in so many bytes of the limit is free. At 1, none
+        stays.
     ahead : int
         Views that are projected together with the current one.
     resident : bool

@@ -69,7 +69,8 @@ class Renderer:
         Pixels that a splat may reach: the ellipse of alpha >= 1/255 (default), or the tiles of ceil(3 sigma) that the
         reference rasteriser uses.
     antialiased : bool
-        Multiply opacities by sqrt(det before / det after) of the 2D covariance's dilation. Set it if the model was trained so.
+        Multiply opacities by sqrt(det before / det after) of the 2D covariance's dilation. Set it if the model was
+        trained so.
     fit : Fit, optional
         How scenes and views share memory.
 
@@ -230,7 +231,8 @@ class Renderer:
         Returns
         -------
         array of the backend
-            [N, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums are drawn.
+            [N, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums are
+            drawn.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
@@ -242,15 +244,15 @@ class Renderer:
     def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
         """Gradients of the squared error of one view against `target`, for each splat, summed over pixels.
 
-        Let r be the residual (target minus view), and e the light that a splat adds when its alpha grows by its own size.
-        The sums are sum(alpha T r) for red, green, blue, then sum(r e), then its moments about the splat's centre:
-        x, y, xx, xy, yy.
+        Let r be the residual (target minus view), and e the light that a splat adds when its alpha grows by its own
+        size. The sums are sum(alpha T r) for red, green, blue, then sum(r e), then its moments about the splat's
+        centre: x, y, xx, xy, yy.
 
         Returns
         -------
         array of the backend
-            [N, 9, 2] u32, low and high words in units of 1 / `FIXED_WEIGHT`, the moments in units of 1 / `FIXED_MOMENT`;
-            valid until the next sums are drawn.
+            [N, 9, 2] u32, low and high words in units of 1 / `FIXED_WEIGHT`, the moments in units of 1 /
+            `FIXED_MOMENT`; valid until the next sums are drawn.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
@@ -320,8 +322,8 @@ class Renderer:
     ) -> tuple[ViewBuffers, np.ndarray]:
         """Project and keep only the splats that the view shows, in row order, so that the image has the same bits.
 
-        If the view shows more splats than its buffers hold, they are allocated anew. Their size comes from the count, or from
-        an estimate by the part of the scene that was projected.
+        If the view shows more splats than its buffers hold, they are allocated anew. Their size comes from the count,
+        or from an estimate by the part of the scene that was projected.
         """
         while True:
             count, seen, rows = self._ahead.fill(scene, camera, buffers, self.storage, self.near, self.inria_extent)

@@ -18,8 +18,8 @@ class Statistics:
     hits : np.ndarray
         [N] i64, pixels that the Gaussian was blended into.
     weights : np.ndarray
-        [N] u64, sum of alpha T over pixels, in fixed point with units of 1 / `FIXED_WEIGHT`. Integers add exactly, so any
-        order of views, chunks and workers gives the same bits.
+        [N] u64, sum of alpha T over pixels, in fixed point with units of 1 / `FIXED_WEIGHT`. Integers add exactly, so
+        any order of views, chunks and workers gives the same bits.
     """
 
     hits: np.ndarray

@@ -52,8 +52,8 @@ class ViewBuffers:
         self._targets: tuple[Any, Any] | None = None
         shapes = view_shapes(self.size, count)
         size = shapes_bytes(shapes)
-        # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the sums
-        # need is checked here too, so that one error message names a limit that is large enough.
+        # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the
+        # sums need is checked here too, so that one error message names a limit that is large enough.
         later = (
             PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + scene.targets * target_bytes(self.size)
         )

@@ -36,8 +36,8 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
     """Check every value of a scene, one chunk at a time.
 
     A row is invalid if a field has NaN or infinity, if an SH coefficient is beyond `SH_LARGEST`, or if the norm of its
-    quaternion is zero or outside what float32 can normalise. Log-scales of -inf (flat splats) are valid: they are read as the
-    smallest finite log-scale of the scene.
+    quaternion is zero or outside what float32 can normalise. Log-scales of -inf (flat splats) are valid: they are read
+    as the smallest finite log-scale of the scene.
 
     Parameters
     ----------

@@ -12,13 +12,13 @@ from flexgs_edge.scene.rotations import turned
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
 OFFSET = 0.4
-"""Distance of each half from the centre along the longest axis, in standard deviations. Nearer halves look more like the
-whole, but overlap so much that they hardly count as two: docs/results/tuning.md#offset"""
+"""Distance of each half from the centre along the longest axis, in standard deviations. Nearer halves look more like
+the whole, but overlap so much that they hardly count as two: docs/results/tuning.md#offset"""
 ALONG = (1.0 - OFFSET**2) ** 0.5
 """Factor on the longest standard deviation: the pair of halves keeps the variance along that axis."""
 ACROSS = 1.04
-"""Factor on the two other standard deviations. Renderers skip alphas below 1/255, which cuts more off fainter Gaussians; a
-little more width makes up for it: docs/results/tuning.md#across"""
+"""Factor on the two other standard deviations. Renderers skip alphas below 1/255, which cuts more off fainter
+Gaussians; a little more width makes up for it: docs/results/tuning.md#across"""
 CENTRE = 0.1
 """Weight of the opacity that keeps the light through the middle; the rest of the weight keeps the sum of alphas:
 docs/results/tuning.md#centre"""
@@ -34,10 +34,10 @@ _OVERLAP = float(np.exp(-(OFFSET**2) / (2 * ALONG**2)))
 def half_logits(logits: np.ndarray) -> np.ndarray:
     """Logits of the opacity of each half, given the logits of whole Gaussians.
 
-    We mix two rules, since neither is enough. Let a be the opacity of the whole and h that of a half, of which the share
-    `_OVERLAP` reaches the middle. The pair lets the same light through the middle if (1 - h overlap)^2 = 1 - a. But for an
-    opaque whole, this pair is too dense everywhere else. For faint Gaussians alphas simply add: their sum along the axis
-    stays if h = a / (2 ALONG).
+    We mix two rules, since neither is enough. Let a be the opacity of the whole and h that of a half, of which the
+    share `_OVERLAP` reaches the middle. The pair lets the same light through the middle if (1 - h overlap)^2 = 1 - a.
+    But for an opaque whole, this pair is too dense everywhere else. For faint Gaussians alphas simply add: their sum
+    along the axis stays if h = a / (2 ALONG).
 
     Parameters
     ----------
@@ -64,9 +64,10 @@ def half_logits(logits: np.ndarray) -> np.ndarray:
 class PartsSource(SceneSource):
     """`count` Gaussians, made by splitting and tiling those of `parent`.
 
-    Gaussian g of tile t is the virtual row v = t * parent.count + g, of V in all. The rows are dealt out evenly: the parts of
-    v begin at row floor((v * count + phase) / V). So the number of a row tells all about it, and any range in any order has
-    the same bits. A Gaussian becomes k parts by halving: its first half becomes ceil(k / 2) parts, its second the rest.
+    Gaussian g of tile t is the virtual row v = t * parent.count + g, of V in all. The rows are dealt out evenly: the
+    parts of v begin at row floor((v * count + phase) / V). So the number of a row tells all about it, and any range in
+    any order has the same bits. A Gaussian becomes k parts by halving: its first half becomes ceil(k / 2) parts, its
+    second the rest.
 
     Parameters
     ----------

@@ -10,9 +10,9 @@ from flexgs_edge.errors import InputError
 def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Permute and reverse the axes of Gaussians so that each rotation is as small as it can be; covariances stay the same.
 
-    The form changes from q to q p, where p is one of the 24 rotations of the cube, and the scales follow. The largest |w|
-    among the 24 forms is the largest of three numbers: the largest component, the sum of the two largest over sqrt(2), and
-    the sum of all four over 2. We use float64, basic operations and sqrt only.
+    The form changes from q to q p, where p is one of the 24 rotations of the cube, and the scales follow. The largest
+    |w| among the 24 forms is the largest of three numbers: the largest component, the sum of the two largest over
+    sqrt(2), and the sum of all four over 2. We use float64, basic operations and sqrt only.
 
     Parameters
     ----------

@@ -97,8 +97,8 @@ class SceneSource(ABC):
         Returns
         -------
         np.ndarray
-            [n, columns] f32, C-contiguous, valid until the next call: means, three zeros (normals), the other fields in the
-            order of `FIELDS`. It is the first rows of `out`, or an array of the source.
+            [n, columns] f32, C-contiguous, valid until the next call: means, three zeros (normals), the other fields in
+            the order of `FIELDS`. It is the first rows of `out`, or an array of the source.
         """
         planes = self.read(rows, [field.name for field in FIELDS])
         part = out[: rows.stop - rows.start]

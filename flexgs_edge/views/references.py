@@ -24,8 +24,8 @@ def to_half(values: np.ndarray) -> np.ndarray:
 class References:
     """Renders of one scene from some cameras, in the layout that `Renderer.residual_sums` takes.
 
-    Half precision (11 bits) is finer than the 8 bits that viewers show. We read the file with plain reads, since the pages of
-    a mapped file would count as memory of the process.
+    Half precision (11 bits) is finer than the 8 bits that viewers show. We read the file with plain reads, since the
+    pages of a mapped file would count as memory of the process.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Sums over views for each Gaussian, added up in memory if it has room, else through a scratch file.
 
-In memory, each view is added to the sums of all chunks as soon as it is drawn. If they do not fit, we write each view's sums
-to a file: only rows with a sum other than zero, at most 52 bytes each. Later we read the file chunk by chunk, and hold the
-sums of one chunk at a time. Both ways add the same numbers in the same order.
+In memory, each view is added to the sums of all chunks as soon as it is drawn. If they do not fit, we write each view's
+sums to a file: only rows with a sum other than zero, at most 52 bytes each. Later we read the file chunk by chunk, and
+hold the sums of one chunk at a time. Both ways add the same numbers in the same order.
 """
 
 from __future__ import annotations

@@ -198,7 +198,7 @@ def test_no_folder(tmp_path: Path) -> None:
 
 def test_a_folder_in_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(storage_module, "file_system_of", lambda folder: "tmpfs")
-    with pytest.raises(InputError, match="lies in memory itself"):
+    with pytest.raises(InputError, match="which lies in memory"):
         ScratchStorage(tmp_path)
 
 

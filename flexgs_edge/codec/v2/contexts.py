@@ -1,9 +1,9 @@
 """Predict a row from rows decoded before: its neighbours on the Morton curve, and its own earlier channels.
 
-Rows are coded in dyadic passes: first the multiples of 2^top, then the odd multiples of 2^(top-1), and so on. Each row of a
-pass thus has decoded rows on both sides, and each pass is one vector operation. All numbers are integers that float32
-(features of one row) or float64 (weighted sums) hold exactly, so that all decoders agree to the bit. Neighbour weights are
-computed by single float32 operations in a fixed order.
+Rows are coded in dyadic passes: first the multiples of 2^top, then the odd multiples of 2^(top-1), and so on. Each row
+of a pass thus has decoded rows on both sides, and each pass is one vector operation. All numbers are integers that
+float32 (features of one row) or float64 (weighted sums) hold exactly, so that all decoders agree to the bit. Neighbour
+weights are computed by single float32 operations in a fixed order.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from flexgs_edge.codec.v2.features import Features
 from flexgs_edge.constants import COARSE_ROWS, VALUE_LIMIT
 
 REACH = (4, 2)
-"""Neighbours on each side: for base channels, then for SH. SH have many channels, so they take fewer neighbours, which saves
-time and costs few bits: docs/results/tuning.md#codec"""
+"""Neighbours on each side: for base channels, then for SH. SH have many channels, so they take fewer neighbours, which
+saves time and costs few bits: docs/results/tuning.md#codec"""
 ONE = 256
 """Features are integers in units of 1/256 of a code."""
 

@@ -1,7 +1,7 @@
 """Features of rows and their weighted sums, from which a channel is predicted.
 
-All features, weights and sums are integers. We add them up in float32 if a bound shows that it holds the sum exactly, else
-in float64. Both give the same numbers; float32 takes half the time.
+All features, weights and sums are integers. We add them up in float32 if a bound shows that it holds the sum exactly,
+else in float64. Both give the same numbers; float32 takes half the time.
 """
 
 from __future__ import annotations

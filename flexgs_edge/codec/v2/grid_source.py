@@ -53,8 +53,8 @@ class GridSource(SceneSource):
         self.count, self.sh_degree = header.count, header.sh_degree
         self.sh_count = self.count if self.sh_degree else 0
         self.origin = np.array(header.origin, np.float64)
-        # A code times a step is finite. Only squares of absurd rotations and colours could leave float32, so the steps tell
-        # enough. A check of the values would decode the file twice more.
+        # A code times a step is finite. Only squares of absurd rotations and colours could leave float32, so the steps
+        # tell enough. A check of the values would decode the file twice more.
         steps = header.grid_steps
         colour = CODE_LIMIT * max(steps.dc, *steps.sh, 0.0) * (1 + steps.chroma)
         self.valid = steps.rotation <= _ROTATION_STEP_MOST and colour <= SH_LARGEST

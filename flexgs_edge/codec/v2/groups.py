@@ -68,8 +68,8 @@ class Group:
     weights : np.ndarray
         [2, features + 1] i16, in 1/256: weights of the value, then of the size of the error; the constant comes last.
     cuts : tuple of np.ndarray
-        Two lists of thresholds, [<= 15] i32 each, ascending: of the predicted value in 1/16, and of the predicted error in
-        1/64. The first list is empty for residuals: the side of the rounding takes its place.
+        Two lists of thresholds, [<= 15] i32 each, ascending: of the predicted value in 1/16, and of the predicted error
+        in 1/64. The first list is empty for residuals: the side of the rounding takes its place.
     """
 
     kind: GroupKind
@@ -243,7 +243,8 @@ def _quantiles(values: np.ndarray, count: int) -> np.ndarray:
 class _LeastSquares:
     """Least-squares weights ([f] i16 in 1/256) for target ~ weights . features, all in 1/256.
 
-    Features [f, m] are scaled to 13 bits. Their products then add up exactly, so that every machine finds the same weights.
+    Features [f, m] are scaled to 13 bits. Their products then add up exactly, so that every machine finds the same
+    weights.
     """
 
     def __init__(self, features: np.ndarray) -> None:

@@ -26,8 +26,8 @@ class TooManyNodes(ValueError):
 def walk_octree(depth: int, rows: int, code: Code, cells: np.ndarray | None = None) -> np.ndarray:
     """Code the set of occupied cells of a cube of 2^depth cells.
 
-    Bit c of a node's byte is set if child c is occupied, where c is the next three bits of the Morton index. Nodes come in
-    Morton order, and each level is one batch.
+    Bit c of a node's byte is set if child c is occupied, where c is the next three bits of the Morton index. Nodes come
+    in Morton order, and each level is one batch.
 
     Parameters
     ----------

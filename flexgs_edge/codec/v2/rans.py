@@ -1,8 +1,8 @@
 """Range asymmetric numeral systems (rANS; Duda 2013) over many lanes at once, with static tables and integers only.
 
-States have 32 bits and stay at or above 2^16, words have 16 bits, and probabilities are in 1/2^14. Every batch of symbols
-starts at lane 0 and goes round the lanes. One vector operation moves all lanes by one symbol, so that NumPy's overhead is
-paid once a round.
+States have 32 bits and stay at or above 2^16, words have 16 bits, and probabilities are in 1/2^14. Every batch of
+symbols starts at lane 0 and goes round the lanes. One vector operation moves all lanes by one symbol, so that NumPy's
+overhead is paid once a round.
 """
 
 from __future__ import annotations
@@ -166,8 +166,8 @@ class Decoder:
         self.lanes = lanes
         self._words = words.astype(np.uint32)
         self._at = 2 * lanes
-        # Constants are arrays, since NumPy converts a Python number to an array in every call. Low bits are written into
-        # the lower halves of wide integers, which can be added to slots as they are.
+        # Constants are arrays, since NumPy converts a Python number to an array in every call. Low bits are written
+        # into the lower halves of wide integers, which can be added to slots as they are.
         place = np.zeros(lanes, np.intp)
         halves = place.itemsize // 4
         self._work: tuple[np.ndarray, ...] = (
@@ -230,8 +230,8 @@ class Decoder:
 def normalize(weights: Sequence[int] | np.ndarray) -> np.ndarray:
     """Frequencies in proportion to `weights` [a], with the sum 2^14 and at least 1 for each weight above 0.
 
-    Each frequency is the floor of its share, but at least 1. The rest, positive or negative, goes to the largest frequencies
-    in turn, one unit each; of equal ones the first comes first. Integers only, so that all decoders agree.
+    Each frequency is the floor of its share, but at least 1. The rest, positive or negative, goes to the largest
+    frequencies in turn, one unit each; of equal ones the first comes first. Integers only, so that all decoders agree.
     """
     weights = np.asarray(weights, np.int64)
     total = int(weights.sum())

@@ -9,8 +9,8 @@ import numpy as np
 from flexgs_edge.codec.v2.rans import Decoder, Encoder, StreamError, Tables, normalize
 
 LEVELS = 65
-"""Levels of a frequency. Level 0 means absent; level v stands for the weight (4 + (v - 1) % 4) << (v - 1) // 4, in steps of
-14 to 25 %. Finer levels would cost more bytes in the file than they save: docs/results/tuning.md#codec"""
+"""Levels of a frequency. Level 0 means absent; level v stands for the weight (4 + (v - 1) % 4) << (v - 1) // 4, in
+steps of 14 to 25 %. Finer levels would cost more bytes in the file than they save: docs/results/tuning.md#codec"""
 SYMBOLS_MOST = 256
 CONTEXTS_MOST = 64
 ENTRY_BITS = 3.0

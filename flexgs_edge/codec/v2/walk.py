@@ -45,8 +45,9 @@ _SOURCES = ("scale x", "scale y", "scale z", "opacity", "dc Y", "dc Co", "dc Cg"
 _SH_SOURCES = ("opacity", *_SCALES)
 """Channels that predict SH. Opacity and scale tell how strongly a row's light changes; rotations tell little."""
 _SH_BEFORE = ((3,), (11, 3, 9, 10), (3, 13, 14, 9, 10, 11, 12))
-"""Places of weights for features of the same coefficient and those before, for the planes Y, Co and Cg. The features are
-the sums of |Cg|, |Y|, |Co| so far, then Y, |Y|, Co, |Co|. Y and Co use them from the second on, Cg from the first."""
+"""Places of weights for features of the same coefficient and those before, for the planes Y, Co and Cg. The features
+are the sums of |Cg|, |Y|, |Co| so far, then Y, |Y|, Co, |Co|. Y and Co use them from the second on, Cg from the
+first."""
 _RESIDUAL = ("scale", "opacity", "dc")
 """Channels whose symbols are residuals: they are predictable and have no sharp limits. Other channels code their values."""
 

@@ -21,9 +21,9 @@ _TIE = np.int64(0x10000000)
 def fma(a: Values, b: Values, c: Values) -> np.ndarray:
     """`a * b + c`, rounded once to float32.
 
-    float64 holds the product of two float32 exactly. The sum is rounded to float64 and then to float32. Two roundings go wrong
-    only if the float64 lies midway between two float32 and was itself rounded; then we nudge it towards the exact sum.
-    Results below 2^-126 may still be off by one denormal step.
+    float64 holds the product of two float32 exactly. The sum is rounded to float64 and then to float32. Two roundings
+    go wrong only if the float64 lies midway between two float32 and was itself rounded; then we nudge it towards the
+    exact sum. Results below 2^-126 may still be off by one denormal step.
     """
     product = np.multiply(a, b, dtype=np.float64)
     total = np.asarray(product + c)

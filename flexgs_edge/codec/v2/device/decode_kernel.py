@@ -47,7 +47,8 @@ class ChunkKernel:
     Parameters
     ----------
     device : Device
-        A backend whose work-items run as threads of a processor. On a GPU, a chunk in one work-item would take far too long.
+        A backend whose work-items run as threads of a processor. On a GPU, a chunk in one work-item would take far too
+        long.
     model : Model
         The model of the file.
     rows : int
