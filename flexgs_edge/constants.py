@@ -49,7 +49,8 @@ LOG2_ALPHA_MIN: Final = -LOG2_255
 """We compare the exponent of a splat at a pixel, not its alpha. In float32, this is the least x with a computed 2^x of
 ALPHA_MIN or more. For smaller x, 2^x is not used and need not be right."""
 LOG2_ALPHA_MAX: Final = -0.0144997
-"""Cap on the exponent, in place of alpha: the computed 2^x is ALPHA_MAX to the bit. For log2(ALPHA_MAX) it is an ulp more."""
+"""Cap on the exponent, in place of alpha: the computed 2^x is ALPHA_MAX to the bit. For log2(ALPHA_MAX) it is an ulp
+more."""
 
 # --- extents ----------------------------------------------------------------------------------
 EXTENT_SLACK: Final = 4e-6
@@ -126,7 +127,8 @@ LOG2_POLY: Final = (
 """log2(1 + f) = f * P(f) on f in [-1/3, 1/3): absolute error 7.1e-8 in float32 (our own Chebyshev fit)."""
 
 DEQUANTIZE_ROWS: Final = 64
-"""Rows of a work-item of the dequantize kernel: one division finds its group, and there are enough items for all units."""
+"""Rows of a work-item of the dequantize kernel: one division finds its group, and there are enough items for all
+units."""
 
 # --- reductions -------------------------------------------------------------------------------
 FIXED_WEIGHT: Final = 2.0**32
@@ -162,7 +164,8 @@ RANS_FLOOR: Final = 1 << 16
 RANS_LANES: Final = 512
 """Most lanes of a stream."""
 LEVEL_CLASSES: Final = 6
-"""Classes of octree levels by their distance from the cells. All coarser levels share the last class: they have few nodes."""
+"""Classes of octree levels by their distance from the cells. All coarser levels share the last class: they have few
+nodes."""
 CHILD_CLASSES: Final = 5
 """Classes of octree nodes by the number of the parent's children: none (the root), 1, 2, 3, more."""
 COARSE_ROWS: Final = 256

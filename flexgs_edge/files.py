@@ -144,10 +144,10 @@ def _merge(source: Path, target: Path) -> None:
 
 @contextmanager
 def temporary_name(output: Path, force: bool, word: str | None = None) -> Iterator[Path]:
-    """Yield a name in a temporary folder beside `output`; the file there becomes `output` if the block ends without an error.
+    """Yield a name in a temporary folder beside `output`.
 
-    The folder is always removed. If `word` is given, the folder is named by it, and one left by a killed run is removed
-    first.
+    The file there becomes `output` if the block ends without an error. The folder is always removed. If `word` is
+    given, the folder is named by it, and one left by a killed run is removed first.
     """
     target = check_writable(output, force)
     folder = target.with_name(f".flexgs-out-{word or secrets.token_hex(8)}")

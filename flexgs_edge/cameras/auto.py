@@ -43,7 +43,8 @@ NEAR_CLEAR = 0.7
 SHARP = 0.008
 """Usual deviation of a splat over its distance from a camera (5 pixels in a view 640 wide)."""
 SHARP_SPREAD = math.log(8.0)
-"""One standard deviation of its logarithm. It is wide, since scenes of few large splats are seen from the same distance."""
+"""One standard deviation of its logarithm. It is wide, since scenes of few large splats are seen from the same
+distance."""
 AGREEMENT_POWER = 3.0
 SEEN_POWER = 1.5
 """A witness that n views show as well as the best place counts (1 + n)^-SEEN_POWER."""

@@ -83,9 +83,9 @@ class Camera:
         )
 
     def every(self, step: int, column: int = 0, row: int = 0) -> Camera:
-        """The view with every `step`-th pixel of both directions, from pixel (`column`, `row`) on; their colours stay the same.
+        """The view with every `step`-th pixel of both directions, from pixel (`column`, `row`) on.
 
-        Raises `InputError` if no pixel is left.
+        Their colours stay the same. It raises `InputError` if no pixel is left.
         """
         width, height = -(-(self.width - column) // step), -(-(self.height - row) // step)
         if not (0 <= column < step and 0 <= row < step) or width < 1 or height < 1:

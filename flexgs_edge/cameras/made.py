@@ -10,7 +10,8 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 
 LEAST_ALIKE = 0.7
-"""Least cosine between two directions of view (45 degrees). Beyond it, the middle view would see what neither of the two sees."""
+"""Least cosine between two directions of view (45 degrees). Beyond it, the middle view would see what neither of the
+two sees."""
 
 
 def at_distance(camera: Camera, depth: float, factor: float) -> Camera:

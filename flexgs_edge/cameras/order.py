@@ -9,20 +9,21 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 
 DIGITS = 6
-"""Decimals in comparisons of squared distances, so that rounding in a scene that was moved does not break ties of a rig."""
+"""Decimals in comparisons of squared distances, so that rounding in a scene that was moved does not break ties of a
+rig."""
 GAIN_DIGITS = 4
 """Decimals in comparisons of what a camera adds, as a share of all points."""
 SAME_VIEW = 0.2
-"""Two views of a point overlap if the cosine of the angle between their directions differs from 1 by less than this, up
-to 37 degrees. A wider reach would leave out views that are needed: docs/results/tuning.md#same_view"""
+"""Two views of a point overlap if the cosine between their directions differs from 1 by less than this: up to 37
+degrees. A wider reach would leave out views that are needed: docs/results/tuning.md#same_view"""
 
 
 def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, count: int) -> list[int]:
-    """Choose at most `count` cameras, each next one with the most to add to what the chosen ones see; returns their indices.
+    """Choose at most `count` cameras, each next one with the most to add to what the chosen ones see.
 
-    A point adds 1 to a camera that has it in its picture; occlusion is ignored. It adds less for every chosen camera
-    that has it from a near direction: 1 / (1 + sum of max(0, 1 - (1 - cosine) / `SAME_VIEW`)). Ties go to the lower
-    index.
+    It returns their indices. A point adds 1 to a camera that has it in its picture; occlusion is ignored. It adds less
+    for every chosen camera that has it from a near direction: 1 / (1 + sum of max(0, 1 - (1 - cosine) / `SAME_VIEW`)).
+    Ties go to the lower index.
 
     Parameters
     ----------
@@ -62,10 +63,10 @@ def _in_picture(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
 def farthest_order(cameras: Sequence[Camera]) -> list[int]:
     """Order all cameras so that each next one is farthest from those before; the first is nearest to their middle.
 
-    The distance of two cameras has two parts, whose squares are added: the distance of their places, over the mean
-    distance from the middle, and the distance of their directions (opposite ones are 2 apart), over the same mean of
-    directions. So neither a ring of cameras that look inwards nor a turning tripod counts as one place. Ties go to the
-    lower index.
+    The distance of two cameras has two parts, whose squares are added. The first is the distance of their places, over
+    the mean distance from the middle. The second is the distance of their directions (opposite ones are 2 apart), over
+    the same mean of directions. So neither a ring of cameras that look inwards nor a turning tripod counts as one
+    place. Ties go to the lower index.
 
     >>> from types import SimpleNamespace
     >>> line = [SimpleNamespace(center=np.array([x, 0.0, 0.0]), rotation=np.eye(3)) for x in (0.0, 1.0, 2.0, 3.0, 4.0)]

@@ -130,7 +130,10 @@ class Witnesses:
         return np.exp(-cells.mean(axis=0) * inside * length)
 
     def agreement(self, eye: np.ndarray) -> np.ndarray:
-        """[M] f64, view-dependent colour towards `eye` over its mean over all directions; 1 for rows that do not tell."""
+        """[M] f64, view-dependent colour towards `eye` over its mean over all directions.
+
+        It is 1 for rows that do not tell directions.
+        """
         lines = self.means - eye[:, None]
         lines /= np.maximum(np.linalg.norm(lines, axis=0), 1e-12)
         basis = sh_basis(lines, self.sh.shape[1])
@@ -184,7 +187,7 @@ def _grid(
     """First corner, cell side, and optical depth of each cell along its side, with a rim of empty cells.
 
     The matter of a splat is its opacity times its mean cross-section. If a splat is wider than a cell, its matter is
-    spread over points drawn from it, and cut if even these would fill more than a cell each. Each row stands for
+    spread over points drawn from it. It is cut if even these would fill more than a cell each. Each row stands for
     `share` rows.
     """
     means = sample["means"].astype(np.float64)
@@ -213,7 +216,10 @@ def _grid(
 
 
 def rotations(quats: np.ndarray) -> np.ndarray:
-    """[3, 3, n] f64, rotation matrices of quaternions w x y z ([4, n], any norm but zero); columns are the splat's axes."""
+    """[3, 3, n] f64, rotation matrices of quaternions w x y z ([4, n], any norm but zero).
+
+    Columns are the splat's axes.
+    """
     w, x, y, z = quats / np.linalg.norm(quats.astype(np.float64), axis=0)
     return np.array(
         [

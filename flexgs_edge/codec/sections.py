@@ -20,7 +20,8 @@ from flexgs_edge.codec.header import PREAMBLE_BYTES, HeaderError, Section, forma
 from flexgs_edge.errors import FormatError, InputError
 
 MAGIC = b"\x93FGS\r\n\x1a\n"
-"""First bytes of a file: a byte above 127, both line ends and a text stop (the idea of PNG). A transfer as text breaks them."""
+"""First bytes of a file: a byte above 127, both line ends and a text stop (the idea of PNG). A transfer as text breaks
+them."""
 _PREAMBLE = struct.Struct("<8sHHIQII")
 _U32 = struct.Struct("<I")
 _PIECE = 1 << 20
@@ -197,7 +198,10 @@ class Verification:
     def check_chunks(
         self, file: SectionFile, table: Section, read: Callable[[], list[ChunkEntry]], unknown: Iterable[Section]
     ) -> list[Section]:
-        """Check the chunk table and the chunks; returns all sections in file order, with `unknown` if the table is damaged."""
+        """Check the chunk table and the chunks.
+
+        It returns all sections in file order, with `unknown` if the table is damaged.
+        """
         if self.check(table, read):
             for entry in read():
                 self.check(entry.section, partial(file.check_chunk, entry))

@@ -16,7 +16,8 @@ from flexgs_edge.goals.target import Target
 AIM = -0.01
 """Excess that new points aim at: a little below the target."""
 NEAREST = 0.1
-"""A new point keeps this share of the interval between its neighbours away from both, since curves are not quite smooth."""
+"""A new point keeps this share of the interval between its neighbours away from both, since curves are not quite
+smooth."""
 CLOSE = 0.03
 """The search stops at a point whose excess (log of loss or size over its limit) is below the target by at most this."""
 LINE_STEPS = {"fast": 4, "balanced": 6, "thorough": 10}

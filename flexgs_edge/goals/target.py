@@ -100,9 +100,10 @@ class MaxDrop:
 
 
 def _log_loss(loss: float, limit: float) -> float:
-    """Log of loss over limit. The error grows about exponentially with the rates, so that this is nearly linear in them.
+    """Log of loss over limit.
 
-    The floor allows for drops at or below zero (the compressed scene beats the original), which hold by far.
+    The error grows about exponentially with the rates, so that this is nearly linear in them. The floor allows for
+    drops at or below zero (the compressed scene beats the original), which hold by far.
     """
     return math.log(max(loss / limit, 0.02))
 

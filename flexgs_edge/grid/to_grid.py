@@ -177,7 +177,10 @@ def _band_codes(
     storage: Storage,
     order: np.ndarray | None = None,
 ) -> np.ndarray:
-    """[3 * (2l + 1), n] codes of the coefficients of one SH degree l; `order` gives the input rows for error messages."""
+    """[3 * (2l + 1), n] codes of the coefficients of one SH degree l.
+
+    `order` gives the input rows for error messages.
+    """
     codes = storage.empty((3, 2 * degree + 1, len(rows)), np.int32)
     for part in blocks(len(rows)):
         chosen = rows[part]

@@ -27,7 +27,8 @@ from flexgs_edge.scene.rotations import normalize_quats
 from flexgs_edge.scene.source import MemorySource, Planes, Rows, SceneSource
 
 OPACITY_LIMIT = 7.0
-"""Logits for opacities 0 and 1. 8-bit formats store these, but logits do not reach them; half a step from the end is 6.2."""
+"""Logits for opacities 0 and 1. 8-bit formats store these, but logits do not reach them; half a step from the end is
+6.2."""
 
 
 def read_foreign(path: str | os.PathLike[str]) -> SceneSource:
@@ -102,7 +103,10 @@ def write_foreign(path: str | os.PathLike[str], source: SceneSource, *, force: b
 
 
 def written_order(source: SceneSource, format: Format) -> np.ndarray | None:
-    """[N] i64, rows of `source` in the order that `write_foreign` writes them; None if the converter sorts by itself."""
+    """[N] i64, rows of `source` in the order that `write_foreign` writes them.
+
+    It is None if the converter sorts by itself.
+    """
     if format.shuffled:
         return None
     return near_order(_WorldSource(source)) if format.sorted else np.arange(source.count)
@@ -184,7 +188,10 @@ class _WorldSource(_WrappedSource):
 
 
 class _ForeignSource(_WrappedSource):
-    """A scene expanded to a PLY. Opacities of exactly 0 and 1 get finite logits; `settings` hold the file's way of drawing."""
+    """A scene expanded to a PLY.
+
+    Opacities of exactly 0 and 1 get finite logits; `settings` hold the file's way of drawing.
+    """
 
     def __init__(
         self,

@@ -78,7 +78,10 @@ def _find_images(folder: Path, settings: dict[str, Any]) -> Path | None:
 
 
 def _read_cfg_args(path: Path) -> dict[str, Any]:
-    """The arguments of the text `Namespace(key=value, ...)`, literals only, nothing is evaluated; empty without the file."""
+    """The arguments of the text `Namespace(key=value, ...)`, as literals; nothing is evaluated.
+
+    The result is empty if there is no such file.
+    """
     if not path.is_file():
         return {}
     try:

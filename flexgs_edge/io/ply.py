@@ -76,9 +76,10 @@ class PlySource(SceneSource):
         self.origin = choose_origin(self._sample())
 
     def _sample(self) -> np.ndarray:
-        """[n, 3] f64, world positions of every k-th row, at most 65536 rows. If k is large, it takes runs of rows instead.
+        """[n, 3] f64, world positions of every k-th row, at most 65536 rows.
 
-        Reads of single rows far apart are slow, since each one moves the disk.
+        If k is large, it takes runs of rows instead. Reads of single rows far apart are slow, since each one moves the
+        disk.
         """
         step = max(1, -(-self.count // _ORIGIN_ROWS))
         rows = np.arange(0, self.count, step)

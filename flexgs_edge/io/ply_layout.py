@@ -40,7 +40,8 @@ _SILENT = ("nx", "ny", "nz")
 PROGRAM = "flexgs-edge"
 """First word of our comments."""
 SMOOTHING = "filter_3D"
-"""Property of Mip-Splatting: standard deviation (scene units) of a filter that stored scales and opacities do not include."""
+"""Property of Mip-Splatting: standard deviation (scene units) of a filter that stored scales and opacities do not
+include."""
 
 
 @dataclass

@@ -96,7 +96,8 @@ class Backend(Protocol):
     name: str
     is_numpy: bool
     threads: int
-    """Work-items that run side by side as threads of a processor with f64; 0 for a device without them, such as a GPU."""
+    """Work-items that run side by side as threads of a processor with f64; 0 for a device without them, such as a
+    GPU."""
     sort_blocks: int
     tile_blocks: int
     startup_seconds: float
@@ -116,10 +117,10 @@ class Backend(Protocol):
         """Copy values into an array, from the flat element `offset` on."""
 
     def mapped(self, array: Any) -> AbstractContextManager[np.ndarray]:
-        """Write to an array on the host, without a copy if the device shares the host's memory. The array may not be empty.
+        """Write to an array on the host, without a copy if the device shares the host's memory.
 
-        The old values may be lost, and the device gets the new ones at the end. This does not wait for kernels, so none
-        may use the array.
+        The array may not be empty. The old values may be lost, and the device gets the new ones at the end. This does
+        not wait for kernels, so none may use the array.
         """
 
     def mark(self) -> Callable[[], None]:

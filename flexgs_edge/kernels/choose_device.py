@@ -19,8 +19,8 @@ HINT = (
     "`--device numpy` (same results, far slower)"
 )
 
-# Fused and separate multiply-add on vectors of 16. It catches runtimes that cannot build for this processor (PoCL's
-# wheels on CPUs newer than their compiler), that fuse operations they must not fuse, or that miss lanes.
+# Fused and separate multiply-add on vectors of 16. It catches runtimes that cannot build for this processor, such as
+# PoCL's wheels on newer CPUs. It also catches those that fuse operations they must not fuse, or that miss lanes.
 _SELF_TEST = """
 #pragma OPENCL FP_CONTRACT OFF
 __kernel void self_test(__global const float *a, __global const float *b, __global float *out) {
@@ -55,7 +55,8 @@ class DeviceInfo:
     self_test: str
     handle: cl.Device | None = field(default=None, repr=False, compare=False)
     context: cl.Context | None = field(default=None, repr=False, compare=False)
-    """The context of the self-test, kept alive: after the last context is gone, PoCL starts its compiler anew for the next."""
+    """The context of the self-test, kept alive: after the last context is gone, PoCL starts its compiler anew for the
+    next."""
 
     @property
     def usable(self) -> bool:

@@ -80,7 +80,10 @@ def _signed(text: str) -> str:
 
 
 def shared_constants() -> Iterator[tuple[str, int | float]]:
-    """Yield name and value of every number in `flexgs_edge.constants`, in order; a tuple gives `NAME_0`, `NAME_1`, ..."""
+    """Yield name and value of every number in `flexgs_edge.constants`, in order.
+
+    A tuple gives `NAME_0`, `NAME_1`, ...
+    """
     for name, value in vars(constants).items():
         if not name.isupper():
             continue

@@ -69,10 +69,10 @@ def _buffer() -> memoryview:
 
 
 def is_cached(address: int, size: int) -> bool:
-    """Whether the page cache seems to hold `size` bytes of a file mapped at `address`; True if the system does not tell.
+    """Whether the page cache seems to hold `size` bytes of a file mapped at `address`.
 
-    We ask for the first and the last page only, since neighbours come and go together. A wrong answer costs time, no
-    data.
+    It is True if the system does not tell. We ask for the first and the last page only, since neighbours come and go
+    together. A wrong answer costs time, no data.
     """
     library = _library()
     if library is None:

@@ -14,7 +14,8 @@ SAMPLE_SECONDS = 0.05
 """Seconds between two samples of the memory; shorter peaks may be missed."""
 
 _MALLOPT = {-3: 8 << 20, -1: 32 << 20, -8: 2}
-"""Settings of glibc: M_MMAP_THRESHOLD and M_TRIM_THRESHOLD in bytes, and M_ARENA_MAX, the number of heaps for threads."""
+"""Settings of glibc: M_MMAP_THRESHOLD and M_TRIM_THRESHOLD in bytes, and M_ARENA_MAX, the number of heaps for
+threads."""
 
 
 def peak_rss() -> int:

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 
 LARGEST = 2.0**126
-"""Largest magnitude that can be coded. A range is at most twice as wide and still fits float32, so nothing overflows."""
+"""Largest magnitude that can be coded. A range is at most twice as wide and still fits float32, so nothing
+overflows."""
 SMALLEST_STEP = 2.0**-126
 """Smallest normal float32. A range with a finer step counts as constant, since devices may flush the step to zero."""
 

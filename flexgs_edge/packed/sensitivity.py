@@ -2,7 +2,7 @@
 
 The start is 8 bits for every attribute (16 for positions). Then each attribute alone is coded at 4 bits. Its loss is
 the rise of the mean squared error against the original's renders, for each bit saved. Attributes move to 4 bits in
-ascending order of loss, as long as the summed rise stays below the error of a 0.3 dB modelled drop.
+ascending order of loss. They stop before the summed rise passes the error of a 0.3 dB modelled drop.
 """
 
 from __future__ import annotations

@@ -30,7 +30,10 @@ AHEAD_ROW_BYTES = shapes_bytes(chunk_shapes(1)) + 4
 
 
 class WaitingView:
-    """A compact view that is projected already and waits for its turn; its splats lie in a scratch file. Close when done."""
+    """A compact view that is projected already and waits for its turn; its splats lie in a scratch file.
+
+    Close it when done.
+    """
 
     def __init__(self, backend: Backend, storage: Storage, camera: Camera, record: np.ndarray) -> None:
         self.of = camera

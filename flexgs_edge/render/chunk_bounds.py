@@ -19,7 +19,8 @@ SIGMAS = math.sqrt((LOG2_255 + EXTENT_SLACK) * 2.0 * math.log(2.0))
 INRIA_SPREAD = math.sqrt(math.sqrt(0.1))
 """Upper bound of what the floor of 0.1 adds to the square root of the larger eigenvalue."""
 ROUNDING = 1e-5
-"""Bound of the float32 error in `project`, as a share of the largest term: generous, so that no chunk vanishes by rounding."""
+"""Bound of the float32 error in `project`, as a share of the largest term: generous, so that no chunk vanishes by
+rounding."""
 LARGER = 1.001
 """Factor that widens the extent of a chunk against rounding."""
 
@@ -42,7 +43,10 @@ class ChunkBounds:
 
     @classmethod
     def of(cls, means: np.ndarray, log_scales: np.ndarray) -> ChunkBounds:
-        """Bounds of rows with these stored values ([3, n] f32 each, n > 0); if one is not finite, every view sees the chunk."""
+        """Bounds of rows with these stored values ([3, n] f32 each, n > 0).
+
+        If one is not finite, every view sees the chunk.
+        """
         low, high = means.min(axis=1).astype(np.float64), means.max(axis=1).astype(np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
             return cls((low + high) / 2, (high - low) / 2, LARGER * float(np.exp(np.float64(log_scales.max()))))

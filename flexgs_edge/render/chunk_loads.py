@@ -88,7 +88,10 @@ class ChunkLoads:
         self._held, self._free, self._coming = [], [], {}
 
     def _ask(self, span: Span, ahead: bool = False) -> bool:
-        """Start to load a chunk; one that is asked for ahead leaves a slot free for a chunk that must come before it."""
+        """Start to load a chunk.
+
+        One that is asked for ahead leaves a slot free for a chunk that must come before it.
+        """
         start, stop, _ = span
         done: Callable[[], None] = _nothing
         stays = self._may_stay(stop - start)

@@ -38,7 +38,10 @@ class Chunk:
     def project(
         self, backend: Backend, camera: Any, base: int, inria_extent: int, antialiased: bool, out: tuple[Any, ...]
     ) -> None:
-        """Project the rows to splat records, depth keys and bounds of tiles; `base` is their first row in the arrays `out`."""
+        """Project the rows to splat records, depth keys and bounds of tiles.
+
+        `base` is their first row in the arrays `out`.
+        """
         backend.launch(
             "project", (self.stride,), self.count, self.stride, base, self.degree, inria_extent, int(antialiased), camera,
             *self.arrays, *out,

@@ -286,7 +286,10 @@ class DeviceScene:
             loads.close()
 
     def refresh(self, *fields: str) -> None:
-        """Read `sh_dc` or `sh_rest` again after the source's values changed. Streamed chunks are read again in any case."""
+        """Read `sh_dc` or `sh_rest` again after the source's values changed.
+
+        Streamed chunks are read again in any case.
+        """
         if not isinstance(self._planes, SourcePlanes):
             raise TypeError("only a scene with a source can be refreshed")
         self.changes += 1

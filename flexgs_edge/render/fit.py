@@ -1,4 +1,7 @@
-"""How many bytes a view, a chunk and their sums take, and what fits into the budget. Arithmetic only; nothing is allocated."""
+"""How many bytes a view, a chunk and their sums take, and what fits into the budget.
+
+This is arithmetic only; nothing is allocated.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Draw one view of a scene: project, sort by depth, list tiles and blend. Long lists are split into depth-ordered batches."""
+"""Draw one view of a scene: project, sort by depth, list tiles and blend.
+
+Long lists are split into depth-ordered batches.
+"""
 
 from __future__ import annotations
 
@@ -168,7 +171,10 @@ class Renderer:
         return self.render_planes(scene, camera)[:, : camera.height, : camera.width].transpose(1, 2, 0)
 
     def in_turn(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[Camera]:
-        """Yield each camera when its view is to be drawn; a scene in scratch files is then read once for several views."""
+        """Yield each camera when its view is to be drawn.
+
+        A scene in scratch files is then read once for several views.
+        """
         return self._ahead.in_turn(scene, cameras)
 
     def render_planes(self, scene: DeviceScene, camera: Camera) -> np.ndarray:

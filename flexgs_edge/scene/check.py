@@ -12,7 +12,8 @@ from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
 
 _TINY = np.finfo(np.float32).tiny
 SH_LARGEST = 1e15
-"""Larger SH coefficients are invalid: squares of their colours leave float32, and infinity times a weight of zero is NaN."""
+"""Larger SH coefficients are invalid: squares of their colours leave float32, and infinity times a weight of zero is
+NaN."""
 
 
 class _Faults:
@@ -35,9 +36,9 @@ class _Faults:
 def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int = 65536) -> SceneSource:
     """Check every value of a scene, one chunk at a time.
 
-    A row is invalid if a field has NaN or infinity, if an SH coefficient is beyond `SH_LARGEST`, or if the norm of its
-    quaternion is zero or outside what float32 can normalise. Log-scales of -inf (flat splats) are valid: they are read
-    as the smallest finite log-scale of the scene.
+    A row is invalid if a field has NaN or infinity, or an SH coefficient is beyond `SH_LARGEST`. It is also invalid if
+    the norm of its quaternion is zero, or outside the range that float32 can normalise. Log-scales of -inf (flat
+    splats) are valid: they are read as the smallest finite log-scale of the scene.
 
     Parameters
     ----------

@@ -1,4 +1,7 @@
-"""Enlarge a scene for tests and studies: split Gaussians into parts that look like the whole, and tile copies; lazily read."""
+"""Enlarge a scene for tests and studies: split Gaussians into parts that look like the whole, and tile copies.
+
+Rows are computed when they are read.
+"""
 
 from __future__ import annotations
 
@@ -136,7 +139,9 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _halve(wide: Planes, parts: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Turn each column of `wide` into one of its parts: number `part` of `parts`. Log-scales and logits (f64) change in place.
+    """Turn each column of `wide` into one of its parts: number `part` of `parts`.
+
+    Log-scales and logits (f64) change in place.
 
     Returns
     -------

@@ -8,11 +8,11 @@ from flexgs_edge.errors import InputError
 
 
 def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Permute and reverse the axes of Gaussians so that each rotation is as small as it can be; covariances stay the same.
+    """Permute and reverse the axes of Gaussians so that each rotation is as small as it can be.
 
-    The form changes from q to q p, where p is one of the 24 rotations of the cube, and the scales follow. The largest
-    |w| among the 24 forms is the largest of three numbers: the largest component, the sum of the two largest over
-    sqrt(2), and the sum of all four over 2. We use float64, basic operations and sqrt only.
+    Covariances stay the same. The form changes from q to q p, where p is one of the 24 rotations of the cube, and the
+    scales follow. The largest |w| among the 24 forms is the largest of three numbers: the largest component, the sum of
+    the two largest over sqrt(2), and the sum of all four over 2. We use float64, basic operations and sqrt only.
 
     Parameters
     ----------
@@ -50,7 +50,10 @@ def turned(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def tilted(quats: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """[4, n] f64, unit quaternions ([4, n]) after small turns about their own axes; `errors` [3, n]: the turns' vector parts."""
+    """[4, n] f64, unit quaternions ([4, n]) after small turns about their own axes.
+
+    `errors` [3, n] are the vector parts of the turns.
+    """
     unit = np.asarray(quats, np.float64)
     unit = unit / np.sqrt((unit * unit).sum(axis=0))
     return _times_conjugate(unit, np.stack([np.sqrt(1 - (errors * errors).sum(axis=0)), *-errors]))

@@ -1,4 +1,7 @@
-"""Renders of the original model, the targets of fine-tuning in place of photos. A scratch file holds them in half precision."""
+"""Renders of the original model, the targets of fine-tuning in place of photos.
+
+A scratch file holds them in half precision.
+"""
 
 from __future__ import annotations
 

@@ -134,7 +134,10 @@ class ViewSums:
         self._spool.add(parts, camera)
 
     def parts(self) -> Iterator[tuple[slice, list[Any]]]:
-        """Yield rows of the scene and their sums over all views, one of each kind, chunk by chunk; valid until the next step."""
+        """Yield rows of the scene and their sums over all views, one of each kind, chunk by chunk.
+
+        The sums are valid until the next step.
+        """
         if self._held:
             for base, (count, parts) in self._held.items():
                 yield slice(base, base + count), parts

@@ -29,7 +29,10 @@ class CodedSource(SceneSource):
         """The arrays with the rows of a chunk, and the row at which their planes start."""
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`; a chunk is dequantized from the first to the last of its rows, also if they are sparse."""
+        """See `SceneSource.read`.
+
+        A chunk is dequantized from the first to the last of its rows, also if they are sparse.
+        """
         rows, planes = self.begin_read(rows, fields, out)
         for chunk, wanted, place in by_chunk(rows, np.arange(0, self.count, CHUNK_ROWS)):
             first, arrays = self._chunk(chunk)

@@ -1,4 +1,7 @@
-"""Bytes of each kind of value in a version 2 file. The header stores them, so that `info` need not decode the chunks."""
+"""Bytes of each kind of value in a version 2 file.
+
+The header stores them, so that `info` need not decode the chunks.
+"""
 
 from __future__ import annotations
 

@@ -227,7 +227,10 @@ class GridContainer(SectionFile):
         decode: Callable[[list[tuple[int, bytes]]], Sequence[Result | ValueError]],
         chunks: Sequence[tuple[Chunk, ChunkEntry]],
     ) -> list[Result]:
-        """Let `decode` work on the rows and bytes of some chunks; raise the error of a chunk with its name and place."""
+        """Let `decode` work on the rows and bytes of some chunks.
+
+        An error of a chunk is raised with its name and place.
+        """
         jobs = [(chunk.stop - chunk.start, self.read_chunk(entry)) for chunk, entry in chunks]
         results: list[Result] = []
         for (_, entry), result in zip(chunks, decode(jobs), strict=True):

@@ -93,7 +93,10 @@ def plan_passes(position: np.ndarray, reach: int, stride: int = 1) -> Plan:
 
 
 def _neighbours(known: np.ndarray, count: int, reach: int, stride: int) -> np.ndarray:
-    """[2 * reach, count], the neighbours of `count` rows: row j lies between `known` j and j + 1. The ends are repeated."""
+    """[2 * reach, count], the neighbours of `count` rows: row j lies between `known` j and j + 1.
+
+    The ends are repeated.
+    """
     padded = np.concatenate([np.repeat(known[:1], reach - 1), known, np.repeat(known[-1:], reach)])
     # Overlapping views of one array; as_strided does the same, but slowly.
     step = padded.itemsize

@@ -70,7 +70,10 @@ def chunk_codes(grid: GridScene, cells: np.ndarray, chunk: Chunk) -> ChunkCodes:
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """A fitted model, and the symbols of a scene for its file; `bits` is the information in the symbols of each alphabet."""
+    """A fitted model, and the symbols of a scene for its file.
+
+    `bits` is the information in the symbols of each alphabet.
+    """
 
     model: Model
     low: np.ndarray

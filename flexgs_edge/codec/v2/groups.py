@@ -24,7 +24,8 @@ SYMBOL_ROOM = 192
 _RARE = 2000
 """One in so many values may lie outside the alphabet at either end; such an escape costs 32 more bits."""
 _RARE_FEW = 8
-"""If values are few, up to 8 of them, but at most one in 50, may lie outside: one outlier must not widen the alphabet."""
+"""If values are few, up to 8 of them, but at most one in 50, may lie outside: one outlier must not widen the
+alphabet."""
 _FAR = 4
 """The fit leaves out samples with a number so many times beyond the usual ones: one of them would outweigh the rest."""
 
@@ -92,7 +93,10 @@ class Group:
         return self.centre * self.kind.residual + self.low
 
     def known(self, terms: Sequence[Term], count: int, before: Sums | None = None) -> Sums:
-        """Add the features that are known for all `count` rows to the prediction; `before` holds what was added so far."""
+        """Add the features that are known for all `count` rows to the prediction.
+
+        `before` holds what was added so far.
+        """
         weights = self.weights.astype(np.float64)
         return add_terms(constant(256 * weights[:, -1], count) if before is None else before, weights, terms)
 

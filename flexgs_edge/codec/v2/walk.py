@@ -49,7 +49,8 @@ _SH_BEFORE = ((3,), (11, 3, 9, 10), (3, 13, 14, 9, 10, 11, 12))
 are the sums of |Cg|, |Y|, |Co| so far, then Y, |Y|, Co, |Co|. Y and Co use them from the second on, Cg from the
 first."""
 _RESIDUAL = ("scale", "opacity", "dc")
-"""Channels whose symbols are residuals: they are predictable and have no sharp limits. Other channels code their values."""
+"""Channels whose symbols are residuals: they are predictable and have no sharp limits. Other channels code their
+values."""
 
 
 def base_kinds() -> list[GroupKind]:
@@ -86,7 +87,10 @@ class ChunkCodes:
 
 
 class Port(Protocol):
-    """Codes batches for `walk_chunk`; `codes` and `symbols` are None to decode. The port chooses the type `known` returns."""
+    """Codes batches for `walk_chunk`; `codes` and `symbols` are None to decode.
+
+    The port chooses the type `known` returns.
+    """
 
     stride: int
     """One in so many rows of each pass is coded."""

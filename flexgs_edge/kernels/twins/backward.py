@@ -266,7 +266,10 @@ def snap(
     sh_dc: np.ndarray,
     sh_rest: np.ndarray,
 ) -> None:
-    """Round values ([14 + 3 K, stride]) to those that a file of these steps decodes to; a step of 0 leaves them as they are."""
+    """Round values ([14 + 3 K, stride]) to those that a file of these steps decodes to.
+
+    A step of 0 leaves them as they are.
+    """
     means[:] = _on_grid(values[:AT_SCALE], steps[0])
     log_scales[:] = _on_grid(values[AT_SCALE:AT_QUAT], steps[1])
     w, x, y, z = values[AT_QUAT:AT_LOGIT]

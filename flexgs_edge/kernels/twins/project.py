@@ -105,7 +105,10 @@ def _from_covariance(
 def _from_factor(
     factor: np.ndarray, t0: Triple, t1: Triple, dilation: np.float32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """As `_from_covariance`, from the triangular factor; also the determinant before the dilation as a share of that after it."""
+    """As `_from_covariance`, from the triangular factor.
+
+    It also gives the determinant before the dilation, as a share of that after it.
+    """
     fxx, fyx, fzx, fyy, fzy, fzz = factor
     g0, g1 = ((dot3(fxx, fyx, fzx, *t), fma(fzy, t[2], fyy * t[1]), fzz * t[2]) for t in (t0, t1))
     cross = tuple(fma(g0[k], g1[m], -(g0[m] * g1[k])) for k, m in ((1, 2), (2, 0), (0, 1)))

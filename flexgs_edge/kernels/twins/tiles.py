@@ -14,7 +14,10 @@ _BANDS = np.arange(TILE // BLOCK, dtype=np.int32)
 
 
 def block_spans(records: np.ndarray, bands: np.ndarray, width: np.float32) -> tuple[np.ndarray, np.ndarray]:
-    """First and last block column ([m, 4] i32) of splats ([m, 16]) over four block rows each ([m, 4]); empty if first > last."""
+    """First and last block column ([m, 4] i32) of splats ([m, 16]) over four block rows each ([m, 4]).
+
+    The span of a row is empty if first > last.
+    """
     mx, my, turn, hh, slope, ic, root_scale, level = (records[:, k : k + 1] for k in (0, 1, 9, 10, 11, 12, 13, 14))
     top = (bands * BLOCK).astype(f32) - my
     slack = fma(hh, f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))

@@ -1,4 +1,7 @@
-"""Decode chunks by the OpenCL kernel `code_chunks`; its specification is `decode.decode_chunk`, which gives the same codes."""
+"""Decode chunks by the OpenCL kernel `code_chunks`.
+
+Its specification is `decode.decode_chunk`, which gives the same codes.
+"""
 
 from __future__ import annotations
 
