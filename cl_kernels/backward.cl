@@ -150,7 +150,7 @@ __kernel void project_backward(
   FW v10 = fma(u01, g00, u11 * g10), v11 = fma(u01, g01, u11 * g11), v12 = fma(u01, g02, u11 * g12);
   const FW slope = SUM(3);
   if (antialiased) {
-    // Log of the opacity's factor: half the difference of the logs of the areas before and after the dilation.
+    // log of the opacity's factor: half the difference of the logs of the areas before and after the dilation.
     const FW nx = fma(g01, g12, -(g02 * g11)), ny = fma(g02, g10, -(g00 * g12)), nz = fma(g00, g11, -(g01 * g10));
     const FW before = dot3(nx, ny, nz, nx, ny, nz);
     const FW share = pick(MASK(before > (FW)FACTOR_MIN), slope / before, (FW)0.0f);

@@ -72,7 +72,7 @@ class PlySource(SceneSource):
             raise InputError(f"{path}: cannot read the scene ({error.strerror})") from error
         self.count = header.vertex.count
         self.sh_count = self.count if self.sh_degree else 0
-        self.origin = np.zeros(3)  # the positions of the sample are relative to the world
+        self.origin = np.zeros(3)  # the sample is of world positions
         self.origin = choose_origin(self._sample())
 
     def _sample(self) -> np.ndarray:
