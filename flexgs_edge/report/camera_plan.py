@@ -116,7 +116,7 @@ def _plan(
     offset = np.array([(SIDE - scale * (high - low)[0]) / 2, (height - size) / 2])
 
     def at(points: np.ndarray) -> np.ndarray:
-        flat = (points @ rows.T - low) * scale + offset
+        flat: np.ndarray = (points @ rows.T - low) * scale + offset
         flat[:, 1] = height - flat[:, 1]
         return flat
 

@@ -13,7 +13,7 @@ import numpy as np
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.steps import SearchResult, Step
 from flexgs_edge.goals.target import Measurement, Target
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.methods.paper.search import adapt
@@ -119,18 +119,15 @@ class StudyScene:
             f"over {views}"
         )
 
+    def ranked(self, order: np.ndarray) -> Ranked:
+        """The scene with its rows in another order ([N] i64, least important first)."""
+        return Ranked(self.run.source, order, self.has_sh)
+
     def evaluator(self, setting: Setting) -> SceneEvaluator:
         """The pipeline's evaluator, set to the bits, groups and score of `setting`, until it is asked for again."""
         if setting.score not in self._evaluators:
             self._evaluators[setting.score] = SceneEvaluator(
-                self.run.scene.source,
-                self.orders[setting.score],
-                self.has_sh,
-                setting.bits,
-                setting.groups,
-                self.bench.renderer,
-                self.judge,
-                self.run.budget,
+                self.ranked(self.orders[setting.score]), setting.bits, setting.groups, self.judge, self.run.budget
             )
         evaluator = self._evaluators[setting.score]
         evaluator.bits, evaluator.groups = setting.bits, setting.groups

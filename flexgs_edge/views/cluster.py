@@ -80,7 +80,9 @@ class Cluster:
         if processes is not None and hasattr(os, "setpriority"):
             # Of this thread and all that it starts: views are drawn meanwhile, and whoever waits for workers leaves them a core.
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
-        import distributed  # takes a second
+        import distributed as dask  # takes a second
+
+        distributed: Any = dask  # it has no types
 
         self._lost = distributed.KilledWorker
         if processes is not None:

@@ -92,7 +92,8 @@ def _on_trial_grid(planes: dict[str, np.ndarray], kind: str, step: np.float32) -
             return (planes["log_scales"] + errors).astype(np.float32)
         if kind == "rotation":
             return tilted(planes["quats"], errors * math.sqrt(SMALLEST_THREE)).astype(np.float32)
-        return (planes["means"] + turned(planes["quats"], errors)).astype(np.float32)
+        moved: np.ndarray = (planes["means"] + turned(planes["quats"], errors)).astype(np.float32)
+        return moved
     return (np.rint(planes["opacity_logits"] / step) * step).astype(np.float32)
 
 

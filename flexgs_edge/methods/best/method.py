@@ -94,7 +94,21 @@ def compress(run: Run[CompressOptions], bench: Bench, output: Path | None) -> Ma
             with run.clock.stage("layers"):
                 bits = GridCoder(bench.renderer).bits(grid)
                 grid = assign_layers(grid, run.options.layers, bits, bench, poses.cameras, run.progress)
-        size, quality = _write(run, bench, coder, grid, search, judges, output, kept)
+        settings = make_settings(run, search)
+        if output is None:
+            size, quality = _tried(run, coder, grid, settings, judges)
+        else:
+            with temporary_name(output, run.options.force, None if kept is None else kept.key) as place:
+                with run.clock.stage("write"):
+                    size = coder.write(place, grid, settings)
+                limit = run.target.limit_bytes
+                if search.reached and limit is not None and size > limit:
+                    raise TargetError(
+                        f"{run.target.describe()}: {run.options.layers} layers make the file {size} bytes; "
+                        "ask for fewer layers"
+                    )
+                quality = judges.measure(decoded(open_fgs(place), bench.renderer))
+            LOG.info("wrote %s, %s", output, format_size(size))
         if kept is not None:
             kept.remove()
         storage.close()
@@ -111,33 +125,14 @@ def compress(run: Run[CompressOptions], bench: Bench, output: Path | None) -> Ma
         )
 
 
-def _write(
-    run: Run[CompressOptions],
-    bench: Bench,
-    coder: GridCoder,
-    grid: GridScene,
-    search: SearchResult,
-    judges: Judges,
-    output: Path | None,
-    kept: Checkpoint | None,
+def _tried(
+    run: Run[CompressOptions], coder: GridCoder, grid: GridScene, settings: dict[str, Any], judges: Judges
 ) -> tuple[int, Quality]:
-    """Write the file under another name, measure what it decodes to, and only then give it its name."""
-    settings, target = make_settings(run, search), run.target
-    if output is None:
-        if run.reporter is not None:
-            run.reporter.read_contents_of(lambda place: coder.write(place, grid, settings))
-        size = coder.size(grid, settings)
-        return size, judges.measure(MemorySource(values_of(grid, bench.renderer.storage), origin=grid.origin))
-    with temporary_name(output, run.options.force, None if kept is None else kept.key) as place:
-        with run.clock.stage("write"):
-            size = coder.write(place, grid, settings)
-        if search.reached and target.limit_bytes is not None and size > target.limit_bytes:
-            raise TargetError(
-                f"{target.describe()}: {run.options.layers} layers make the file {size} bytes; ask for fewer layers"
-            )
-        quality = judges.measure(decoded(open_fgs(place), bench.renderer))
-    LOG.info("wrote %s, %s", output, format_size(size))
-    return size, quality
+    """Bytes and quality of the file in a dry run; the report reads its contents from a file that is gone afterwards."""
+    if run.reporter is not None:
+        run.reporter.read_contents_of(lambda place: coder.write(place, grid, settings))
+    size = coder.size(grid, settings)
+    return size, judges.measure(MemorySource(values_of(grid, judges.storage), origin=grid.origin))
 
 
 def grid_search(

@@ -63,7 +63,8 @@ def scored_poses(
 def some_positions(source: SceneSource) -> np.ndarray:
     """[3, n] f64, world: positions of `SAMPLE_ROWS` rows at most, evenly spread."""
     rows = np.arange(0, source.count, max(-(-source.count // SAMPLE_ROWS), 1))
-    return source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
+    positions: np.ndarray = source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
+    return positions
 
 
 def is_fine(options: CompressOptions, source: SceneSource) -> bool:

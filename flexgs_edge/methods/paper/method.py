@@ -14,7 +14,7 @@ from flexgs_edge.codec.v1.packed_source import FgsSource
 from flexgs_edge.files import temporary_name
 from flexgs_edge.goals.steps import SearchResult, step_words
 from flexgs_edge.methods.paper.auto_bits import bits_by_sensitivity
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.methods.paper.score_cache import ScoreCache
 from flexgs_edge.methods.paper.score_files import load_scores, save_scores
@@ -65,8 +65,8 @@ def compress(
         with run.clock.stage("open"):
             has_sh = nonzero_sh(run.source)
         bits, groups = run.options.bit_spec()
-        renderer, decide = (None, None) if bench is None or judges is None else (bench.renderer, judges.decide)
-        evaluator = SceneEvaluator(run.source, ranking.order, has_sh, PAPER, groups, renderer, decide, run.budget)
+        ranked = Ranked(run.source, ranking.order, has_sh)
+        evaluator = SceneEvaluator(ranked, PAPER, groups, None if judges is None else judges.decide, run.budget)
         sensitivity: list[Sensitivity] = []
         if bits is None:
             assert bench is not None

@@ -45,7 +45,7 @@ def load_scores(path: str | Path, count: int) -> np.ndarray:
         raise InputError(
             f"{path}: expected {count} numbers, one a Gaussian of the scene; found shape {loaded.shape}, dtype {loaded.dtype}"
         )
-    scores = loaded.astype(np.float64)
+    scores: np.ndarray = loaded.astype(np.float64)
     bad = np.flatnonzero(np.isnan(scores) | (scores == np.inf))
     if len(bad):
         raise InputError(

@@ -63,7 +63,8 @@ def score_scene(
     with np.errstate(divide="ignore"):  # log(0) = -inf is what unseen Gaussians get
         if kind == "gs":
             return log_opacity + VOLUME_POWER * volume + np.log(statistics.hits.astype(np.float64))
-        return VOLUME_POWER * volume + np.log(statistics.weight_sums)
+        scores: np.ndarray = VOLUME_POWER * volume + np.log(statistics.weight_sums)
+        return scores
 
 
 def gather_statistics(

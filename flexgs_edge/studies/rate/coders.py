@@ -65,7 +65,8 @@ def _byte_planes(values: np.ndarray) -> bytes:
         return b""
     shifted = (values - values.min()).astype("<u8")
     width = max(-(-int(shifted.max()).bit_length() // 8), 1)
-    return shifted.view(np.uint8).reshape(-1, 8)[:, :width].T.tobytes()
+    shuffled: bytes = shifted.view(np.uint8).reshape(-1, 8)[:, :width].T.tobytes()
+    return shuffled
 
 
 def _lzma(data: bytes) -> bytes:

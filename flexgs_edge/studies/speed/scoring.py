@@ -152,16 +152,7 @@ def _evaluator(studied: StudyScene, order: np.ndarray) -> SceneEvaluator:
     """As `studied.evaluator`, with rows in another order."""
     bits, groups = studied.run.options.bit_spec()
     assert bits is not None
-    return SceneEvaluator(
-        studied.run.source,
-        order,
-        studied.has_sh,
-        bits,
-        groups,
-        studied.bench.renderer,
-        studied.judge,
-        studied.run.budget,
-    )
+    return SceneEvaluator(studied.ranked(order), bits, groups, studied.judge, studied.run.budget)
 
 
 def _quality(studied: StudyScene, rows: list[dict[str, Cell]], count: int) -> Experiment:

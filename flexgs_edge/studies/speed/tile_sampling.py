@@ -130,7 +130,8 @@ class TileSampler:
         keys = np.random.default_rng(seed).random(len(self._tiles))
         order = np.lexsort((keys, self._stratum))
         place = np.arange(len(order)) - self._starts[self._stratum]
-        return self._tiles[order[place < self._drawn[self._stratum]]]
+        tiles: np.ndarray = self._tiles[order[place < self._drawn[self._stratum]]]
+        return tiles
 
     def estimate(self, drawn: np.ndarray, errors: np.ndarray) -> Estimate:
         """The figures of all tiles.

@@ -13,7 +13,7 @@ from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.io.exchange import near_order
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.report.plots import LineChart
 from flexgs_edge.scene.source import MemorySource, SceneSource
@@ -161,4 +161,4 @@ def _reordered(grid: GridScene, order: np.ndarray) -> GridScene:
 
 def _evaluator(studied: StudyScene, source: SceneSource, has_sh: np.ndarray, bits: BitSpec = PAPER) -> SceneEvaluator:
     order = np.arange(source.count)
-    return SceneEvaluator(source, order, has_sh, bits, None, studied.bench.renderer, studied.judge, studied.run.budget)
+    return SceneEvaluator(Ranked(source, order, has_sh), bits, None, studied.judge, studied.run.budget)

@@ -15,7 +15,7 @@ from flexgs_edge.io.ply import write_ply
 from flexgs_edge.methods.best.grid_coder import SETTINGS_MOST, GridCoder
 from flexgs_edge.methods.best.keep import kept_as_it_is
 from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.methods.paper.search import adapt
@@ -144,14 +144,7 @@ def _again(studied: StudyScene, source: SceneSource, size: int) -> Whole:
 
 def _evaluator(studied: StudyScene, source: SceneSource, order: np.ndarray, setting: Setting) -> SceneEvaluator:
     return SceneEvaluator(
-        source,
-        order,
-        nonzero_sh(source),
-        setting.bits,
-        setting.groups,
-        studied.bench.renderer,
-        studied.judge,
-        studied.run.budget,
+        Ranked(source, order, nonzero_sh(source)), setting.bits, setting.groups, studied.judge, studied.run.budget
     )
 
 

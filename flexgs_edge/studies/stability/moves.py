@@ -14,7 +14,7 @@ from flexgs_edge.cameras.order import farthest_order
 from flexgs_edge.errors import FlexGSError
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.io.ply import write_ply
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores, ranks_from_order, select_rows
 from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
@@ -137,9 +137,7 @@ class Place:
         has_sh = nonzero_sh(self.source)
         bits, groups = self.studied.run.options.bit_spec()
         assert bits is not None
-        evaluator = SceneEvaluator(
-            self.source, order, has_sh, bits, groups, self.renderer, judge, self.studied.run.budget
-        )
+        evaluator = SceneEvaluator(Ranked(self.source, order, has_sh), bits, groups, judge, self.studied.run.budget)
         rows = np.sort(np.concatenate(select_rows(ranks_from_order(order), choice, has_sh)))
         return Found(rows, evaluator.size(choice), evaluator.measure(choice).fidelity)
 

@@ -262,13 +262,4 @@ def _score(studied: StudyScene, score: str, cameras: Sequence[Camera]) -> np.nda
 def _ranked(studied: StudyScene, order: np.ndarray) -> SceneEvaluator:
     bits, groups = studied.run.options.bit_spec()
     assert isinstance(bits, BitSpec)
-    return SceneEvaluator(
-        studied.run.source,
-        order,
-        studied.has_sh,
-        bits,
-        groups,
-        studied.bench.renderer,
-        studied.judge,
-        studied.run.budget,
-    )
+    return SceneEvaluator(studied.ranked(order), bits, groups, studied.judge, studied.run.budget)

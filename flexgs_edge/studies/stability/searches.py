@@ -106,7 +106,7 @@ class World:
 
     def size_at(self, multiplier: float) -> int:
         """Bytes at a multiplier: no fewer than at the farthest."""
-        return round(BYTES * min(multiplier / MIDDLE, FARTHEST) ** SIZE_BY_MULTIPLIER)
+        return round(BYTES * float(min(multiplier / MIDDLE, FARTHEST) ** SIZE_BY_MULTIPLIER))
 
     def place_at(self, multiplier: float) -> float:
         """Log of the smooth loss at a multiplier: never less than that of the whole scene."""

@@ -13,7 +13,7 @@ from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.methods.best.choose_steps import holdable, reachable
 from flexgs_edge.methods.best.rounds import take_rows
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.report.plots import BarChart
 from flexgs_edge.scene.fields import FIELD, FIELDS
@@ -37,7 +37,8 @@ AGAINST = {"log_scales": -1.0}
 
 def unseen_direction(cameras: Sequence[Camera], middle: np.ndarray, distance: float) -> np.ndarray | None:
     """[3] f64: a direction in which nothing so far from `middle` is in any view; None where views go all around."""
-    for direction in fibonacci(DIRECTIONS):
+    directions: list[np.ndarray] = list(fibonacci(DIRECTIONS))
+    for direction in directions:
         place = middle + distance * direction
         if not any(_in_view(camera, place) for camera in cameras):
             return direction
@@ -132,9 +133,7 @@ def _coded(
 
     def evaluator(bits: BitSpec, groups: int | None) -> SceneEvaluator:
         order = np.arange(source.count)
-        return SceneEvaluator(
-            source, order, has_sh, bits, groups, studied.bench.renderer, studied.judge, studied.run.budget
-        )
+        return SceneEvaluator(Ranked(source, order, has_sh), bits, groups, studied.judge, studied.run.budget)
 
     rtn = BitSpec.rtn(BITS)
     return [
