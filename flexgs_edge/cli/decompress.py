@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("input", metavar="INPUT", type=click.Path())
-@shared_options.option(
-    "Output", "-o", "--output", metavar="OUT", required=True, help="File to write: .ply, .spz, .sog or .compressed.ply."
+@help_page.option(
+    help_page.OUTPUT, "-o", "--output", metavar="OUT", required=True, help="File to write: .ply, .spz, .sog or .compressed.ply."
 )
-@shared_options.option(
-    "Run",
+@help_page.option(
+    help_page.DEVICE,
     "--device",
     metavar="SPEC",
     help="What decodes a large .fgs of --method best: an OpenCL processor (its number, part of its name, or cpu), or numpy: the "
     "same bits, four times slower. Default: the first CPU, where there are enough Gaussians to make up for opening it.",
 )
 @shared_options.memory_option
-@shared_options.force_option
-@shared_options.json_option
-@shared_options.talk_options
+@shared_options.write_options
 def command(
     input: str,
     output: str,

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 from flexgs_edge.commands.devices import device_lines
 from flexgs_edge.errors import DeviceError
 
 
-@click.command(cls=shared_options.SectionCommand)
-@shared_options.option(
-    "Run", "--device", metavar="SPEC", help="Show which device this would choose: a number, part of a name, cpu or gpu."
+@click.command(cls=help_page.SectionCommand)
+@help_page.option(
+    help_page.DEVICE, "--device", metavar="SPEC", help="Show which device this would choose: a number, part of a name, cpu or gpu."
 )
-@shared_options.force_option
-@shared_options.json_option
-@shared_options.talk_options
+@shared_options.write_options
 def command(device: str | None, force: bool, json_path: str | None, quiet: bool) -> None:
     """List the OpenCL devices, their limits, whether they pass the self-test, and which one is used and why.
 

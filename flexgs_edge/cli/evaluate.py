@@ -6,19 +6,19 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @shared_options.scene_argument
-@shared_options.option(
+@help_page.option(
     "Quality",
     "--against",
     metavar="REF",
     required=True,
     help="The original: any scene, such as its .ply or model folder.",
 )
-@shared_options.option(
+@help_page.option(
     "Quality",
     "--lpips",
     is_flag=True,

@@ -7,20 +7,20 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 from flexgs_edge.errors import InputError
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("file", metavar="FILE", type=click.Path())
-@shared_options.option(
+@help_page.option(
     "Errors",
     "--errors",
     is_flag=True,
     help="Also measure what each channel and SH degree of a .fgs is worth: the bytes saved and the quality lost with one bit "
     "less of it, and without it. Takes as long as drawing the views some 15 times.",
 )
-@shared_options.option(
+@help_page.option(
     "Errors",
     "--picture",
     metavar="FILE",

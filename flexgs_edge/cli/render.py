@@ -6,17 +6,17 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk, value_types
+from flexgs_edge.cli import help_page, shared_options, talk, value_types
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @shared_options.scene_argument
-@shared_options.option(
-    "Output", "-o", "--output", metavar="DIR", required=True, help="Folder for the PNG files; made if missing."
+@help_page.option(
+    help_page.OUTPUT, "-o", "--output", metavar="DIR", required=True, help="Folder for the PNG files; made if missing."
 )
 @shared_options.cameras_option
-@shared_options.option(
-    "Views",
+@help_page.option(
+    help_page.VIEWS,
     "--views",
     type=value_types.VIEWS,
     help="Views to draw, counted from 0 in order of name: 0,8,16 or START:STOP:STEP such as 0:50:8. Default: all.",

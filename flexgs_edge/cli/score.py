@@ -6,13 +6,13 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @shared_options.scene_argument
-@shared_options.option("Output", "-o", "--output", metavar="SCORES.npy", required=True, help="NumPy file to write.")
-@shared_options.option(
+@help_page.option(help_page.OUTPUT, "-o", "--output", metavar="SCORES.npy", required=True, help="NumPy file to write.")
+@help_page.option(
     "Method",
     "--score",
     type=click.Choice(["gs", "meson"]),

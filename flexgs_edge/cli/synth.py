@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("output", metavar="OUT.ply", type=click.Path())
-@shared_options.option(
+@help_page.option(
     "Scene", "--from", "input", metavar="SCENE", required=True, help="The scene to make it from: any INPUT of compress."
 )
-@shared_options.option(
+@help_page.option(
     "Scene",
     "--gaussians",
     metavar="N",
@@ -20,7 +20,7 @@ from flexgs_edge.cli import shared_options, talk
     required=True,
     help="Gaussians to write, exactly; at least as many as SCENE has.",
 )
-@shared_options.option(
+@help_page.option(
     "Scene",
     "--seed",
     metavar="N",
@@ -30,9 +30,7 @@ from flexgs_edge.cli import shared_options, talk
     help="Chooses which Gaussians get one part more than others.",
 )
 @shared_options.memory_option
-@shared_options.force_option
-@shared_options.json_option
-@shared_options.talk_options
+@shared_options.write_options
 def command(
     output: str,
     input: str,

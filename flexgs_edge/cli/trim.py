@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import shared_options, talk, value_types
+from flexgs_edge.cli import help_page, shared_options, talk, value_types
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("input", metavar="IN.fgs", type=click.Path())
-@shared_options.option("Output", "-o", "--output", metavar="OUT.fgs", required=True, help="File to write.")
-@shared_options.option(
-    "Output",
+@help_page.option(help_page.OUTPUT, "-o", "--output", metavar="OUT.fgs", required=True, help="File to write.")
+@help_page.option(
+    help_page.OUTPUT,
     "--max-size",
     type=value_types.SIZE,
     required=True,
     help="Bytes that it may have, such as 800kB (10^3) or 1MiB (2^20): as many whole layers as fit are kept.",
 )
-@shared_options.force_option
-@shared_options.json_option
-@shared_options.talk_options
+@shared_options.write_options
 def command(input: str, output: str, max_size: int, force: bool, json_path: str | None, quiet: bool) -> None:
     """Cut a layered .fgs file to a size, at the speed of copying.
 

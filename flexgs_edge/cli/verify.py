@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 from flexgs_edge.errors import FormatError
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("file", metavar="FILE.fgs", type=click.Path())
-@shared_options.force_option
-@shared_options.json_option
-@shared_options.talk_options
+@shared_options.write_options
 def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
     """Check every byte of a .fgs file against its checksums.
 

@@ -6,13 +6,13 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("scenes", metavar="SCENE...", type=click.Path(), nargs=-1, required=True)
 @shared_options.results_option
-@shared_options.option(
+@help_page.option(
     "Search",
     "--max-drop",
     metavar="DB",

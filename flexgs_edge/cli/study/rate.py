@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
 class RatiosType(click.ParamType):
@@ -29,16 +29,16 @@ class RatiosType(click.ParamType):
 RATIOS = RatiosType()
 
 
-def effort_option(name: str, default: str, text: str) -> Callable[[shared_options.Decorated], shared_options.Decorated]:
+def effort_option(name: str, default: str, text: str) -> Callable[[help_page.Decorated], help_page.Decorated]:
     """A choice of effort."""
     efforts = click.Choice(["fast", "balanced", "thorough"])
-    return shared_options.option("Points", name, type=efforts, default=default, show_default=True, help=text)
+    return help_page.option("Points", name, type=efforts, default=default, show_default=True, help=text)
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
-@shared_options.option(
+@help_page.option(
     "Points",
     "--ratios",
     type=RATIOS,
@@ -47,7 +47,7 @@ def effort_option(name: str, default: str, text: str) -> Callable[[shared_option
     help="Ratios to the PLY that best and paper aim at.",
 )
 @effort_option("--effort", "balanced", "Steps of the search for these points, as for compress.")
-@shared_options.option(
+@help_page.option(
     "Points",
     "--ablations",
     type=RATIOS,
@@ -58,7 +58,7 @@ def effort_option(name: str, default: str, text: str) -> Callable[[shared_option
 @effort_option(
     "--ablation-effort", "fast", "Steps of the search without a part, and of the whole method that it is held against."
 )
-@shared_options.option(
+@help_page.option(
     "Points",
     "--distilled",
     type=RATIOS,

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
 class PartsType(click.ParamType):
@@ -23,10 +23,10 @@ class PartsType(click.ParamType):
 PARTS = PartsType()
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
-@shared_options.option(
+@help_page.option(
     "Parts",
     "--parts",
     type=PARTS,
@@ -34,13 +34,13 @@ PARTS = PartsType()
     show_default=True,
     help="What to measure.",
 )
-@shared_options.option(
+@help_page.option(
     "Parts", "--repeats", type=int, default=5, show_default=True, help="Rounds of timing; the least counts."
 )
-@shared_options.option(
+@help_page.option(
     "Parts", "--trials", type=int, default=200, show_default=True, help="Samples of tiles of every size, for sampling."
 )
-@shared_options.option(
+@help_page.option(
     "Parts",
     "--max-drop",
     metavar="DB",

@@ -6,19 +6,19 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
-@shared_options.option(
+@help_page.option(
     "Points",
     "--quick",
     is_flag=True,
     help="Few points of every experiment, on views 120 pixels wide: a minute in place of a quarter of an hour.",
 )
-@shared_options.option(
+@help_page.option(
     "Points",
     "--max-drop",
     metavar="DB",
