@@ -112,8 +112,8 @@ More examples:
     MACHINES,
     "--cluster",
     metavar="ADDRESS|local:N",
-    help="Draw views on a Dask cluster, such as tcp://HOST:8786, or in N processes here. The bytes stay the same. "
-    "Install: pip install 'flexgs-edge[cluster]'.",
+    help="Draw views in N processes here (local:N) or on a Dask cluster, such as tcp://HOST:8786. Needs "
+    "pip install 'flexgs-edge[cluster]'. The bytes stay the same.",
 )
 @option(OUTPUT, "-o", "--output", metavar="OUT", help="File to write: .fgs, .spz, .sog or .compressed.ply.")
 @option(
@@ -126,7 +126,7 @@ More examples:
     help="Layers, up to 4, that `flexgs-edge trim` can cut. More: slightly larger file.",
 )
 @shared_options.report_option
-@option(OUTPUT, "--dry-run", is_flag=True, help="Do everything but write. The size shown is exact.")
+@option(OUTPUT, "--dry-run", is_flag=True, help="Write nothing (no -o needed). The size shown is exact.")
 @option(
     METHOD,
     "--method",
@@ -141,8 +141,8 @@ More examples:
     metavar="keep|drop|N%",
     default="keep",
     show_default=True,
-    help="What to do with Gaussians that no training view sees: keep them without view-dependent colour, drop them, or keep "
-    "the largest and most opaque N %.",
+    help="What to do with Gaussians that no training view sees. keep: without view-dependent colour. drop: leave them out. "
+    "N%: only the largest and most opaque N %.",
 )
 @option(
     METHOD,
@@ -194,8 +194,8 @@ More examples:
     metavar="SPEC",
     default="paper",
     show_default=True,
-    help="Bits of each value. paper: xyz=16,dc=8,scale=8,rot=8,opacity=4,rest=4. Some of these, such as rest=3,dc=7: the others "
-    "as in paper. auto: searched. rtn8, rtn4, ...: as many for every value, one range a channel (a weak baseline).",
+    help="Bits of each value. paper: xyz=16,dc=8,scale=8,rot=8,opacity=4,rest=4. A list such as rest=3,dc=7: the others as in "
+    "paper. auto: searched. rtn8, rtn4, ...: as many for all values (a weak baseline).",
 )
 @option(
     METHOD,

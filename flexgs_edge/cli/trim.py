@@ -15,14 +15,14 @@ from flexgs_edge.cli import help_page, shared_options, talk, value_types
     "--max-size",
     type=value_types.SIZE,
     required=True,
-    help="Bytes that it may have, such as 800kB (10^3) or 1MiB (2^20): as many whole layers as fit are kept.",
+    help="Largest size of the new file, such as 800kB or 1MiB.",
 )
 @shared_options.write_options
 def command(input: str, output: str, max_size: int, force: bool, json_path: str | None, quiet: bool) -> None:
-    """Cut a layered .fgs file to a size, at the speed of copying.
+    """Cut a layered .fgs file to a size, without the original.
 
-    Needs neither the original nor cameras: the file's layers run from coarse to fine, and any number of the first ones is a
-    valid scene. The new file says in info what it was cut from.
+    compress --layers writes layers, from coarse to fine. trim keeps as many of the first layers as fit. The result is a valid
+    scene, and info says what it was cut from. This takes as long as copying the file.
 
     \b
     Examples:

@@ -14,14 +14,14 @@ from flexgs_edge.errors import FormatError
 def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
     """Check every byte of a .fgs file against its checksums.
 
-    Names every part with its place, and those that are damaged. Reads the file in pieces, so any size will do.
+    Lists the parts of the file and marks the damaged ones. Reads the file in pieces: a large file needs no more memory.
 
     \b
     Examples:
       flexgs-edge verify scene.fgs
       flexgs-edge verify scene.fgs -q > /dev/null && echo whole
 
-    Exit code 0: every part is whole. 2: something is damaged.
+    Exit code 0: every part is whole. Exit code 2: something is damaged.
     """
     talk.start(quiet, json_path, force)
     from flexgs_edge.commands.verify import verify, verify_json, verify_text

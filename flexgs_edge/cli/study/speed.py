@@ -32,13 +32,25 @@ PARTS = PartsType()
     type=PARTS,
     default="drawing,scoring,sampling,presets,scaling",
     show_default=True,
-    help="What to measure.",
+    help="What to measure. Fewer parts are faster.",
 )
 @help_page.option(
-    "Parts", "--repeats", type=int, default=5, show_default=True, help="Rounds of timing; the least counts."
+    "Parts",
+    "--repeats",
+    metavar="N",
+    type=int,
+    default=5,
+    show_default=True,
+    help="Repeats of each timing; the shortest counts. More is slower, more exact.",
 )
 @help_page.option(
-    "Parts", "--trials", type=int, default=200, show_default=True, help="Samples of tiles of every size, for sampling."
+    "Parts",
+    "--trials",
+    metavar="N",
+    type=int,
+    default=200,
+    show_default=True,
+    help="Random samples of each size, for sampling. More is slower, more exact.",
 )
 @help_page.option(
     "Parts",
@@ -47,7 +59,7 @@ PARTS = PartsType()
     type=float,
     default=1.0,
     show_default=True,
-    help="Target of the whole runs, and of the paper's search that scoring and sampling build on.",
+    help="Loss of PSNR that whole runs and searches aim at.",
 )
 @shared_options.study_options
 def command(
@@ -63,16 +75,15 @@ def command(
     """Chart speed against accuracy for a scene.
 
     \b
-    drawing   time of a view against its PSNR to the exact one: fewer SH, splats
-              left out by opacity, extents, half precision, small pictures
-    scoring   time of scoring against what it is worth at one size, by the number
-              of views scored; and how stable the ranks are
-    sampling  fidelity estimated from a part of the tiles, with its interval
-    presets   time of whole runs of compress against the ratio that they find
-    scaling   how times grow with Gaussians, pixels and views
+      drawing   time of a view against its PSNR to the exact one: fewer SH,
+                faint splats left out, half precision, small pictures
+      scoring   time of scoring against the quality at one size, by the
+                number of views scored
+      sampling  fidelity estimated from a part of each view
+      presets   time of whole runs of compress against the ratio reached
+      scaling   time by number of Gaussians, pixels and views
 
-    DIR appears when everything is done: index.html, and every part's rows and chart as CSV, JSON, PNG and SVG. Times are those of
-    this machine; close other programs.
+    Results appear in DIR when all is done: open DIR/index.html. Times are those of this machine: close other programs.
 
     \b
     Examples:
