@@ -38,8 +38,8 @@ def command(scenes: tuple[str, ...], output: str, json_path: str | None, quiet: 
       rates       quality at ratios from 8x to 256x
       times       time and memory
 
-    SCENE is an INPUT of compress. --cameras and --images hold for all scenes. Results appear in DIR when all is done: open DIR/index.html, with a
-    folder for each scene. All but the times is the same in every run.
+    SCENE is an INPUT of compress. --cameras and --images hold for all scenes. Results appear in DIR when all is done: open
+    DIR/index.html. All but the times is the same in every run.
 
     \b
     Examples:

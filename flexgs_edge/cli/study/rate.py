@@ -85,8 +85,8 @@ def command(
       - --method best without each of its parts: measured costs, measuring
         again, the refit, the SH degree of each Gaussian, the context coder
 
-    The same views judge every file: held-out photos where there are some. Results appear in DIR when all is done: open DIR/index.html; rate.csv has
-    all points. More ratios and more effort take longer.
+    The same views judge every file: held-out photos where there are some. Results appear in DIR when all is done: open
+    DIR/index.html; rate.csv has all points. More ratios and more effort take longer.
 
     \b
     Examples:
