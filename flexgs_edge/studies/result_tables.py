@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from flexgs_edge.report import html
+from flexgs_edge.report.html import count
 
 Cell = str | int | float | bool | None
 Row = Mapping[str, Cell]
@@ -63,11 +63,9 @@ class Table:
         """The rows as plain records."""
         return [dict(row) for row in self.rows]
 
-    def to_html(self) -> str:
-        """A table for the page."""
-        return html.table(
-            [column.head for column in self.columns], [[_words(cell) for cell in row.values()] for row in self.rows]
-        )
+    def words(self) -> list[list[str]]:
+        """The rows' cells as people read them."""
+        return [[_words(cell) for cell in row.values()] for row in self.rows]
 
 
 def json_bytes(record: Any) -> bytes:
@@ -100,5 +98,4 @@ def _words(cell: Cell) -> str:
         return "yes" if cell else "no"
     if isinstance(cell, float):
         return f"{cell:.7g}"
-    # Sizes are read by digit groups; a narrow no-break space keeps them in one piece.
-    return f"{cell:,}".replace(",", "\N{NARROW NO-BREAK SPACE}") if isinstance(cell, int) else cell
+    return count(cell) if isinstance(cell, int) else cell
