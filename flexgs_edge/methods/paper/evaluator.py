@@ -1,4 +1,4 @@
-"""What the search asks of a real scene: exact bytes of a choice, and its measured quality."""
+"""Answers the questions of the search for a real scene: exact bytes of a choice, and its measured quality."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import SceneSource
 
 QUANTIZE_COPIES = 4
-"""Times a chunk's planes that quantizing holds at once: as read, gathered, and the codes in between."""
+"""Copies of a chunk's planes that quantizing holds at once: as read, gathered, and codes in between."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class SceneEvaluator:
     groups : int or None
         As for `quantize_scene`.
     judge : Judge or None
-        Draws and compares; `None`: `measure` cannot be asked.
+        Draws and compares. Without one, `measure` and `estimate` fail.
     budget : MemoryBudget
         The quantized scene is taken from it.
     """
@@ -68,11 +68,11 @@ class SceneEvaluator:
         self.budget = budget
         self._ranks = ranks_from_order(ranked.order)
         self._has_sh = ranked.has_sh
-        # SH rows of rank r and above, so that sizes cost nothing: the search asks for hundreds.
+        # Number of SH rows from each rank up. With it sizes cost nothing, and the search asks for hundreds of sizes.
         self._sh_above = np.concatenate([np.cumsum(ranked.has_sh[ranked.order][::-1])[::-1], [0]])
 
     def counts(self, choice: Choice) -> tuple[int, int]:
-        """Rows that stay, and of these with SH."""
+        """Number of rows that stay, and number of these that keep SH."""
         kept = self.source.count - choice.pruned(self.source.count)
         return kept, int(self._sh_above[choice.boundary(self.source.count)])
 
@@ -88,7 +88,7 @@ class SceneEvaluator:
             return measurement_of(self.judge.compare(scene))
 
     def estimate(self, choice: Choice) -> Measurement:
-        """`measure` at a fourth of the pixels."""
+        """As `measure`, from a fourth of the pixels."""
         assert self.judge is not None
         with self.quantized(choice) as quantized, self.judge.renderer.load_quantized(quantized) as scene:
             return measurement_of(self.judge.estimate(scene))
