@@ -1,4 +1,4 @@
-"""One page for a whole study: every chart, table and finding, in one file."""
+"""Makes one HTML page of a study, with every chart, table and finding."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flexgs_edge.studies.experiment import Experiment
 
 @dataclass(frozen=True)
 class Section:
-    """A scene of the page: its name, lines about it, and its experiments with their charts as SVG."""
+    """The part of the page about one scene: its name, facts about it, and its experiments with their charts as SVG."""
 
     name: str
     facts: Sequence[tuple[str, str]]

@@ -1,4 +1,4 @@
-"""Experiments on pruning: ADP against rows or SH alone, the plane of the two rates, and the two scores."""
+"""Experiments on pruning: ADP against pruning only rows or only SH, all pairs of the two rates, and the two scores."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
 from flexgs_edge.studies.study_scene import FIGURES, Point, Setting, StudyScene
 
 DIAGONAL = tuple(range(50, 501, 50))
-"""Rates p = s of the ADP curve, thousandths: a split that nothing was tuned for."""
+"""Rates p = s of the ADP curve, in thousandths. Nothing was tuned for this split."""
 GRID = 100
-"""Step of the plane, thousandths: the paper's candidates lie on it."""
+"""Step of the rates in `plane`, in thousandths. The paper's candidates lie on this grid."""
 MAX_ROWS = 980
-"""Largest rate of row pruning alone, thousandths."""
+"""Largest rate of pruning rows alone, in thousandths."""
 RATES = {"prune_rate": "p (removed)", "sh_rate": "s (SH removed)"}
 
 
@@ -29,9 +29,9 @@ def candidates(studied: StudyScene) -> list[Choice]:
 
 
 def nearest(sizes: Sequence[int], size: int) -> int | None:
-    """Where in `sizes` (falling) the one nearest to `size` stands; `None` when out of reach.
+    """Index of the size nearest to `size` in `sizes` (falling); `None` when out of reach.
 
-    Out of reach: beyond an end by more than half of the step there.
+    A size is out of reach if it lies beyond an end by more than half of the step there.
 
     >>> nearest([90, 50, 10], 40), nearest([90, 50, 10], 0), nearest([90, 50, 10], -20)
     (1, 2, None)
@@ -43,7 +43,7 @@ def nearest(sizes: Sequence[int], size: int) -> int | None:
 
 
 def splits(studied: StudyScene) -> Experiment:
-    """ADP against row pruning only (Row-P) and SH pruning only (SH-P) at equal bytes."""
+    """Compare ADP with row pruning only (Row-P) and SH pruning only (SH-P) at equal bytes."""
     families = {
         "Row-P": [Choice(rate, 0) for rate in range(MAX_ROWS + 1)],
         "SH-P": [Choice(0, rate) for rate in range(1001)],
@@ -97,7 +97,7 @@ def splits(studied: StudyScene) -> Experiment:
 
 
 def _wins(rows: Sequence[dict[str, Cell]], level: str, family: str, figure: str) -> str:
-    """At how many sizes ADP loses less than the family, and by how much in the mean."""
+    """At how many sizes ADP loses less than `family`, and by how much on average."""
     gaps: list[float] = []
     apart = 0.0
     own: dict[str, Cell] = {}
@@ -118,7 +118,7 @@ def _wins(rows: Sequence[dict[str, Cell]], level: str, family: str, figure: str)
 
 
 def plane(studied: StudyScene) -> Experiment:
-    """The loss over (p, s), the line where the target lies, and the path of the search."""
+    """Measure the loss over all (p, s), and show where the target lies and how the search went."""
     search = studied.search
     line = range(0, 1000, GRID)
     cells = [Choice(p, s) for p in line for s in range(0, 1001 - p, GRID)]
@@ -130,7 +130,7 @@ def plane(studied: StudyScene) -> Experiment:
     ]
     for number, step in enumerate(search.steps, 1):
         assert step.measurement is not None
-        # Steps of the list and of the refinement are what the search saw: estimates.
+        # Steps of the list and of the refinement are estimates, because the search saw only these.
         kind = "answer" if step is search.chosen else step.phase
         rows.append(
             {
@@ -197,7 +197,7 @@ def plane(studied: StudyScene) -> Experiment:
 
 
 def _frontier(losses: dict[Choice, float], limit: float) -> list[tuple[float, float]]:
-    """For each s of the grid the p at which the loss first passes `limit`, interpolated; nothing where it never does."""
+    """For each s of the grid, the interpolated p at which the loss first exceeds `limit`; no entry if it never does."""
     found = []
     for s in sorted({choice.sh for choice in losses}):
         line = sorted((choice.prune, loss) for choice, loss in losses.items() if choice.sh == s)
@@ -209,7 +209,7 @@ def _frontier(losses: dict[Choice, float], limit: float) -> list[tuple[float, fl
 
 
 def _monotone(found: dict[Choice, Point], studied: StudyScene) -> str:
-    """How often more pruning loses less, over neighbouring cells and over the sorted list."""
+    """How often more pruning loses less, among neighbouring cells and along the sorted list."""
     rises = []
     for choice, point in found.items():
         for more in ((choice.prune + GRID, choice.sh), (choice.prune, choice.sh + GRID)):
@@ -228,7 +228,7 @@ def _monotone(found: dict[Choice, Point], studied: StudyScene) -> str:
 
 
 def _slope(frontier: Sequence[tuple[float, float]], studied: StudyScene) -> str:
-    """How the frontier lies, against lines of equal bytes."""
+    """The slope of the frontier, compared with lines of equal bytes."""
     if len(frontier) < 2:
         return f"The target lies on fewer than two rows of the plane ({len(frontier)}): no frontier to speak of."
     (p, s), (q, t) = frontier[0], frontier[-1]
@@ -243,7 +243,7 @@ def _slope(frontier: Sequence[tuple[float, float]], studied: StudyScene) -> str:
 
 
 def scores(studied: StudyScene) -> Experiment:
-    """Ranking by gs (hits) against meson (weights), at the paper's candidates."""
+    """Compare the scores gs (hits) and meson (weights) at the paper's candidates."""
     kinds = ("gs", "meson")
     wanted = [Setting(choice, score=score) for choice in candidates(studied) for score in kinds]
     rows: list[dict[str, Cell]] = [
