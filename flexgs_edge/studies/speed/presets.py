@@ -1,4 +1,4 @@
-"""Whole runs of `compress`: time against the ratio at one drop, by method and effort."""
+"""Times whole runs of `compress` for each method and effort, all at one target."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from flexgs_edge.studies.speed.front import front
 LOG = logging.getLogger("flexgs_edge")
 
 PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"), ("best", "thorough"), ("best", "max"))
-"""Method and effort."""
+"""Method and effort of each run."""
 
 
 def presets(path: str | Path, options: CompressOptions, progress: Progress) -> Experiment:

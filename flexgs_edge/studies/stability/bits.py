@@ -1,4 +1,4 @@
-"""Experiments on rounding: fewer bits, other groups and other orders of the rows, and stray values."""
+"""Experiments on rounding: fewer bits, other groups, and other orders of the rows."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ORDERS = ("file", "shuffled", "curve")
 
 
 def rounding(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
-    """Plain rounding from 8 bits down, in ever finer ranges, and ever coarser grids of best."""
+    """Compare plain rounding with 8 bits and fewer, in ranges of three kinds, and ever coarser grids of best."""
     rows: list[dict[str, Cell]] = []
 
     def add(method: str, bits: int | None, coarser: float | None, found: Outcome) -> None:
@@ -103,7 +103,7 @@ def _of_grid(grid: GridScene) -> tuple[int, MemorySource]:
 
 
 def groups(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
-    """Rows that share a range, from few to all, in three orders of the rows."""
+    """Compare numbers of rows that share a range, from few to all, in three orders of the rows."""
     source = studied.run.source
     count = source.count
     orders = {
@@ -154,7 +154,7 @@ def _losses(rows: Sequence[Row]) -> list[float]:
 
 
 def _reordered(grid: GridScene, order: np.ndarray) -> GridScene:
-    """The grid of the same rows, handed over in another order."""
+    """The grid of the same rows, made from another order."""
     planes = {name: values[:, order] for name, values in from_grid(grid).items()}
     return to_grid(planes, grid.sh_degrees[order], grid.steps, grid.origin, rename=False)[0]
 

@@ -1,4 +1,4 @@
-"""Experiments on removal: more and more of the scene, and scores from too few views or from one side only."""
+"""Experiments on pruning: larger and larger shares, and scores from few views or from one side only."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ HEADS = {"scores": "scored", "same": "loss on the same half (dB)", "other": "los
 
 
 def pruning(studied: StudyScene, path: PruneRounds, amounts: Amounts) -> Experiment:
-    """Shares of the Gaussians removed by each score, and shares that lose their SH; 16 bits stand for untouched values."""
+    """Remove shares of the Gaussians, or their SH, by each score. Values have 16 bits, so only removal loses quality."""
     costs = path.snapshots[0]
     removal = np.full(studied.run.source.count, -np.inf)
     removal[path.rows[costs.rows]] = costs.costs.removal
@@ -90,7 +90,7 @@ def pruning(studied: StudyScene, path: PruneRounds, amounts: Amounts) -> Experim
 
 
 def _path_rows(studied: StudyScene, path: PruneRounds, most: int) -> list[dict[str, Cell]]:
-    """The snapshots of the path, until so many thousandths are gone."""
+    """Rows for the snapshots of the rounds, until `most` thousandths are removed."""
     keep = EFFORTS[studied.run.options.effort].keep
     count = studied.run.source.count
     while path.snapshots[-1].count > (1 - most / 1000) * count and path.snapshots[-1].count > 16:
@@ -106,7 +106,7 @@ def _path_rows(studied: StudyScene, path: PruneRounds, most: int) -> list[dict[s
 
 
 def views(studied: StudyScene, amounts: Amounts) -> Experiment:
-    """Scores from ever more views: ranks against those from all, and what removing by them costs."""
+    """Score from more and more views; compare ranks with those from all views, and losses of removing by them."""
     count = len(studied.views.train)
     choice = studied.search.chosen.choice
     rows = [
@@ -156,7 +156,7 @@ def views(studied: StudyScene, amounts: Amounts) -> Experiment:
 
 
 def _settled(rows: Sequence[Row], name: str, figure: str) -> str:
-    """From how many views on ranks and quality are those of all views."""
+    """A sentence: from how many views on ranks and quality are about those of all views."""
     whole = number(rows[-1], figure)
     close = next(row for row in rows if number(row, figure) <= whole + 0.1)
     alike = next(row for row in rows if number(row, "spearman") >= 0.95)
@@ -174,7 +174,7 @@ def half_of(cameras: Sequence[Camera], axis: np.ndarray, middle: float) -> np.nd
 
 
 def longest_axis(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
-    """The direction ([3]) that the cameras are spread most along, and the median along it."""
+    """The direction ([3]) along which the cameras spread most, and their median along it."""
     places = np.array([camera.center for camera in cameras])
     _, _, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
     axis: np.ndarray = axes[0]
@@ -182,7 +182,7 @@ def longest_axis(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
 
 
 def halves(studied: StudyScene, ours: Whole) -> Experiment | None:
-    """Scores from one half of the training poses, judged on held-out views of that half and of the other."""
+    """Score from one half of the training poses; judge on held-out views of this half and of the other."""
     cameras = studied.views.of(studied.views.train)
     axis, middle = longest_axis(cameras)
     near = half_of(cameras, axis, middle)

@@ -1,4 +1,4 @@
-"""Stray values: a few Gaussians that no camera sees, with values far from all others."""
+"""Experiment on stray values: a few Gaussians that no camera sees, with values far from all others."""
 
 from __future__ import annotations
 
@@ -30,13 +30,14 @@ BITS = 8
 METHODS = ("RTN, per tensor", "RTN, per channel", "RTN, sub-groups", "paper (MPQ)", "best")
 DIRECTIONS = 256
 MARGIN = 1.5
-"""Strays lie this far outside of every frame, in half widths."""
+"""Least distance of strays from the middle of every frame, in half widths and half heights."""
 AGAINST = {"log_scales": -1.0}
-"""Signs of strays: a huge splat is in every view, a tiny one in none. Quaternions are coded at unit length: none can stray."""
+"""Signs of stray values by field, otherwise +1. Huge splats would show in every view, so stray scales are tiny. Quaternions are
+coded at unit length, so none can stray."""
 
 
 def unseen_direction(cameras: Sequence[Camera], middle: np.ndarray, distance: float) -> np.ndarray | None:
-    """[3] f64: a direction in which nothing so far from `middle` is in any view; None where views go all around."""
+    """[3] f64, a direction in which no view shows a point at `distance` from `middle`; None if there is no such direction."""
     directions: list[np.ndarray] = list(fibonacci(DIRECTIONS))
     for direction in directions:
         place = middle + distance * direction
@@ -54,14 +55,14 @@ def _in_view(camera: Camera, place: np.ndarray) -> bool:
 
 
 def strays_of(planes: dict[str, np.ndarray], size: float, direction: np.ndarray) -> dict[str, np.ndarray]:
-    """One stray a field but quaternions: the scene's medians, that field `size` spreads away, all at the far place.
+    """One stray for each field but quaternions. It has the scene's medians, except for a far position and its stray field.
 
     Parameters
     ----------
     planes : dict
-        Of the scene.
+        Stored planes of the scene ([width, n] f32 by field).
     size : float
-        In standard deviations of each channel.
+        Distance of the stray values, in standard deviations of each channel.
     direction : np.ndarray
         [3], where no camera looks.
     """
@@ -81,7 +82,7 @@ def strays_of(planes: dict[str, np.ndarray], size: float, direction: np.ndarray)
 
 
 def strays(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
-    """Quantizers with and without strays; the strays are part of what is coded, and in no view."""
+    """Compare quantizers with and without strays. Strays are coded, but no view shows them."""
     source = studied.run.source
     planes = source.read(slice(0, source.count), list(FIELD))
     cameras = [camera.moved(source.origin) for camera in studied.views.cameras]
@@ -146,12 +147,12 @@ def _coded(
 
 
 def _joined(planes: dict[str, np.ndarray], added: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Rows of both; the second has no more channels than the first."""
+    """Rows of both sets of planes. The second may have fewer channels."""
     return {name: np.concatenate([values, added[name][: len(values)]], axis=1) for name, values in planes.items()}
 
 
 def _best(ours: Whole, added: dict[str, np.ndarray] | None) -> tuple[int, MemorySource]:
-    """The rows that best kept and the strays, which it keeps as it does all that no pose sees."""
+    """The rows that best kept, and the strays, which it keeps like all Gaussians that no pose sees."""
     if added is None:
         return ours.size, ours.source
     kept = from_grid(ours.grid)
