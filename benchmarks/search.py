@@ -1,4 +1,4 @@
-"""One step of the search: prune, quantize, dequantize, render the held-out views, compare with renders and photos.
+"""Times one step of the paper's search: prune, quantize, dequantize, render the held-out views, compare.
 
 python -m benchmarks.search [--scene fox|sample] [--device SPEC] [--repeats N]
 """
@@ -41,7 +41,7 @@ def main() -> None:
     judge = Judge(Bench(renderer), scene.source, views, views.held_out)
     with renderer.load(scene.source) as original:
         judge.prepare(original)
-    # Which Gaussians go does not change the cost of a step much: by opacity and volume will do.
+    # The choice of Gaussians hardly changes the time of a step, so opacity times volume will do as a score.
     stored = scene.source.read(slice(0, scene.source.count), ["log_scales", "opacity_logits"])
     scores = stored["opacity_logits"][0] + 0.1 * stored["log_scales"].sum(axis=0)
     order = order_from_scores(scores.astype(np.float64))
