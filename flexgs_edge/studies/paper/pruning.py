@@ -75,8 +75,8 @@ def splits(studied: StudyScene) -> Experiment:
     return Experiment(
         "splits",
         "ADP against row pruning and SH pruning at equal bytes",
-        "The paper's bits throughout. ADP removes a share p of the Gaussians and the SH of a further share s; Row-P and SH-P "
-        "do one of the two, at the rate (in thousandths) whose file is nearest in bytes. SH-P ends where all SH are gone.",
+        "All files have the paper's bits. ADP removes a share p of the Gaussians and the SH of a further share s. Row-P and SH-P "
+        "do one of the two, at the rate (in thousandths) whose file is nearest in bytes. SH-P ends when all SH are removed.",
         table,
         LineChart(
             "Removing Gaussians and SH (ADP), Gaussians only, SH only",
@@ -111,8 +111,8 @@ def _wins(rows: Sequence[dict[str, Cell]], level: str, family: str, figure: str)
         return f"{level}: {family} reaches none of these sizes."
     better = sum(gap > 0 for gap in gaps)
     return (
-        f"{level}: loses less than {family} at {better} of the {len(gaps)} sizes that both reach; the loss of {family} less "
-        f"ADP's is {mean(gaps):+.3f} dB in the mean ({min(gaps):+.3f} to {max(gaps):+.3f}); bytes differ by at most "
+        f"{level}: loses less than {family} at {better} of the {len(gaps)} sizes that both reach; {family} loses "
+        f"{mean(gaps):+.3f} dB more than ADP on average ({min(gaps):+.3f} to {max(gaps):+.3f}). Bytes differ by at most "
         f"{100 * apart:.2f} %."
     )
 
@@ -160,14 +160,14 @@ def plane(studied: StudyScene) -> Experiment:
     return Experiment(
         "plane",
         "The plane of the two rates, and the search on it",
-        f"Every cell is a measured file at the paper's bits. The line is where the {words}, interpolated between cells; dots "
-        f"are the paper's candidates; the path is the search for {studied.target.describe()} "
+        f"Every cell is a measured file at the paper's bits. The line is where the {words}, interpolated between cells. Dots "
+        f"are the paper's candidates. The path shows the search for {studied.target.describe()} "
         f"(effort {studied.run.options.effort}).",
         table,
         PlaneChart(
-            "Loss over the two rates, and the path of the search",
+            "Loss over the two rates, and the steps of the search",
             "p: share of the Gaussians removed",
-            "s: further share whose SH are removed",
+            "s: further share of Gaussians that lose their SH",
             FIGURES[figure],
             {(_number(row, "prune_rate"), _number(row, "sh_rate")): _number(row, figure) for row in grid},
             GRID / 1000,
@@ -276,9 +276,9 @@ def scores(studied: StudyScene) -> Experiment:
             magnitudes=True,
         ),
         (
-            f"meson loses less at {sum(gap < 0 for gap in gaps)} of {len(gaps)} candidates; its loss less that of gs is "
-            f"{mean(gaps):+.3f} dB in the mean ({min(gaps):+.3f} to {max(gaps):+.3f}). Of the lower half of the ranks the two "
-            f"share {100 * same:.0f} %.",
+            f"meson loses less at {sum(gap < 0 for gap in gaps)} of {len(gaps)} candidates; it loses "
+            f"{mean(gaps):+.3f} dB more than gs on average ({min(gaps):+.3f} to {max(gaps):+.3f}). The two scores share "
+            f"{100 * same:.0f} % of the lower half of the ranks.",
         ),
     )
 

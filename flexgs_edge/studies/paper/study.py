@@ -123,9 +123,9 @@ def _write(folder: Path, scenes: Sequence[SceneStudy]) -> None:
         place.mkdir()
         sections.append(write_scene(place, scene))
     intro = (
-        "The experiments of the FlexGaussian paper (Tian et al., ACM MM 2025), made again by flexgs-edge with its own programs, "
-        "containers and quality figures. Sizes are bytes of the finished file; ratios are to the PLY as INRIA writes it. The "
-        "paper's figures are means over its own scenes: beside one scene they give the order of magnitude."
+        "The experiments of the FlexGaussian paper (Tian et al., ACM MM 2025), repeated by flexgs-edge with its own programs, "
+        "containers and quality figures. Sizes are bytes of the finished file. Ratios are to the PLY as INRIA writes it. The "
+        "paper's figures are means over its own scenes, so beside one scene they only give the order of magnitude."
     )
     page = study_page("The paper's evaluation", intro, sections)
     (folder / "index.html").write_text(page, encoding="utf-8")

@@ -86,8 +86,8 @@ def parts(studied: StudyScene) -> Experiment:
     return Experiment(
         "parts",
         "Pruning only, quantization only, both",
-        f"p = {choice.prune / 1000:g}, s = {choice.sh / 1000:g} (the search's choice) and the paper's bits. Without MPQ the "
-        "bytes are 4 for every float32 value that is left, without normals and header; ratios are to the PLY with its normals.",
+        f"p = {choice.prune / 1000:g}, s = {choice.sh / 1000:g} (the search's choice) and the paper's bits. Without MPQ, "
+        "sizes count 4 bytes for every float32 value that is left, no normals, no header. Ratios are to the PLY with normals.",
         table,
         LineChart(
             "What pruning, quantization and both cost",
@@ -128,8 +128,8 @@ def rates(studied: StudyScene) -> Experiment:
     return Experiment(
         "rates",
         "Rate and distortion from 8x to 256x",
-        "For each ratio the search for the best quality in that size, at the paper's bits and with the rates alone to choose. "
-        f"least: nothing pruned; most: the end of the search's range, p = {STRONGEST.prune / 1000:g} and no SH.",
+        "For each ratio we search for the best quality in that size, at the paper's bits; the search chooses only the rates. "
+        f"least: nothing pruned. most: the end of the search's range, p = {STRONGEST.prune / 1000:g} and no SH.",
         table,
         LineChart(
             "Rate and distortion",
@@ -190,8 +190,8 @@ def times(studied: StudyScene) -> Experiment:
         f"Wall seconds of this run: {source.count} Gaussians, {len(views.train)} training and "
         f"{len(studied.plan.decide)} deciding views. The parts of a step are medians of {REPEATS} at the search's answer; "
         "rendering includes comparing with the references. The paper's seconds are for its own, larger scenes and 32 views on "
-        "an RTX 3090: they compare shares, not machines. Memory is the largest that the process has held, "
-        "earlier scenes included.",
+        "an RTX 3090, so compare shares, not machines. Memory is the peak of the process, including "
+        "earlier scenes.",
         table,
         BarChart(
             "A step of the search",

@@ -144,13 +144,13 @@ def parts_of(order: np.ndarray, sh_degree: int) -> tuple[Variant, ...]:
     parts = [
         Variant(
             "gs ranks",
-            "Gaussians go in the order of the paper's score gs, ranked once, in place of measured costs",
+            "Gaussians are removed in the order of the paper's score gs, ranked once, instead of by measured costs",
             path=partial(RankedPath, order=order),
         ),
         Variant(
-            "one pass", "costs of one pass over the whole scene, never measured again as others go", path=OnePassPath
+            "one pass", "costs of one pass over the whole scene, not measured again after removals", path=OnePassPath
         ),
-        Variant("no refit", "colours stay as they are (--no-refit)", refit=False),
+        Variant("no refit", "colours are not refitted (--no-refit)", refit=False),
     ]
     if sh_degree:
         parts += [

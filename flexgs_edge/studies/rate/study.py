@@ -98,9 +98,9 @@ def study_rate(
 
 
 _INTRO = (
-    "What flexgs-edge makes of a scene at many sizes, beside the paper's method and the formats of other programs. Sizes are "
-    "bytes of the finished file; ratios are to the PLY as INRIA writes it. All methods are judged by the same renderer over "
-    "the same views."
+    "Bytes and quality of a scene compressed by flexgs-edge to many sizes, beside the paper's method and the formats of other "
+    "programs. Sizes are bytes of the finished file. Ratios are to the PLY as INRIA writes it. All methods are judged by the "
+    "same renderer over the same views."
 )
 
 

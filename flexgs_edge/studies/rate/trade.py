@@ -13,7 +13,7 @@ from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
 from flexgs_edge.studies.study_scene import FIGURES, StudyScene
 
 CODERS = {
-    "order-0 entropy": "a bound for coders that take each integer by itself, their tables free",
+    "order-0 entropy": "a bound for coders that code each integer by itself, without their tables",
     "lzma": "lzma (Python's, preset 9) on each plane, instead of the context coder",
     "zlib": "zlib (level 9) on each plane, instead of the context coder",
     "fixed bits": "as many bits a value as each plane's range needs, instead of the context coder",
@@ -35,8 +35,8 @@ def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str
         f"Every method at the sizes asked for: best at the effort {effort} and distilled (the effort {MAX}), paper with "
         "its rates to choose, and the whole scene in the formats of other programs as this one writes them. "
         f"{'PSNR and SSIM are against the photos' if with_photos else 'SSIM is against the original: there are no photos'}; "
-        f"{FIDELITY_WORDS}. The rows hold all points of this study, those without a part of the method among them. The first "
-        "seconds of a curve include most of the path of prune and rescore, which its other points go on from.",
+        f"{FIDELITY_WORDS}. The rows hold all points of this study, also those without a part of the method. The first seconds "
+        "of a curve include most of the rounds of pruning, which its other points share.",
         table,
         _chart(table, "Bytes and quality", figure, effort),
         tuple(findings),
@@ -55,7 +55,7 @@ def fidelity(studied: StudyScene, points: Sequence[RatePoint], effort: str) -> E
     return Experiment(
         "fidelity",
         "Bytes and fidelity",
-        f"The same files; {FIDELITY_WORDS}, which a drop against photos does not show: an error may come nearer to a photo.",
+        f"The same files; {FIDELITY_WORDS}, which shows all errors. A drop against photos hides those that come nearer to one.",
         table,
         _chart(table, "Bytes and fidelity", "fidelity", effort),
         (
@@ -186,10 +186,10 @@ def parts(
     return Experiment(
         "parts",
         "Each part earns its place",
-        f"best with one part taken away at a time, at the effort {effort}, against the whole method at that effort, whose points "
-        "are joined by power laws. Other coders hold the same integers: quality is the whole method's, and each plane is coded "
-        "alone, as it is or as differences along the curve. A dash: beyond the whole method's points. Drops of a few hundredths "
-        "of a dB are mostly chance, which way errors fall against the photos: the modelled drop is then the steadier figure.",
+        f"best with one part taken away at a time, at the effort {effort}, compared with the whole method at that effort. "
+        "Power laws join the whole method's points. Other coders code the same integers, so quality is equal; each plane is "
+        "coded alone, as it is or as differences along the curve. A dash means beyond the whole method's points. Drops of a few "
+        "hundredths of a dB are mostly chance; the modelled drop is then the steadier figure.",
         table,
         BarChart(
             "What it costs to leave a part out",

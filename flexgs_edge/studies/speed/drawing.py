@@ -192,10 +192,10 @@ def _experiment(studied: StudyScene, every: Sequence[Way], rows: list[dict[str, 
         "drawing",
         "Time of a view and what it is worth",
         f"The {len(studied.judge.cameras)} deciding views ({studied.judge.cameras[0].width}x{studied.judge.cameras[0].height}), "
-        "drawn whole and read back, in less exact ways; PSNR is against the exact views, mean over the views that differ. "
-        f"Times are the least of {repeats} rounds over all settings, with the scene loaded. Splats below an opacity of 1/255 "
-        "never show. Half precision is that of the stored values: they are drawn in single precision, so its time is that "
-        "of the exact view. Small pictures are enlarged bilinearly for the comparison, which is not timed.",
+        "drawn whole and read back, in less exact ways. PSNR is against the exact views, mean over the views that differ. "
+        f"Times are the shortest of {repeats} rounds over all settings, with the scene loaded. Splats below an opacity of 1/255 "
+        "never show. Half precision is about stored values; they are drawn in single precision, in the time of the exact "
+        "view. Small pictures are enlarged bilinearly for the comparison, which is not timed.",
         table,
         LineChart(
             "Time of a view against its PSNR",

@@ -55,8 +55,8 @@ def presets(path: str | Path, options: CompressOptions, progress: Progress) -> E
     return Experiment(
         "presets",
         "Time of a whole run and the ratio that it finds",
-        f"compress by each method and effort, asked for {target}: opening, scoring, searching, coding and the last look at "
-        "the quality, in one process whose device is started and whose kernels are built before. Nothing is written.",
+        f"compress by each method and effort, asked for {target}: opening, scoring, searching, coding and measuring the final "
+        "quality. All run in one process, whose device is started and whose kernels are built before. Nothing is written.",
         table,
         LineChart(
             "Time of a run against the ratio that it finds",

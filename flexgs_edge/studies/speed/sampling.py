@@ -172,12 +172,12 @@ def _experiment(
         "sampling",
         "Fidelity from a part of the tiles",
         f"The answer of the paper's search (p = {chosen.prune / 1000:g}, s = {chosen.sh / 1000:g}; fidelity {full} when "
-        f"measured whole) over the {len(studied.judge.cameras)} deciding views, estimated {trials} times from tiles of error "
-        "maps that are known whole. Tiles of a view are cut into strata of equal expected error, and two are drawn from "
-        f"each: expected from the map of another step of the search ({'; '.join(words) or 'it had none before its answer'}), "
-        "or with nothing known, strata being runs of neighbours. The interval is one of 95 %, by the delta method. The "
-        "renderer draws whole views: the time is computed, as the measured time of a view without its blending, and the "
-        "share of blending and comparing.",
+        f"measured whole) over the {len(studied.judge.cameras)} deciding views, estimated {trials} times from some tiles of "
+        "complete error maps. Tiles of a view are cut into strata of equal expected error, and two are drawn from each. "
+        f"Errors are expected from another step of the search ({'; '.join(words) or 'it had none before its answer'}); "
+        "with nothing known, strata are runs of neighbours. The 95 % interval is by the delta method. The renderer "
+        "draws whole views, so the time is computed: the measured time of a view without blending, and the share of "
+        "blending and comparing.",
         table,
         LineChart(
             "Time of a measurement against the width of its interval",

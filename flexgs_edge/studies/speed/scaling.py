@@ -116,12 +116,12 @@ def _experiment(studied: StudyScene, rows: list[dict[str, Cell]], repeats: int) 
     return Experiment(
         "scaling",
         "How times grow",
-        f"Gaussians and pixels: ms of a view, mean of the {len(studied.judge.cameras)} deciding ones, drawn and read back; and "
-        "the stages of it with a wait after every kernel, which is why they may sum to more. Gaussians are left out by "
-        "chance, so fewer of them cover less of the picture. Pixels: both sides times "
+        f"Gaussians and pixels: ms of a view, mean of the {len(studied.judge.cameras)} deciding ones, drawn and read back. "
+        "Stages are timed with a wait after every kernel, so their sum may be larger. Gaussians are left out at "
+        "random, so fewer of them cover less of the picture. Pixels: both sides times "
         f"{', '.join(f'{side:g}' for side in SIDES)} from {camera.width}x{camera.height}. Views: ms of counting hits and "
-        f"weights over so many training poses. Times are the least of {repeats} rounds. An exponent is the slope of the "
-        "logarithms over all amounts, not a law.",
+        f"weights over so many training poses. Times are the shortest of {repeats} rounds. An exponent is the slope of the "
+        "logarithms over all amounts.",
         table,
         LineChart(
             "Times of parts and multiples of the scene's own amounts",

@@ -24,8 +24,8 @@ from flexgs_edge.studies.study_scene import FIGURES, RANK_BYTES, StudyScene
 FEWEST = 4
 SCORES = {"gs": "the paper's score gs", "removal": "measured costs of removal"}
 ORDERS = {
-    "covering": "each next pose the one that adds most to what those before it see, as compress takes them",
-    "farthest": "each next pose farthest from those before it",
+    "covering": "each next pose adds most to what those before it see, as in compress",
+    "farthest": "each next pose is farthest from those before it",
     "even": "poses spread evenly by name",
     "first": "the first poses by name",
 }
@@ -173,15 +173,15 @@ def _quality(studied: StudyScene, rows: list[dict[str, Cell]], count: int) -> Ex
     whole = {row["score"]: row for row in rows if row["poses"] == ALL}
     return Experiment(
         "scoring",
-        "Scored views and what they are worth",
+        "Quality by the number of scored views",
         f"The Gaussians are ranked from some of the {count} training poses; then the paper's method removes p = "
         f"{choice.prune / 1000:g} of them and the SH of s = {choice.sh / 1000:g} at its own bits, so all files have one "
-        f"size. gs: {SCORES['gs']}; removal: {SCORES['removal']}, from the pass that measures those of SH as well. covering: "
+        f"size. gs: {SCORES['gs']}; removal: {SCORES['removal']}, from the pass that also measures costs of SH. covering: "
         f"{ORDERS['covering']}; farthest: {ORDERS['farthest']}; even: {ORDERS['even']}. Gaussians that no scored pose sees "
-        "have no score and go first. Seconds are of scoring alone.",
+        "have no score and are removed first. Seconds are of scoring alone.",
         table,
         LineChart(
-            "Time of scoring against what it is worth at one size",
+            "Time of scoring against quality at one size",
             "seconds of scoring (log)",
             FIGURES[figure],
             tuple(_series(rows, score, poses, "seconds", figure) for score in SCORES for poses in COMPARED),

@@ -94,9 +94,9 @@ def study_speed(
 
 
 _INTRO = (
-    "What less work costs: drawing views less exactly, scoring Gaussians from fewer of them, measuring a part of the pixels, and "
-    "searching less. Points that no other beats in time and accuracy are joined as the Pareto front. Times are wall times of "
-    "this run on the device named below; all but the times, and the fronts that they decide, is the same in every run."
+    "The cost of less work: drawing views less exactly, scoring Gaussians from fewer views, measuring a part of the pixels, "
+    "and searching less. The Pareto front joins points that no other point beats in time and accuracy. Times are wall times "
+    "of this run on the device named below. Everything but times, and the fronts that they decide, is equal in every run."
 )
 
 

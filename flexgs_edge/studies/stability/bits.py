@@ -60,9 +60,9 @@ def rounding(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
     return Experiment(
         "bits",
         "Fewer bits",
-        f"RTN rounds every value to the same number of bits, nothing removed: with one range for an attribute, for each of its "
-        f"channels, or for each sub-group of about 512 rows. {MPQ}: 16, 8 and 4 bits in sub-groups. {BEST}: the result at the "
-        "study's target, its rows on grids of ever larger steps, colours not refitted again.",
+        f"RTN rounds every value to the same number of bits and removes nothing. It has one range for an attribute, for each "
+        f"of its channels, or for each sub-group of about 512 rows. {MPQ}: 16, 8 and 4 bits in sub-groups. {BEST}: the result at "
+        "the study's target, put on grids of larger and larger steps without another refit.",
         table,
         LineChart(
             "Fewer bits: where each way of rounding breaks",
@@ -127,8 +127,8 @@ def groups(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
     return Experiment(
         "groups",
         "Group sizes and the order of the rows",
-        "The paper's bits, nothing removed, with a range for every so many consecutive rows (8 bytes a channel each): rows as "
-        "they are in the file, shuffled, or along a space-filling curve. best puts rows in an order of its own.",
+        "The paper's bits, nothing removed, with a range (8 bytes a channel) for each group of consecutive rows. Rows are in the "
+        "order of the file, shuffled, or along a space-filling curve. best puts rows in an order of its own.",
         table,
         LineChart(
             "Rows that share a range",

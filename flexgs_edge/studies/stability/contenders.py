@@ -16,9 +16,9 @@ from flexgs_edge.studies.study_scene import Setting, StudyScene
 BEST, PAPER, RTN, ROWS, SH = "best", "paper", "RTN, 8 bits", "rows only", "SH only"
 MARGIN = "best, --views-margin"
 WORDS = (
-    f"best and paper: the results at the study's target; {MARGIN}: with poses that nobody took among those scored. {RTN}: one "
-    f"range a channel, nothing removed. {ROWS}, {SH}: the paper's bits, and Gaussians or SH alone removed by gs, to "
-    "paper's bytes or as near as they come."
+    f"best and paper: the results at the study's target. {MARGIN}: generated poses are scored too. {RTN}: one "
+    f"range a channel, nothing removed. {ROWS}, {SH}: the paper's bits, with only Gaussians or only SH removed by gs, to "
+    "paper's bytes or as near as possible."
 )
 
 

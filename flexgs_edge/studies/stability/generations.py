@@ -107,9 +107,9 @@ def generations(studied: StudyScene, path: PruneRounds, ours: Whole, amounts: Am
     return Experiment(
         "generations",
         "Generation after generation",
-        "Compressed, decompressed to a PLY and compressed again, each time to the bytes of the first file, judged "
-        f"against the first original. {RTN}: one range a channel. {IN_A_ROW}: first to {FIRST_TIMES:g} times the "
-        "bytes, then what that decompresses to, to the bytes of the first generation.",
+        "The scene is compressed, decompressed to a PLY and compressed again, each time to the bytes of the first file, and "
+        f"judged against the first original. {RTN}: one range a channel. {IN_A_ROW}: first to {FIRST_TIMES:g} times the "
+        "bytes, then from its PLY to the bytes of the first generation.",
         table,
         LineChart(
             "Loss of every generation",

@@ -71,9 +71,8 @@ def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amo
         "heldout",
         "The worst view, and views that decided nothing",
         f"The {len(cameras)} held-out views one by one, against {views}. A worst view within {WORST_TIMES:g} times "
-        f"the mean and {WORST_MORE:g} dB more counts as within. {EVEN}: the search stops by the first, third, ... of "
-        "them; the "
-        f"others decided nothing. {HELD}: no view loses more than {WORST_TIMES:g} times the target. " + WORDS,
+        f"the mean plus {WORST_MORE:g} dB counts as within. {EVEN}: only the first, third, ... view decides. "
+        f"{HELD}: no view loses more than {WORST_TIMES:g} times the target. " + WORDS,
         table,
         BarChart(
             "Mean and worst held-out view",

@@ -254,10 +254,10 @@ def _experiment(rows: list[dict[str, Cell]], names: Sequence[str], train: Sequen
         "Far from the origin, in other units, turned",
         "The scene is written to a PLY again, moved so many units from the origin (with float32 or float64 "
         "positions), scaled (the near plane alike) or turned (SH too), and compressed: best at one multiplier "
-        f"(where a search stops is partly chance), paper at its rates, both scored by {len(train)} poses "
-        f"{train[0].width} pixels wide and judged by {judges} against the moved scene itself. {HALF}: nothing but "
-        "the positions, relative to the world's origin, is rounded, as published programs do. Fidelity of the moved "
-        "file: its renders against those of the scene as it is, before any method. Within bounds: "
+        f"(because where a search stops is partly chance), paper at its rates. Both score {len(train)} poses that are "
+        f"{train[0].width} pixels wide, and {judges} judge against the moved scene itself. {HALF}: only positions are "
+        "rounded, relative to the world's origin, as published programs do. Fidelity of the moved file compares its "
+        "renders with those of the scene as it is, before any method. Within bounds: "
         f"{100 * SAME_KEPT:g} % of the kept Gaussians the same, {100 * MORE_BYTES:g} % of the bytes, "
         f"{OTHER_FIDELITY:g} dB.",
         table,

@@ -68,11 +68,10 @@ def pruning(studied: StudyScene, path: PruneRounds, amounts: Amounts) -> Experim
     return Experiment(
         "pruning",
         "More and more removed",
-        "Gaussians go in the order of a score, all values in 16 bits in sub-groups, so that only removal loses "
-        "anything. gs: the paper's score; meson: MesonGS's; dSE: the measured squared error of removing each alone. "
-        "SH only: every Gaussian stays and the SH of a share go, by gs. best's path: removed in rounds, costs "
-        "measured again and colours refitted after each; its bytes are those of 16 bits a value, for the share that "
-        "stays.",
+        "Gaussians are removed in the order of a score. All values have 16 bits in sub-groups, so only removal loses "
+        "quality. gs: the paper's score. meson: MesonGS's score. dSE: the measured squared error of removing each alone. "
+        "SH only: every Gaussian stays, and a share loses its SH, by gs. best's path: removal in rounds, with costs "
+        "measured again and colours refitted after each; its bytes count 16 bits a value for the share that stays.",
         table,
         LineChart(
             "Removing more and more: where each score breaks",
@@ -138,12 +137,12 @@ def views(studied: StudyScene, amounts: Amounts) -> Experiment:
         "views",
         "Too few views",
         f"Scores from some of the {count} training poses, each next one farthest from those before it, or the first "
-        f"ones by name; then the paper's method removes p = {choice.prune / 1000:g} and the SH of s = "
-        f"{choice.sh / 1000:g}, so all files have one size. removal: measured costs. What no scored pose sees has no "
-        "score, and goes first.",
+        f"ones by name. Then the paper's method removes p = {choice.prune / 1000:g} and the SH of s = "
+        f"{choice.sh / 1000:g}, so all files have one size. removal: measured costs. Gaussians that no scored pose sees "
+        "have no score and are removed first.",
         table,
         LineChart(
-            "Views scored, and what they are worth at one size",
+            "Quality at one size, by the number of scored views",
             "views scored (log)",
             f"loss: {studied.plan.figure} (dB)",
             tuple(curve(part, f"{score}, {poses}", "views", studied.figure) for (score, poses), part in series.items()),
@@ -218,8 +217,8 @@ def halves(studied: StudyScene, ours: Whole) -> Experiment | None:
     return Experiment(
         "halves",
         "Scored from one side",
-        f"{len(some)} of the {len(cameras)} training poses, those on one side of the middle of the path, score (for "
-        "best also refit the colours), at one size for each method; held-out views of that side and of the other "
+        f"{len(some)} of the {len(cameras)} training poses, those on one side of the middle, are scored (best also "
+        "refits colours to them), at one size for each method. Held-out views of that side and of the other "
         "judge.",
         table,
         BarChart(

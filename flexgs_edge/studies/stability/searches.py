@@ -238,12 +238,12 @@ def searches(effort: str) -> Experiment:
     names = [curve.name for curve in CURVES]
     return Experiment(
         "search",
-        "The searches on curves that scenes need not have",
-        "Three searches over a pretended scene whose loss is a known function of what is removed: smooth, with "
+        "The searches on artificial curves",
+        "Three searches over an artificial scene whose loss is a known function of the removed share: smooth, with "
         "waves (more compression may lose less), in steps, nearly flat, with a cliff at the target, and measured "
-        f"with noise, as from a sample of tiles (the worst of {SEEDS} draws). A search fails where it takes "
-        f"{100 * FAR:g} % more bytes than the best possible, misses a target that can be met, or says that one holds "
-        "which does not.",
+        f"with noise, as from a sample of tiles (the worst of {SEEDS} draws). A search fails if it takes "
+        f"{100 * FAR:g} % more bytes than the best possible, misses a target that can be met, or wrongly says that a "
+        "target holds.",
         table,
         BarChart(
             "Bytes beyond the best possible at 1 dB",

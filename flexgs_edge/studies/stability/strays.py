@@ -104,9 +104,9 @@ def strays(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
         "strays",
         "Stray values",
         f"{len(strays_of(planes, 1.0, np.zeros(3))['means'][0])} Gaussians are added where no camera looks, each "
-        "with one attribute so many standard deviations away from all others, and all of them so far from the "
+        "with one attribute far from all others, by so many standard deviations, and a position as far from the "
         f"scene. RTN with {BITS} bits and the paper's bits, nothing removed; best with the rows that it keeps and "
-        "the strays. Views are those without strays." + note,
+        "the strays. Losses are over views that show no strays." + note,
         table,
         BarChart(
             "A few stray values, and what they cost all others",

@@ -104,10 +104,10 @@ def study_stability(
 
 
 _INTRO = (
-    "Where methods break. A method has broken at a point if it loses more than 3 dB there, or ends in an error; "
-    "charts cross out the first such point of each method, and the dashed line is the limit. All files are judged "
-    "by the same renderer; means over few views hide single bad ones, so the worst view, and where it matters the "
-    "worst tile, stand beside them."
+    "Where methods break. A method has broken at a point if it loses more than 3 dB there, or ends in an error. "
+    "Charts cross out the first such point of each method, and the dashed line is the limit. All files are judged "
+    "by the same renderer. Means over few views hide single bad ones, so the worst view, and where it matters the "
+    "worst tile, are shown beside them."
 )
 
 

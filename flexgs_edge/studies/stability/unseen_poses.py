@@ -157,8 +157,8 @@ def poses(studied: StudyScene, contenders: Contenders, amounts: Amounts) -> list
 
 
 _LOOK = (
-    "Fidelity to the original's renders, mean over the views, of the worst view and of the worst tile of "
-    f"{TILE_SIDE}x{TILE_SIDE} pixels; a method has broken where it is more than {BREAK:g} dB below its own at "
+    "Fidelity to the original's renders: mean over the views, worst view, and worst tile of "
+    f"{TILE_SIDE}x{TILE_SIDE} pixels. A method has broken if it is more than {BREAK:g} dB below its own fidelity at "
     "training poses. "
 )
 
@@ -173,13 +173,13 @@ def _by_distance(rows: list[dict[str, Cell]], contenders: Contenders, base: floa
     return Experiment(
         "distance",
         "Nearer and farther",
-        "Held-out poses moved along their axes, so that what is in the middle of the frame is at so many times its distance. "
+        "Held-out poses are moved along their axes, to so many times the distance of the middle of the frame. "
         + _LOOK
         + WORDS,
         table,
         LineChart(
-            "Poses nearer and farther than any that was scored",
-            "distance to what the pose looks at, times",
+            "Poses nearer and farther than the scored ones",
+            "distance to the scene, times",
             "fidelity (dB)",
             tuple(curve(part, name, "amount", "fidelity", every=True) for name, part in series.items()),
             limit=round(base - BREAK, 2) if math.isfinite(base) else None,
