@@ -33,8 +33,8 @@ GEOMETRY_MENDED = 2.0
 """Factor on squared errors of geometry: the colour refit that follows takes back about half of them:
 docs/results/tuning.md#geometry_mended"""
 CHROMA = 2.0
-"""Step sizes of Co and Cg in step sizes of Y. The squared error in red, green and blue is 3 dY^2 + dCo^2 / 2 + 3/4 dCg^2, so
-equal slopes ask for sqrt(6) and 2."""
+"""Step sizes of Co and Cg in step sizes of Y. The squared error in red, green and blue is 3 dY^2 + dCo^2 / 2 + 3/4 dCg^2.
+So equal slopes ask for sqrt(6) and 2."""
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,8 @@ COST_BYTES = 16
 BAND_BYTES = 20
 """Bytes of a row's costs in a snapshot for each SH degree: a cost in double precision, and a mean colour."""
 WORK_PLANES = 11
-"""Copies of its rows' planes (236 bytes a row at degree 3) that making a candidate holds for a moment. These are the rows
-that stay, codes, values of codes twice, colours of the last refit and of this one, and sums of the refit twice. With a
+"""Copies of its rows' planes (236 bytes a row at degree 3) that making a candidate holds for a moment. These are rows, codes,
+twice the values of codes, colours of the last refit and of this one, and twice the sums of the refit. With a
 smaller number, a scene of which nearly all rows stay would exceed its limit: docs/results/tuning.md#work_planes"""
 DESCENTS = 3
 """Copies of the scene's stored planes that the values of all descents take. A strict target keeps more rows and needs fewer

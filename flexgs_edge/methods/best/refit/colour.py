@@ -45,8 +45,8 @@ def refit_colours(
 ) -> dict[str, np.ndarray]:
     """Move colours towards the original's renders, all at once, for a fixed number of rounds.
 
-    Each step adds to every coefficient `relax * sum(Y alpha T r) / sum(|Y| alpha T)` over pixels and poses, with r the
-    original's render minus the present one (SIRT: Gilbert 1972). Gaussians that no pose sees stay as they are.
+    Each step adds `relax * sum(Y alpha T r) / sum(|Y| alpha T)` to every coefficient (SIRT: Gilbert 1972). Sums are over
+    pixels and poses, and r is the original's render minus the present one. Gaussians that no pose sees stay as they are.
 
     Parameters
     ----------
