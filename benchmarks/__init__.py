@@ -1,1 +1,1 @@
-"""Measurements of speed, memory and of the tests themselves; see README.md."""
+"""Benchmarks of speed and memory, and checks of the tests themselves; see README.md."""

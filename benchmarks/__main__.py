@@ -1,4 +1,4 @@
-"""All benchmarks, each in a process of its own: JSON lines to a file, a table to the terminal.
+"""Runs all benchmarks, each in its own process: JSON lines go to a file, a table goes to the terminal.
 
 python -m benchmarks [view splats peak quantize codec coder search twins compress] [--json FILE]
 """

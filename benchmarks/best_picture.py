@@ -1,9 +1,9 @@
-"""Draws docs/images/best.png: what `best` does to the bundled scene, from the records of real runs.
+"""Draws docs/images/best.png: how `best` compresses the bundled scene, from the records of real runs.
 
     python -m benchmarks.best_picture                  # about a minute on two cores
 
-On the left, the bytes that are left after each decision of `--effort balanced`; on the right, every candidate that the search of
-each effort measured.
+The left chart shows the bytes after each decision of `--effort balanced`. The right chart shows every candidate that the
+search of each effort measured.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ INK, GREY = "#222222", "#b9c1c9"
 
 
 def run(*words: str | Path) -> None:
-    """The program, in a process of its own."""
+    """Run the program in its own process."""
     subprocess.run(
         [sys.executable, "-m", "flexgs_edge", *map(str, words)], cwd=ROOT, stdout=subprocess.DEVNULL, check=True
     )
 
 
 def records(effort: str, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What `compress` says of its search, and `info` of the file."""
+    """The JSON records of `compress` and of `info`."""
     file, search, contents = (folder / f"{effort}{suffix}" for suffix in (".fgs", ".json", "-info.json"))
     run("compress", SCENE, "-o", file, "--effort", effort, "--json", search, "-q")
     run("info", file, "--json", contents)
@@ -45,7 +45,7 @@ def records(effort: str, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def draw_bytes(axes: Axes, search: dict[str, Any], contents: dict[str, Any]) -> None:
-    """Bytes after each decision, as a PLY would take them, and the file's."""
+    """Draw the bytes of a PLY after each decision, and the bytes of the file."""
     given, kept = search["input"], search["count"]
     row = given["ply_bytes"] // given["count"]
     bare = row - 3 * ((given["sh_degree"] + 1) ** 2 - 1) * FLOAT
@@ -67,7 +67,7 @@ def draw_bytes(axes: Axes, search: dict[str, Any], contents: dict[str, Any]) -> 
 
 
 def draw_search(axes: Axes, searches: dict[str, dict[str, Any]]) -> None:
-    """Every candidate: filled where the target holds, with a ring where it is the answer."""
+    """Draw every candidate. It is filled if the target holds, and has a ring if it is the answer."""
     for effort, search in searches.items():
         steps, colour = search["search"], EFFORTS[effort]
         sizes, drops = [step["size"] / 1e3 for step in steps], [step["drop"] for step in steps]

@@ -1,10 +1,10 @@
-"""The real coder (container version 2): a scene onto its grid, into a file, and back to a PLY, M Gaussians a second.
+"""Times the coder of container version 2: a scene to its grid, to a file, and back to a PLY, in M Gaussians a second.
 
 python -m benchmarks.codec [--scene fox|sample] [--rows N] [--repeats N] [--device SPEC]
 
-Rows are copies of the scene's larger Gaussians side by side with a little noise, half of them with SH as a search would
-leave them; `--rows 0` takes these rows once. Everything is NumPy, but for what is "on the device" and "file to PLY"; the
-rate of the last leaves out the seconds that opening the device and building its kernels took.
+Rows are copies of the scene's larger Gaussians with a little noise, side by side. Half of them have SH, as after a search.
+`--rows 0` takes these Gaussians once. Everything is NumPy except results "on the device" and "file to PLY". The rate of
+the last one leaves out opening the device and building its kernels.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from flexgs_edge.methods.best.grid_coder import bit_model
 from flexgs_edge.scene.fields import FIELD
 
 KEPT = 0.47
-"""Share of the scene's rows that is taken: the largest and least transparent."""
+"""Share of the scene's rows to take: the largest and most opaque ones."""
 DEGREES = (0.5, 0.65, 0.8)
-"""Ranks by the size of their SH from which rows have SH of degree 1, 2 and 3."""
+"""Rows get SH of degree 1, 2 and 3 from these ranks on, by the size of their SH."""
 
 
 def some_rows(path: Path, count: int, steps: StepSizes) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Planes of `count` rows (0: once all that are kept), and their SH degrees."""
+    """Planes of `count` rows (0: the taken rows once), and their SH degrees."""
     source = PlySource(path)
     planes = source.read(slice(0, source.count), list(FIELD))
     size = planes["log_scales"].sum(axis=0) + planes["opacity_logits"][0]
@@ -111,7 +111,7 @@ def main() -> None:
             rate("codec: encode on the device", lambda: write_grid(path, grid, {}, force=True, device=backend))
             source = GridSource(path)
             with source.on_device(backend, source.threads):
-                source.read(slice(0, 1), ["means"])  # the first launch builds
+                source.read(slice(0, 1), ["means"])  # the first launch builds kernels
                 rate("codec: decode on the device", source.grid)
         rate("codec: file to PLY in NumPy", lambda: decompress(path, ply, force=True, device="numpy"))
         rate("codec: file to PLY", lambda: decompress(path, ply, force=True, device=options.device))

@@ -1,7 +1,7 @@
-"""What the coder of container version 2 takes for each channel, beside the order-0 entropy of the same integers.
+"""Bits that the coder of container version 2 takes for each channel, beside the order-0 entropy of the same integers.
 
-Without --file, for the base payload: every Gaussian of the scene, geometry, opacity and constant colour on grids and the constant
-refitted, the SH above degree 0 left exact. What that loses against the held-out photos is measured on decoded values.
+Without --file it codes the base payload: every Gaussian of the scene, with geometry, opacity and refitted constant colour
+on grids, and exact SH above degree 0. The loss against the held-out photos is measured on decoded values.
 
 python -m benchmarks.coder [--scene fox|sample] [--device SPEC] [--file FILE.fgs] [--steps POSITION SCALE ROTATION OPACITY DC]
 """
@@ -40,15 +40,15 @@ from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.references import References
 
 STEPS = (0.002, 0.2, 0.04, 0.3, 0.06)
-"""Of position, scale, rotation, opacity and constant colour, in fox's units."""
+"""Step sizes of position, scale, rotation, opacity and constant colour, in fox's units."""
 MOST_BITS, MOST_DROP = 62.0, 0.15
-"""Bits a Gaussian and dB that the base payload of fox may take and lose."""
+"""Most bits a Gaussian and most dB of loss for the base payload of fox."""
 ROUNDS, SUBSETS = 2, 3
-"""Of the refit."""
+"""Rounds of the refit, and steps of a round."""
 
 
 def entropy_bits(planes: np.ndarray) -> float:
-    """Order-0 entropy of each of the planes ([m, n] integers) by itself, all together in bits."""
+    """Sum of the order-0 entropies of the planes ([m, n] integers), in bits."""
     total = 0.0
     for plane in planes:
         counts = np.unique(plane, return_counts=True)[1]
@@ -57,7 +57,7 @@ def entropy_bits(planes: np.ndarray) -> float:
 
 
 def channels(grid: GridScene) -> dict[str, np.ndarray]:
-    """[m, n] integers of every channel, by the first word of their names in `channel_bytes`."""
+    """[m, n] integers of every channel, by the first word of its name in `channel_bytes`."""
     named = {
         "position": grid.position,
         "scale": grid.scale,
@@ -71,7 +71,7 @@ def channels(grid: GridScene) -> dict[str, np.ndarray]:
 
 
 def report(timer: Timer, path: Path, what: str) -> float:
-    """One result a channel; returns the bits of the whole file a Gaussian."""
+    """Report one result for each channel; returns the bits a Gaussian of the whole file."""
     source = GridSource(path)
     grid, coded = source.grid(), channel_bytes(path)
     coded["position"] += coded.pop("repeats")
@@ -106,7 +106,7 @@ def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str |
         planes = source.read(slice(0, source.count), list(FIELD))
         grid, order = to_grid(planes, np.zeros(source.count, np.uint8), steps, source.origin)
         exact = {"sh_rest": np.ascontiguousarray(planes["sh_rest"][:, order])}
-        # The refit starts from the colours as they were, beside geometry from the grid.
+        # The refit starts from the original colours, with geometry from the grid.
         start = {**from_grid(grid), **exact, "sh_dc": np.ascontiguousarray(planes["sh_dc"][:, order])}
         degrees = np.full(source.count, source.sh_degree, np.uint8)
         with targets:

@@ -1,4 +1,4 @@
-"""The whole of `flexgs-edge compress`, as a user starts it: wall time and peak memory, kernel cache cold and warm.
+"""Measures a whole run of `flexgs-edge compress`: wall time and peak memory, with a cold and a warm kernel cache.
 
 python -m benchmarks.compress [--scene fox|sample] [--device SPEC] [--repeats N]
 """

@@ -1,6 +1,6 @@
-"""Changes of small files that a reader should survive: bytes, words of texts, values of JSON, sections of containers.
+"""Damages small files in ways that a reader must survive: bytes, words of texts, values of JSON, sections of containers.
 
-Every function draws its choices from the `random.Random` given, so that the same seed makes the same file.
+Every function draws its choices from a given `random.Random`, so that the same seed makes the same file.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ NUMBERS = (0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x100, 0x7FFF, 0xFFFF, 0x10000, 0x7FFFF
 
 
 def nested(depth: int) -> list[object]:
-    """Lists in lists."""
+    """A list nested `depth` times."""
     value: list[object] = []
     for _ in range(depth):
         value = [value]
@@ -31,13 +31,13 @@ VALUES: tuple[object, ...] = (
     "\ud800", [], [1], [[]], {}, {"a": 1}, "x" * 3000,
     nested(700),
 )  # fmt: skip
-"""What JSON values are replaced with."""
+"""Values that replace a value of JSON."""
 WORDS = (*b"0 -1 1e999 1e308 nan inf 99999999999999999999 4294967296 list double #".split(b" "), b"", b"\n", b"\xff")
-"""What words of text files are replaced with."""
+"""Words that replace a word of a text."""
 
 
 def mutate_bytes(draw: random.Random, data: bytes) -> bytes:
-    """One to four changes: bits, bytes, numbers, and pieces cut, doubled, moved, put in."""
+    """Make one to four changes: to bits, bytes or numbers, or pieces removed, doubled, moved or inserted."""
     made = bytearray(data)
     for _ in range(draw.choice((1, 1, 1, 2, 4))):
         size = len(made)
@@ -64,7 +64,7 @@ def mutate_bytes(draw: random.Random, data: bytes) -> bytes:
 
 
 def mutate_text(draw: random.Random, data: bytes) -> bytes:
-    """Words and lines of a text (or of a PLY's header) replaced, moved and doubled; else any bytes."""
+    """Replace, move or double words and lines of a text (or of a PLY's header), or change any bytes."""
     if draw.random() < 0.3:
         return mutate_bytes(draw, data)
     end = data.find(b"end_header\n")
@@ -80,7 +80,7 @@ def mutate_text(draw: random.Random, data: bytes) -> bytes:
 
 
 def mutate_json(draw: random.Random, data: bytes) -> bytes:
-    """One value of a JSON text replaced, or a key dropped; else its text."""
+    """Replace one value of a JSON text or drop a key, or change its text."""
     if draw.random() < 0.4:
         return mutate_text(draw, data)
     record = json.loads(data)
@@ -101,12 +101,12 @@ def mutate_json(draw: random.Random, data: bytes) -> bytes:
             else:
                 parent[key] = draw.choice(VALUES)  # type: ignore[index]
         except (KeyError, IndexError):
-            continue  # gone with what was changed before
+            continue  # an earlier change removed it
     return json.dumps(record).encode()
 
 
 def mutate_sealed(draw: random.Random, data: bytes, sections: Sequence[Section]) -> bytes:
-    """A change of a container's header, ranges, model, chunks or chunk table, under checksums that are right again.
+    """Change a container's header, ranges, model, chunks or chunk table, and correct all checksums.
 
     `sections` are those of `data`.
     """
@@ -142,7 +142,7 @@ def _sum_behind(data: bytearray, section: Section) -> None:
 
 
 def _seal(data: bytes, length: int) -> bytes:
-    """Correct file size, header checksum and preamble checksum."""
+    """`data` with its file size, header checksum and preamble checksum corrected."""
     made = bytearray(data)
     struct.pack_into("<QII", made, 16, len(made), length, zlib.crc32(made[36 : 36 + length]))
     struct.pack_into("<I", made, 32, zlib.crc32(made[:32]))

@@ -1,4 +1,4 @@
-"""The figures that README and docs show: runs of the command line in one CSV file, and the tables made from it.
+"""Measures the figures of README and docs: runs of the command line go to one CSV file, and tables are made from it.
 
 python -m benchmarks.figures run [--scene still_life ...] [--command "compress --effort fast" ...]
 python -m benchmarks.figures tables [--check]
@@ -40,7 +40,7 @@ SCENES = {
     "fox": SCENES_DIR / "fox",
     "figure": SCENES_DIR / "figure",
 }
-"""The bundled scene, and two that the repository does not hold."""
+"""The bundled scene, and two others that the repository lacks."""
 DEFAULT = "compress"
 EFFORTS = {
     DEFAULT: "default",
@@ -51,7 +51,7 @@ EFFORTS = {
 }
 FORMATS = ("compress -o X.spz", "compress -o X.sog", "compress -o X.compressed.ply")
 COMMANDS = {**{command: tuple(SCENES) for command in EFFORTS}, **dict.fromkeys(FORMATS, ("still_life",))}
-"""What is run, and on which scenes."""
+"""Commands to run, and the scenes of each."""
 PICTURE, VIEW, LABEL = ROOT / "docs" / "images" / "still_life.jpg", "24", 26
 NONE = "\u2013"
 
@@ -61,7 +61,7 @@ NONE = "\u2013"
 
 @dataclass(frozen=True)
 class Taken:
-    """One run: its record, its file, and what the system counted for it and its children."""
+    """One run: its record, its file, and the system's counts for the process and its children."""
 
     record: dict[str, Any]
     file: bytes
@@ -71,7 +71,7 @@ class Taken:
 
 
 def compress(scene: Path, command: str, folder: Path) -> tuple[Taken, Path]:
-    """One run of a command of `COMMANDS`, and the file that it wrote."""
+    """Run a command of `COMMANDS` once; returns the run and the file that it wrote."""
     words = shlex.split(command)
     output, record = folder / "out.fgs", folder / "out.json"
     if "-o" in words:
@@ -92,7 +92,7 @@ def compress(scene: Path, command: str, folder: Path) -> tuple[Taken, Path]:
 
 
 def check_result(taken: Taken, output: Path) -> None:
-    """The file is whole, and the record speaks of it and of a target that is met."""
+    """Check that the file is whole, that the record is about it, and that the target is met."""
     reader = "verify" if output.suffix == ".fgs" else "info"
     done = subprocess.run(
         [sys.executable, "-m", "flexgs_edge", reader, str(output)], cwd=ROOT, stdout=subprocess.DEVNULL
@@ -104,7 +104,7 @@ def check_result(taken: Taken, output: Path) -> None:
 
 
 def measure(name: str, command: str, repeats: int) -> Row:
-    """A row: the first run is checked and fills the kernel cache, medians of the others are kept."""
+    """Measure a row. The first run is checked and fills the kernel cache; the row holds medians of the others."""
     with tempfile.TemporaryDirectory(prefix="figures-") as folder:
         first, output = compress(SCENES[name], command, Path(folder))
         check_result(first, output)
@@ -132,7 +132,7 @@ def measure(name: str, command: str, repeats: int) -> Row:
 
 
 def read_rows(place: Path = CSV) -> list[Row]:
-    """The rows of a CSV file; none where it is not there."""
+    """The rows of a CSV file; none if it does not exist."""
     if not place.exists():
         return []
     with open(place, newline="", encoding="utf-8") as file:
@@ -140,7 +140,7 @@ def read_rows(place: Path = CSV) -> list[Row]:
 
 
 def put(row: Row, place: Path = CSV) -> None:
-    """Add a row, or replace the one of its scene and command; in the order of `SCENES` and `COMMANDS`."""
+    """Add a row, or replace the row of its scene and command. Rows stay in the order of `SCENES` and `COMMANDS`."""
     rows = {(other["scene"], other["command"]): other for other in [*read_rows(place), row]}
 
     def rank(key: tuple[str, str]) -> tuple[int, int]:
@@ -156,7 +156,7 @@ def put(row: Row, place: Path = CSV) -> None:
 
 
 def run(scenes: Sequence[str], commands: Sequence[str], repeats: int) -> None:
-    """Measure every command on every scene that is there, and keep each row at once."""
+    """Measure every command on every scene that exists, and write each row at once."""
     revision()  # before the first row changes the checkout
     for name in scenes:
         if not (SCENES[name] / "point_cloud.ply").is_file():
@@ -177,7 +177,7 @@ class Missing(Exception):
 
 
 def figure(rows: Sequence[Row], scene: str, command: str, column: str) -> float:
-    """One figure."""
+    """One figure of a row; raises `Missing` without the row."""
     for row in rows:
         if row["scene"] == scene and row["command"] == command:
             return float(row[column])
@@ -191,7 +191,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def megabytes(size: float) -> str:
-    """Three digits of a size in MB (10^6 bytes)."""
+    """A size in MB (10^6 bytes) with three digits."""
     return f"{size / 1e6:#.3g}" if size < 9.995e6 else f"{size / 1e6:.1f}"
 
 
@@ -208,14 +208,14 @@ def scenes_table(rows: Sequence[Row]) -> str:
 
 
 def span(values: Iterable[float]) -> str:
-    """The least and the most of some factors."""
+    """The smallest and the largest of some factors, in words."""
     some = sorted(values)
     least, most = (f"{value:.2g}" if value < 9.95 else f"{value:.0f}" for value in (some[0], some[-1]))
     return f"{least}x" if least == most else f"{least} to {most}x"
 
 
 def effort_table(rows: Sequence[Row]) -> str:
-    """What each effort takes beside the default: factors of processor time and bytes over all scenes."""
+    """Each effort compared with the default: factors of processor time and of bytes over all scenes."""
 
     def factors(command: str, column: str) -> str:
         scenes = COMMANDS[command]
@@ -256,12 +256,12 @@ BLOCK = re.compile(r"(<!-- figures: ([^>]*?) -->\n)(.*?)(<!-- end -->)", re.DOTA
 
 
 def pages(root: Path = ROOT) -> list[Path]:
-    """The pages that may hold blocks."""
+    """The pages that may contain tables."""
     return [root / "README.md", *sorted((root / "docs").rglob("*.md")), root / "deploy" / "README.md"]
 
 
 def rewritten(text: str, rows: Sequence[Row]) -> str:
-    """A page with its blocks made anew."""
+    """The text of a page with its tables made again."""
 
     def block(found: re.Match[str]) -> str:
         begin, name, _, end = found.groups()
@@ -275,7 +275,7 @@ def rewritten(text: str, rows: Sequence[Row]) -> str:
 
 
 def stale(root: Path = ROOT) -> list[str]:
-    """What `tables` would change, a line a page."""
+    """The changes that `tables` would make, one line for each page."""
     rows, found = read_rows(root / CSV.relative_to(ROOT)), []
     for page in pages(root):
         text = page.read_text(encoding="utf-8")
@@ -288,7 +288,7 @@ def stale(root: Path = ROOT) -> list[str]:
 
 
 def write_tables() -> None:
-    """Make the blocks of all pages anew."""
+    """Make the tables of all pages again."""
     rows = read_rows()
     for page in pages():
         text = page.read_text(encoding="utf-8")
@@ -302,7 +302,7 @@ def write_tables() -> None:
 
 
 def picture() -> None:
-    """One held-out view of the bundled scene: the original, by the paper's method, and by the default."""
+    """Draw one held-out view of the bundled scene: the original, then compressed by `paper`, then by `best`."""
     name = "still_life"
     with tempfile.TemporaryDirectory(prefix="figures-") as folder:
 

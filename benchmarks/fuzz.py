@@ -1,12 +1,12 @@
-"""Mutates files by the million and shows that every reader says what is wrong, or reads what is right.
+"""Fuzzes all readers: every mutated file must raise an error of ours or be read as valid values.
 
     python -m benchmarks.fuzz                          # a million, and writes docs/results/fuzzing.md: 8 processor minutes
     python -m benchmarks.fuzz --part 0.1               # a tenth of it
-    python -m benchmarks.fuzz --tries 2000 --only v2   # so many of one kind; writes nothing
+    python -m benchmarks.fuzz --tries 2000 --only v2   # 2000 of one kind; writes nothing
 
-Every try has a number, which is the seed of its random choices: `--from N --tries 1` makes one again. Mutations of containers are
-of two kinds: *plain* ones must all be found by `verify`; *sealed* ones have their checksums corrected, so that the decoders meet
-them: they must end in values that are finite or in an error of ours.
+Every try has a number, which is the seed of its random choices: `--from N --tries 1` repeats one. Mutations of containers
+are of two kinds. `verify` must find all *plain* ones. *Sealed* ones have corrected checksums, so that they reach the
+decoders; these must return finite values or raise an error of ours.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ SEEDS = ROOT / "tests" / "fuzz" / "seeds"
 """Small valid files that mutations start from."""
 TABLE = ROOT / "docs" / "results" / "fuzzing.md"
 SLOW = 1.0
-"""Processor seconds that no try may take."""
+"""Most processor seconds of a try."""
 STUCK = 20.0
-"""Processor seconds after which the try that a run of 32 is at is given up."""
+"""Processor seconds after which a run of 32 tries gives up its present try."""
 TRACED_EVERY = 100
-"""Allocations are traced on one try in so many: tracing makes it several times as slow."""
+"""Allocations are traced in one of this many tries, because tracing is slow."""
 BOUND = 12 << 20
-"""Bytes that reading a file may allocate whatever it holds: the decoder's tables take 7.5 MB."""
+"""Bytes that reading any file may allocate. Most of them are for the decoder's tables."""
 ROW_BOUND = 4096
-"""Bytes a row beyond that, for as many rows as the file's size allows."""
+"""Further bytes for each row, for as many rows as the file's size allows."""
 
 
 def read_all(source: SceneSource) -> str:
-    """Every value of a scene; `read`, or `left out` where rows of it are invalid."""
+    """Read every value of a scene. Returns `read`, or `left out` if some rows are invalid."""
     planes = source.read(slice(0, source.count), [field.name for field in FIELDS])
     good = all(bool(np.isfinite(plane).all()) for plane in planes.values())
     check_scene(source, drop_invalid=True)
@@ -64,7 +64,7 @@ def read_all(source: SceneSource) -> str:
 
 
 def read_container(place: Path) -> str:
-    """Decode a `.fgs`; its values must be finite."""
+    """Decode a `.fgs` and check that its values are finite."""
     source = open_fgs(place)
     outcome = read_all(source)
     if outcome != "read":
@@ -78,7 +78,7 @@ def read_ply(place: Path) -> str:
 
 
 def read_views(place: Path) -> str:
-    """Read cameras, in their two orders of strictness."""
+    """Read cameras twice: strictly, and with distortion ignored."""
     cameras = read_cameras(place, ignore_distortion=True)
     for camera in cameras:
         values = np.concatenate(
@@ -90,30 +90,31 @@ def read_views(place: Path) -> str:
 
 
 def find(place: Path) -> str:
-    """`verify`; reading what it passes is `missed`."""
+    """Run `verify`. Returns `missed` if it passes a damaged file that can be read."""
     verify(place)
     return "missed"
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What is mutated, how, and what reads it.
+    """A kind of mutation: the files, the changes, and the reader.
 
     Parameters
     ----------
     name : str
-        For the table and `--only`.
+        Name in the table and for `--only`.
     seeds : tuple of str
-        Files in `SEEDS` (of a COLMAP model one is changed, its folder is read).
+        Files in `SEEDS`. Of a COLMAP model one file is changed, and its folder is read.
     mutate : callable
-        Another file's bytes from a seed's; containers whose checksums are made right again take their sections as well.
+        Makes a file's bytes from a seed's. For sealed kinds it also gets the sections.
     read : callable
-        Gives a word for the outcome, or raises.
+        Reads the file; returns a word for the outcome, or raises.
     sealed : bool
+        Whether checksums of the mutated container are corrected.
     tries : int
-        Of a whole run.
+        Tries of a whole run.
     folder : bool
-        What is read is the folder that the file lies in.
+        Whether the reader gets the file's folder instead of the file.
     """
 
     name: str
@@ -139,7 +140,7 @@ KINDS = (
 
 @dataclass
 class Tally:
-    """What came of the tries of one kind."""
+    """Outcomes of the tries of one kind."""
 
     kind: Kind
     outcomes: Counter[str] = field(default_factory=Counter)
@@ -147,7 +148,7 @@ class Tally:
     slowest: float = 0.0
     most_bytes: int = 0
     most_over: float = 0.0
-    """Largest allocation traced, as a part of what the file's bound allows."""
+    """Largest traced allocation, as a share of the file's bound."""
 
     @property
     def tries(self) -> int:
@@ -156,13 +157,14 @@ class Tally:
 
 
 class Fuzzer:
-    """Makes and reads the mutations of one kind, in a folder of its own.
+    """Makes and reads the mutations of one kind, in its own folder.
 
     Parameters
     ----------
     kind : Kind
+        What to mutate.
     folder : path
-        Best in memory: a file is written for each try.
+        A folder in memory is best, because each try writes a file.
     """
 
     def __init__(self, kind: Kind, folder: Path) -> None:
@@ -173,14 +175,14 @@ class Fuzzer:
         for name in kind.seeds:
             place = folder / name
             shutil.copytree((SEEDS / name).parent, place.parent, dirs_exist_ok=True)
-            # Also so that nothing is imported while allocations are counted.
+            # This also imports everything before allocations are counted.
             outcome = kind.read(place.parent if kind.folder else place)
             if outcome not in ("read", "missed"):
                 raise AssertionError(f"{SEEDS / name} is not as it should be: {outcome}")
             self.places.append(place)
 
     def made(self, number: int) -> tuple[int, bytes]:
-        """The seed that try `number` starts from, and its mutation."""
+        """The number of the seed that a try starts from, and its mutation."""
         draw = random.Random(f"{self.kind.name} {number}")
         index = draw.randrange(len(self.seeds))
         seed = self.seeds[index]
@@ -191,7 +193,7 @@ class Fuzzer:
         return index, data
 
     def run(self, number: int, traced: bool = False) -> str:
-        """One try: the outcome, which goes into the tally as well."""
+        """Make one try; returns the outcome and adds it to the tally."""
         index, data = self.made(number)
         place = self.places[index]
         place.write_bytes(data)
@@ -212,7 +214,7 @@ class Fuzzer:
             self._weigh(number, place, tracemalloc.get_traced_memory()[1])
             tracemalloc.stop()
         elif seconds > self.tally.slowest:
-            # A busy machine, or a slow try: read again by the processor's clock (asking it costs more than most tries do).
+            # Either the machine is busy or the try is slow. Measure processor time now; always asking for it would cost too much.
             self.tally.slowest = max(self.tally.slowest, seconds := self._processor_seconds(place))
             if seconds > SLOW:
                 self._fail(number, f"took {seconds:.2f} s")
@@ -254,11 +256,11 @@ def _stuck(number: int, frame: object) -> None:
 
 
 def fuzz(kind: Kind, first: int, tries: int, keep: Path | None = None) -> Tally:
-    """Tries `first` and on of one kind; what fails is kept in the folder `keep`."""
+    """Make tries of one kind, numbered from `first`. Files that fail are copied to the folder `keep`."""
     memory = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as name, warnings.catch_warnings():
         signal.signal(signal.SIGVTALRM, _stuck)
-        warnings.simplefilter("error")  # arithmetic that overflowed was not thought of
+        warnings.simplefilter("error")  # a warning means an overflow that nobody thought of
         fuzzer = Fuzzer(kind, Path(name))
         for number in range(first, first + tries):
             if number % 32 == 0:

@@ -1,7 +1,7 @@
-"""How far a compressed scene holds away from the poses that were scored, and how far its worst view is from the mean.
+"""Measures how a compressed scene looks away from the scored poses, with --views-margin off and on.
 
-Fidelity at the training poses and at those of held-out views at other distances from what they look at, the held-out views' drop,
-bytes and processor seconds, with --views-margin off and on.
+It reports fidelity at the training poses, and at the held-out views from other distances. It also reports the drop of the
+held-out views (mean and worst), bytes and processor seconds.
 
 python -m benchmarks.guards [--scene fox|sample] [--effort fast|balanced|thorough|max] [--only off|on]
     [--max-drop DB | --max-size BYTES] [--distil STEPS]
@@ -35,7 +35,7 @@ FACTORS = (0.25, 0.35, 0.5, 0.71, 1.0, 1.41, 2.0, 2.83, 4.0)
 
 
 def fidelities(renderer: Renderer, original: SceneSource, coded: SceneSource, cameras: Sequence[Camera]) -> np.ndarray:
-    """[n] dB, of each camera."""
+    """[n] f64, fidelity of each camera in dB."""
     with renderer.load(original) as scene:
         images = [renderer.render(scene, camera) for camera in cameras]
     with renderer.load(coded) as scene:

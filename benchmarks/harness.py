@@ -1,4 +1,4 @@
-"""What every benchmark shares: scenes, repeats and medians, and one JSON line a result."""
+"""Shared by all benchmarks: scenes, repeats and medians, and one JSON line for each result."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ SCENES = {
 
 
 class CheckFailed(Exception):
-    """The result that was to be timed is wrong."""
+    """Raised when the result to be timed is wrong."""
 
 
 def check(holds: bool, what: str) -> None:
-    """Nothing is timed before its result is right."""
+    """Raise `CheckFailed` unless `holds`. Call this before timing anything."""
     if not holds:
         raise CheckFailed(what)
 
@@ -46,9 +46,9 @@ class Result:
     label : str
         What was measured.
     median, low, high : float
-        Of the repeats, in `unit`.
+        Median, least and largest value of the repeats, in `unit`.
     repeats : int
-        Times it was measured.
+        How often it was measured.
     peak_bytes : int
         Largest resident memory of the process that measured it.
     note : str
@@ -69,7 +69,7 @@ class Result:
 
 @functools.lru_cache(maxsize=1)
 def revision() -> str:
-    """The checkout's commit, with a + when files differ from it."""
+    """The checkout's commit, with a + if files were changed since."""
     done = subprocess.run(["git", "describe", "--always", "--dirty=+"], cwd=ROOT, capture_output=True, text=True)
     return done.stdout.strip() or "unknown"
 
@@ -80,9 +80,9 @@ class Timer:
     Parameters
     ----------
     device : str
-        For the results.
+        Name of the device, for the results.
     repeats : int
-        Times everything is measured.
+        How often everything is measured.
     """
 
     def __init__(self, device: str, repeats: int) -> None:
@@ -90,7 +90,7 @@ class Timer:
         self.repeats = repeats
 
     def add(self, label: str, values: Sequence[float], unit: str, note: str = "", peak: int | None = None) -> None:
-        """A result from its repeats."""
+        """Print a result from the values of its repeats."""
         median, low, high = (float(f"{v:.4g}") for v in (statistics.median(values), min(values), max(values)))
         result = Result(
             label,
@@ -107,7 +107,7 @@ class Timer:
         print(json.dumps(result.__dict__), flush=True)
 
     def time(self, label: str, run: Callable[[], Any], unit: str = "ms", per: float = 1.0, note: str = "") -> None:
-        """Wall time of `run` after one run that does not count; `per` divides it."""
+        """Print the wall time of `run`, divided by `per`. One run before does not count."""
         run()
         scale = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[unit.split("/")[0]] / per
         values = []
@@ -121,7 +121,7 @@ class Timer:
 def parse(
     doc: str | None, repeats: int, scene: str = "fox", more: Sequence[tuple[str, dict[str, Any]]] = ()
 ) -> argparse.Namespace:
-    """The options that all benchmarks have, and `more` of one: name and arguments of `add_argument`."""
+    """Parse the options of all benchmarks, and `more` of one: names and arguments for `add_argument`."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", choices=SCENES, default=scene, help="default: %(default)s")
     parser.add_argument("--device", help="as for flexgs-edge; default: the device that it would take")
@@ -142,7 +142,7 @@ def backend_of(options: argparse.Namespace) -> tuple[Backend, MemoryBudget]:
 
 
 def run_module(name: str, *arguments: str, environment: dict[str, str] | None = None) -> str:
-    """Standard output of `python -m benchmarks.NAME` in a process of its own."""
+    """Run `python -m benchmarks.NAME` in its own process; returns its standard output."""
     command = [sys.executable, "-m", f"benchmarks.{name}", *arguments]
     done = subprocess.run(
         command, cwd=ROOT, env={**os.environ, **(environment or {})}, stdout=subprocess.PIPE, text=True

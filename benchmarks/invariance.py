@@ -1,7 +1,7 @@
-"""The same compression whatever the unit and the axes of the world: a scene as it is, and scaled and turned.
+"""Checks that compression does not depend on the unit and axes of the world: compares a scene with a scaled, turned copy.
 
-`--method best` chooses by squared errors of pixels, so both shall keep the same Gaussians in as many bytes. Only --near has a
-unit, and follows the scale.
+`--method best` chooses by squared errors of pixels. So both runs should keep the same Gaussians in about as many bytes. Only
+--near has a unit; it follows the scale.
 
 python -m benchmarks.invariance [SCENE] [--factor F] [--effort fast|balanced|thorough] [--max-drop DB] [--resolution WIDTH]
 """
@@ -35,11 +35,11 @@ from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.studies.stability.moved_scene import Similarity
 
 LEAST_SAME, MOST_BYTES = 0.99, 0.02
-"""Share of the kept Gaussians that must be the same, and difference of the bytes that is allowed."""
+"""Least share of equal kept Gaussians, and largest relative difference of the bytes."""
 
 
 def write_project(folder: Path, source: SceneSource, cameras: Sequence[Camera], images: Path | None) -> Path:
-    """A PLY with cameras.json and photos (linked) beside it."""
+    """Write a PLY with cameras.json and linked photos beside it."""
     folder.mkdir()
     write_ply(folder / "point_cloud.ply", source)
     (folder / "cameras.json").write_text(inria_json(cameras), encoding="utf-8")
@@ -50,7 +50,7 @@ def write_project(folder: Path, source: SceneSource, cameras: Sequence[Camera], 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A search's answer: the multiplier, the rows it keeps (ascending), and the bytes of the file."""
+    """Answer of a search: the multiplier, the kept rows (ascending), and the bytes of the file."""
 
     search: GridSearch
     multiplier: float
@@ -59,7 +59,7 @@ class Found:
 
 
 def compress_and_look(path: Path, output: Path, near: float, progress: Progress, **words: Any) -> Found:
-    """What `--method best` keeps, and the bytes of the file."""
+    """Compress by `--method best`; returns the kept rows and the bytes of the file."""
     searches: list[GridSearch] = []
     steps: list[Candidate] = []
 
@@ -89,10 +89,10 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
 
 @dataclass(frozen=True)
 class Likeness:
-    """Two compressions of one scene: the share of the kept rows that both keep, and the second's bytes over the first's.
+    """Comparison of two compressions: the share of rows that both keep, and the second's bytes over the first's.
 
-    `choice` is the share at the first one's multiplier: how far the choice itself differs. The rest is where on the curve the
-    searches stop. That is a matter of chance: rounding moves the drop of a whole result by 4 % (fox, one standard deviation).
+    `choice` is the share at the first one's multiplier, so it shows how far the choice itself differs. Where the searches
+    stop is partly chance, because rounding moves the drop of a candidate.
     """
 
     same: float
@@ -103,16 +103,16 @@ class Likeness:
 def compare(
     folder: Path, scratch: Path, factor: float, progress: Progress | None = None, **words: Any
 ) -> tuple[Likeness, str]:
-    """Compress the scene of `folder` as it is and moved.
+    """Compress the scene of `folder` as it is, and scaled and turned.
 
     Parameters
     ----------
     folder : path
-        With point_cloud.ply, cameras.json, and images/ if there are photos.
+        Folder with point_cloud.ply, cameras.json, and images/ if there are photos.
     scratch : path
-        Takes the moved scene and both files.
+        Folder for the moved scene and both files.
     **words
-        For `compress`.
+        Options of `compress`.
     """
     progress = progress or Progress(enabled=False)
     source, cameras = PlySource(folder / "point_cloud.ply"), read_cameras(folder / "cameras.json")
@@ -129,7 +129,7 @@ def compare(
 
 
 def _same(first: np.ndarray, second: np.ndarray) -> float:
-    """Rows in both, as a share of the longer list."""
+    """Share of rows that are in both lists, of the longer list."""
     return len(np.intersect1d(first, second)) / max(len(first), len(second), 1)
 
 

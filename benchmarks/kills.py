@@ -1,4 +1,6 @@
-"""`compress --resume` killed (kill -9) at random moments: nothing but what goes on is left, and the bytes are those of one run.
+"""Kills `compress --resume` (kill -9) at random moments and resumes it.
+
+Only files for the next run may stay behind, and the result must have the bytes of an uninterrupted run.
 
 python -m benchmarks.kills [--kills 10] [--seed 0] [--memory-limit SIZE] [--scene fox|sample]
 """
@@ -22,11 +24,11 @@ from benchmarks.harness import ROOT, SCENES, check
 COMMAND = (sys.executable, "-m", "flexgs_edge", "compress")
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))}
 OURS = (".flexgs-resume-", ".flexgs-out-")
-"""Names of what a killed run may leave for the one that goes on."""
+"""Beginnings of names of files that a killed run may leave for the next one."""
 
 
 def compress(scene: Path, output: Path, words: Sequence[str], seconds: float | None = None) -> bool:
-    """Whether a run in a process of its own came to its end within some seconds; it is killed then."""
+    """Run in a new process; returns whether it ended within `seconds`. Otherwise it is killed."""
     command = [
         *COMMAND,
         str(scene / "point_cloud.ply"),
@@ -49,7 +51,7 @@ def compress(scene: Path, output: Path, words: Sequence[str], seconds: float | N
 
 
 def killed_and_resumed(scene: Path, folder: Path, words: Sequence[str], kills: int, seed: int) -> dict[str, object]:
-    """Kill so many runs, one after the other; each goes on from the last, and begins anew where that one came to its end."""
+    """Kill `kills` runs, one after the other. Each run resumes the one before, or starts again if that one ended."""
     started = time.perf_counter()
     compress(scene, folder / "plain.fgs", words)
     whole = time.perf_counter() - started
@@ -65,7 +67,7 @@ def killed_and_resumed(scene: Path, folder: Path, words: Sequence[str], kills: i
             finished += 1
             continue
         done += 1
-        if output.exists():  # killed between giving the file its name and its own end
+        if output.exists():  # killed after the file got its name, but before the end of the process
             check(output.read_bytes() == expected, "no part of a file by the name of the output")
             output.unlink()
         names = os.listdir(place)

@@ -1,4 +1,4 @@
-"""Runs of `compress` under caps that the kernel keeps, one line each in a CSV file, and the chart of their peaks by Gaussians.
+"""Runs `compress` under memory caps that the kernel enforces; records each run in a CSV file and draws a chart of peaks.
 
 python -m benchmarks.memory run SCENE.ply --cameras POSES.json [--cap 512MiB --limit 480MiB] [--csv docs/results/memory.csv]
 python -m benchmarks.memory draw [--csv docs/results/memory.csv] [--png docs/images/memory.png]
@@ -28,12 +28,12 @@ COLUMNS = (
     "gaussians", "cap", "limit", "seconds", "processor_seconds", "group_peak", "anonymous_peak", "resident_peak", "scratch",
     "bytes", "sha256",
 )  # fmt: skip
-"""Sizes in bytes; `cap`, `limit`, `group_peak`, `anonymous_peak` and `scratch` are empty where there were none."""
+"""Columns of the CSV file; sizes in bytes. `cap`, `limit`, `group_peak`, `anonymous_peak` and `scratch` may be empty."""
 MIB = 1 << 20
 
 
 def run(scene: Path, cameras: Path, cap: str | None, limit: str | None) -> dict[str, object]:
-    """One run, `--effort fast`, in a control group where a cap is given; its figures by `COLUMNS`."""
+    """Run once with `--effort fast`, in a control group if there is a cap; returns figures by `COLUMNS`."""
     with tempfile.TemporaryDirectory(prefix="memory-", dir=scene.parent) as folder:
         output, record = Path(folder) / "a.fgs", Path(folder) / "a.json"
         command = [*([str(ROOT / "deploy" / "capped-run.sh"), cap] if cap else []), sys.executable, "-m", "flexgs_edge"]
@@ -61,7 +61,7 @@ def run(scene: Path, cameras: Path, cap: str | None, limit: str | None) -> dict[
 
 
 def add(place: Path, row: dict[str, object]) -> None:
-    """Append a line; a new file gets its head first."""
+    """Append a line. A new file gets its head first."""
     new = not place.exists()
     with open(place, "a", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
@@ -71,7 +71,7 @@ def add(place: Path, row: dict[str, object]) -> None:
 
 
 def chart(rows: Sequence[dict[str, str]]) -> LineChart:
-    """Peaks in MiB by thousands of Gaussians."""
+    """A chart of peaks in MiB over thousands of Gaussians."""
     rows = sorted(rows, key=lambda row: int(row["gaussians"]))
 
     def series(label: str, column: str, capped: bool) -> Series:

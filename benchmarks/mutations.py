@@ -1,11 +1,11 @@
-"""Plants one fault at a time in a copy of the kernels and shows which test turns red.
+"""Mutation testing: plants one fault at a time in a copy of the kernels and shows which test fails.
 
     python -m benchmarks.mutations                    # all, and writes docs/results/mutations.md
-    python -m benchmarks.mutations --only conic -v    # those whose name holds a word; writes nothing
+    python -m benchmarks.mutations --only conic -v    # only faults whose name contains a word; writes nothing
 
-The twins stay as they are, so that the comparison with them sees every fault by construction. What counts are the tests against
-the float64 reference, which knows neither kernels nor twins. (A coder has no values of its own to be wrong in: its kernels are
-held against the coder in NumPy.)
+The twins stay as they are, so the comparison with them sees every fault by construction. The tests against the float64
+reference count, because it knows neither kernels nor twins. (The coder's kernels have no such reference; they are compared
+with the coder in NumPy.)
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SURVIVED = "survived"
 
 @dataclass(frozen=True)
 class Tests:
-    """Files and keywords of the tests that must see a kind of fault; `{form}` is the form's name."""
+    """Files and keywords of the tests that must see a kind of fault. `{form}` stands for the form's name."""
 
     reference: tuple[str, ...]
     reference_words: str
@@ -59,17 +59,17 @@ class Mutation:
     Parameters
     ----------
     name : str
-        What is wrong, for the table.
+        The fault in words, for the table.
     file : str
         The kernel file.
     old, new : str
-        Text to replace, everywhere in the file (it must be there).
+        Text to replace everywhere in the file. It must occur.
     form : str
-        Which form of the kernels the tests run on: `w16` or `gpu`.
+        Form of the kernels that the tests run on: `w16` or `gpu`.
     reference : bool
-        Whether the reference can see it (some faults only break the equality of bits between forms).
+        Whether the reference can see it. Some faults only break the equality of bits between forms.
     tests : Tests
-        Which tests must see it.
+        Tests that must see it.
     """
 
     name: str
@@ -94,7 +94,7 @@ def coder(name: str, old: str, new: str) -> Mutation:
 
 
 def constant(name: str, literal: str, words: str) -> Mutation:
-    """A wrong constant: defined again in front of everything else."""
+    """A wrong constant, defined again in front of everything else."""
     first_line = "#pragma OPENCL FP_CONTRACT OFF\n"
     return Mutation(words, "common.clh", first_line, f"{first_line}#undef {name}\n#define {name} {literal}\n")
 
@@ -234,7 +234,7 @@ MUTATIONS = (
 
 
 def kernel_folder(parent: Path, mutation: Mutation | None) -> Path:
-    """A copy of the kernels with the fault in it (or none); raises when its text is not there any more."""
+    """A copy of the kernels with the fault, or without one. Raises if the text to replace does not occur."""
     folder = parent / "cl_kernels"
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(ROOT / "cl_kernels", folder, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
@@ -251,7 +251,7 @@ def kernel_folder(parent: Path, mutation: Mutation | None) -> Path:
 
 @contextmanager
 def workplace() -> Iterator[Path]:
-    """A temporary folder for kernels and the compiler's cache."""
+    """A temporary folder for kernels and for the compiler's cache."""
     with tempfile.TemporaryDirectory(prefix="mutations-") as name:
         yield Path(name)
 
@@ -269,7 +269,7 @@ def run_tests(place: Path, files: tuple[str, ...], keywords: str) -> str | None:
 
 
 def judge(place: Path, mutation: Mutation | None, tests: Tests, verbose: bool = False) -> tuple[str | None, ...]:
-    """First red test against the reference, the twins and the golden renders."""
+    """The first test that fails against the reference, against the twins, and against the golden renders."""
     kernel_folder(place, mutation)
     form = mutation.form if mutation else "(w16 or gpu)"
     found = tuple(
@@ -286,7 +286,7 @@ def judge(place: Path, mutation: Mutation | None, tests: Tests, verbose: bool = 
 
 
 def table(rows: list[tuple[Mutation, tuple[str | None, ...]]]) -> str:
-    """The page: faults by the tests that see them."""
+    """The page with all faults and the tests that see them."""
     seen: dict[str, list[str]] = {}
     drawn = [row for row in rows if row[0].tests.golden and row[0].form != "gpu" and row[0].file != "dequantize.cl"]
     golden = [bool(found[2]) for _, found in drawn]
@@ -312,12 +312,12 @@ def table(rows: list[tuple[Mutation, tuple[str | None, ...]]]) -> str:
 
 
 def _test(name: str) -> str:
-    """A test without its parameters."""
+    """The name of a test without its parameters."""
     return f"`{name.partition('[')[0]}`"
 
 
 def main() -> int:
-    """Run the mutations; 1 when one survives."""
+    """Run the mutations; returns 1 if one survives."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", metavar="WORD", help="mutations whose name holds this word; the page is not written")
     parser.add_argument("-v", "--verbose", action="store_true", help="a line for each mutation as it is done")

@@ -1,4 +1,4 @@
-"""The blend beside what this machine can do: its arithmetic alone, over data in the nearest cache, and the share of views in it.
+"""Compares the blend with the machine's peak: the same arithmetic alone, on data in the nearest cache.
 
 python -m benchmarks.peak [--scene fox|sample] [--device SPEC] [--repeats N]
 """
@@ -22,8 +22,8 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 
 SPLATS, BLOCKS, ROUNDS, ITEMS = 8, 8, 100_000, 16
-"""Eight blocks that do not wait for each other (four or one: 2.5 and 2.1 instead of 3.0 G lanes/s), for a twentieth of a second
-(runs of 3 ms measured how long cores take to wake: 1.2)."""
+"""Eight blocks that do not wait for each other; fewer leave parts of a core idle. They run for a twentieth of a second, because
+short runs would measure how long cores take to wake."""
 VIEWS = 10
 
 ARITHMETIC = f"""
@@ -52,13 +52,13 @@ __kernel void peak(const uint rounds, __global const float *records, __global fl
   STOREF(all, out, get_global_id(0) * W);
 }}
 """
-"""The blend's step for vectors of which every lane counts; splats, pixels and colours never leave the nearest cache."""
+"""The blend's step with all lanes of its vectors in use. Splats, pixels and colours never leave the nearest cache."""
 
 
 def bench_peak(timer: Timer, backend: OpenCLBackend) -> float:
-    """Lanes a second of the arithmetic alone, on all cores."""
+    """Measure the lanes a second of the arithmetic alone, on all cores."""
     session, width = backend.session, backend.width
-    source = load_source("dequantize.cl") + ARITHMETIC  # that file for the constants and helpers before it
+    source = load_source("dequantize.cl") + ARITHMETIC  # the file brings constants and helpers
     kernel = session.kernel(source, "peak", (f"-DW={width}",), "ubb")
     records = np.zeros((SPLATS, 16), np.float32)
     records[:, 0], records[:, 1] = np.arange(SPLATS) * 2, 1.5
@@ -87,7 +87,7 @@ def bench_peak(timer: Timer, backend: OpenCLBackend) -> float:
 
 
 def bench_share(timer: Timer, backend: OpenCLBackend, renderer: Renderer, folder: Path, peak: float) -> None:
-    """The blend of real views, lane by lane."""
+    """Measure the blend of real views, as a share of the peak."""
     cameras = read_cameras(folder / "cameras.json")
     cameras = cameras[:: max(len(cameras) // VIEWS, 1)][:VIEWS]
     with renderer.load(PlySource(folder / "point_cloud.ply")) as scene:

@@ -1,4 +1,4 @@
-"""Quantizing and dequantizing, ns by Gaussian.
+"""Times quantizing and dequantizing, in ns a Gaussian.
 
 python -m benchmarks.quantize [--scene fox|sample] [--device SPEC] [--repeats N]
 """
@@ -20,11 +20,11 @@ from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 
 LARGE = 1_000_000
-"""Gaussians that the loop over groups is compared on."""
+"""Gaussians for the comparison with the loop over groups."""
 
 
 def quantize_in_a_loop(scene: QuantizedScene, source: MemorySource) -> dict[str, np.ndarray]:
-    """The baseline, channel by channel and group by group, codes left unpacked: decoded values, {field: [c, n] f32}."""
+    """The baseline, by channels and groups, without packing codes. Returns decoded values, [c, n] f32 by field."""
     decoded = {}
     planes = source.read(slice(0, source.count), list(FIELD))
     for name, array in scene.arrays.items():
@@ -43,7 +43,7 @@ def quantize_in_a_loop(scene: QuantizedScene, source: MemorySource) -> dict[str,
 
 
 def bench_against_loop(timer: Timer, source: PlySource) -> None:
-    """Both ways there and back, in turn."""
+    """Time both ways, there and back, in turn."""
     planes = source.read(slice(0, source.count), list(FIELD))
     copies = -(-LARGE // source.count)
     large = MemorySource({k: np.ascontiguousarray(np.tile(v, copies)[:, :LARGE]) for k, v in planes.items()})
@@ -60,7 +60,7 @@ def bench_against_loop(timer: Timer, source: PlySource) -> None:
         ratios.append(loop[-1] / ours[-1])
         for name, values in baseline.items():
             if name == "quats":
-                continue  # normalized before they are quantized
+                continue  # quaternions are normalized before they are quantized
             most = (quantized.arrays[name].step.max(axis=1) * 1.01)[:, None]
             check(bool((np.abs(values - back[name]) <= most).all()), f"{name} of the loop")
     note = (
@@ -96,7 +96,7 @@ def main() -> None:
     )
 
     def load() -> None:
-        """Loading decides where a scene lives when its chunks are first asked for."""
+        """Load the scene and ask for its chunks: only then is it decided where it lives."""
         with renderer.load_quantized(quantized) as scene:
             for _ in scene.chunks():
                 pass

@@ -1,8 +1,8 @@
-"""The measured error of removing a Gaussian against removing it and blending again in float64, across the whole range of errors.
+"""Compares the measured cost of removing a Gaussian with removing it and blending again in float64.
 
-Once with kernels whose pixels never end (then the measure is exact), once with the ordinary ones (then removing a Gaussian lets
-splats be blended that lay behind the end, which frozen hits leave out). Projection and tile lists are the renderer's; float64
-since the image without a Gaussian differs by less than float32's rounding where errors are small.
+It runs twice. With kernels whose pixels never end, measured costs are exact. With the ordinary kernels, removing a Gaussian
+reveals splats behind the end of a pixel, and measured costs leave these out. Projection and tile lists are the renderer's.
+The comparison needs float64: where costs are small, the change of the image is below the rounding of float32.
 
 python -m benchmarks.removal_exactness [--scene fox|sample] [--device SPEC] [--gaussians N] [--views N]
 """
@@ -34,25 +34,25 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.views.bench import Bench
 
 ROUNDING = 2.0**-22
-"""A pixel's difference from the image without a Gaussian is off by about this times alpha / (1 - alpha): float32 rounds what
-lies behind it, whose colours add up to about 1, a few times."""
+"""Rounding error of a pixel's change by a removal, divided by alpha / (1 - alpha). Float32 rounds the light from behind a few
+times, and its colours add up to about 1."""
 NEAR_THRESHOLD = 1e-4
-"""Splats whose alpha is so near, relative, to the least that is drawn may be drawn in float32 and not in float64."""
+"""Splats whose alpha is this near (relative) to the least drawn alpha may be drawn in float32 and not in float64."""
 FLOORS = tuple(10.0**exponent for exponent in range(-8, 1))
-"""Squared errors that the smallest exact one is looked for among."""
+"""Squared errors among which the smallest exact one is searched for."""
 FIRST_LINE = "#pragma OPENCL FP_CONTRACT OFF\n"
 
 
 @dataclass(frozen=True)
 class Exactness:
-    """Errors of removing single rows, summed over views.
+    """Squared errors of removing single rows, summed over views.
 
     Parameters
     ----------
     measured, rendered : np.ndarray
-        [m] f64: from one scoring pass, and from pixels blended with and without the Gaussian.
+        [m] f64, from one scoring pass, and from pixels blended with and without the Gaussian.
     noise : np.ndarray
-        [m] f64: what rounding to float32 and to fixed point may change, at most about.
+        [m] f64, about the largest change by rounding to float32 and to fixed point.
     """
 
     measured: np.ndarray
@@ -61,21 +61,21 @@ class Exactness:
 
     @property
     def relative(self) -> np.ndarray:
-        """[m] relative difference."""
+        """[m] f64, relative difference."""
         return abs(self.measured - self.rendered) / np.maximum(self.rendered, 1e-30)
 
     @property
     def beyond_noise(self) -> np.ndarray:
-        """[m] relative difference that rounding does not explain."""
+        """[m] f64, relative difference that rounding does not explain."""
         return np.maximum(abs(self.measured - self.rendered) - self.noise, 0) / np.maximum(self.rendered, 1e-30)
 
     def floor(self, limit: float) -> float:
-        """The least error above which no relative difference is beyond `limit`."""
+        """The smallest error above which no relative difference exceeds `limit`."""
         return next((f for f in FLOORS if (self.relative[self.rendered > f] <= limit).all()), float("inf"))
 
 
 def kernels_without_ending(folder: Path) -> Path:
-    """A copy of the kernels whose pixels never end: the least transmittance is zero."""
+    """A copy of the kernels whose pixels never end, because the least transmittance is zero."""
     shutil.copytree(kernel_dir(), folder)
     common = folder / "common.clh"
     text = common.read_text(encoding="utf-8")
@@ -97,7 +97,7 @@ def spread_over_range(costs: np.ndarray, count: int, seed: int = 0) -> np.ndarra
     for low, high in zip(edges, edges[1:]):
         inside = order[np.searchsorted(logs, low, "right") : np.searchsorted(logs, high, "right")]
         rows += rng.choice(inside, 1).tolist() if len(inside) else []
-    # Where the range has gaps, the rest comes from anywhere.
+    # If the range has gaps, the rest comes from anywhere.
     left = np.setdiff1d(order, rows)
     rows += rng.choice(left, min(count - len(rows), len(left)), replace=False).tolist()
     return np.sort(np.array(rows, np.int64))
@@ -110,6 +110,8 @@ class BlendedView:
     ----------
     renderer : Renderer
         Has just drawn the view, in one batch.
+    camera : Camera
+        The view.
     least : float
         Transmittance that ends a pixel.
     """
@@ -123,13 +125,13 @@ class BlendedView:
         self.ids = pairs[: self.ends[-1], 0]
         self.tiles_x, self.camera, self.least = buffers.tiles_x, camera, least
         self.background = np.array(renderer.background)
-        # Tiles of every splat: pairs sorted by splat.
+        # Pairs sorted by splat give the tiles of every splat.
         tile_of = np.repeat(np.arange(buffers.tiles), np.diff(self.ends, prepend=0))
         order = np.argsort(self.ids, kind="stable")
         self.by_splat, self.tiles_by_splat = self.ids[order], tile_of[order]
 
     def removal(self, row: int) -> np.ndarray:
-        """[2]: squared error of the view without the splat `row`, and what rounding may change of it."""
+        """[2] f64, squared error of the view without the splat `row`, and its change by rounding."""
         first, last = np.searchsorted(self.by_splat, [row, row + 1])
         return sum((self._tile(int(tile), row) for tile in self.tiles_by_splat[first:last]), np.zeros(2))
 
@@ -146,7 +148,7 @@ class BlendedView:
             alpha: np.ndarray = np.exp2(level[rows] - power)
             return alpha
 
-        # Other pixels cannot change: small splats reach few of a tile's.
+        # Other pixels cannot change. Small splats reach only a few pixels of a tile.
         x, y = xs.reshape(-1), ys.reshape(-1)
         reached = np.flatnonzero(alphas(slice(at, at + 1), x, y)[0] >= ALPHA_MIN * (1 - NEAR_THRESHOLD))
         alpha = alphas(slice(None), x[reached], y[reached])
@@ -158,14 +160,14 @@ class BlendedView:
         difference = self._blend(alpha, colours) - whole
         rounding = ROUNDING * own / (1 - own)
         noise = 2 * (abs(difference).sum(axis=0) * rounding).sum() + 3 * np.vdot(rounding, rounding) + 1 / FIXED_ERROR
-        # A splat more or less in front or behind changes what this one adds by 2 ALPHA_MIN of it; if it is this one, by all.
+        # One splat more or less in front or behind changes this one's part by 2 ALPHA_MIN of it; this splat itself, by all.
         square = (difference * difference).sum(axis=0)
         flipped = np.where(flips, np.maximum(square, 3 * ALPHA_MIN**2), 4 * ALPHA_MIN * near.any(axis=0) * square)
         return np.array([square.sum(), noise + flipped.sum()])
 
     def _blend(self, alpha: np.ndarray, colours: list[np.ndarray]) -> np.ndarray:
         after = np.cumprod(1.0 - alpha, axis=0)
-        hit = after >= self.least  # once below, always below
+        hit = after >= self.least  # transmittance only falls
         before = np.concatenate([np.ones((1, alpha.shape[1])), after[:-1]])
         weight = np.where(hit, alpha * before, 0.0)
         end = np.where(hit, after, np.inf).min(axis=0, initial=1.0)
@@ -180,7 +182,7 @@ def compare_in_float64(
     least: float = TRANSMITTANCE_MIN,
     progress: Progress | None = None,
 ) -> Exactness:
-    """Remove each of `rows` alone and blend the tiles that it touches again."""
+    """Remove each of `rows` alone, and blend the tiles that it touches again."""
     measured, blended = np.zeros(len(rows)), np.zeros((len(rows), 2))
     progress = progress or Progress(enabled=False)
     for camera in progress.track(cameras, "removing and blending", len(cameras)):
@@ -192,7 +194,7 @@ def compare_in_float64(
 
 
 def report(timer: Timer, name: str, found: Exactness) -> None:
-    """Relative differences by size of the error, and the share beyond 1e-4 and 1 %."""
+    """Report relative differences by size of the error, and the shares beyond 1e-4 and 1 %."""
     exponents = np.floor(np.log10(np.maximum(found.rendered, 1e-16)) / 2).astype(int)
     for exponent in np.unique(exponents):
         relative = found.relative[exponents == exponent]

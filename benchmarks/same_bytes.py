@@ -1,10 +1,10 @@
-"""The same bytes as before: digests of all that 56 commands write for the bundled scene.
+"""Checks that output keeps its bytes: compares digests of all files that 56 commands write for the bundled scene.
 
-Every command runs in a process and a folder of its own, by the command line alone. benchmarks/same_bytes.json keeps
-its exit code, its summary, its errors, and a digest of every file. Of JSON it keeps every key: a lost key shows. Times,
-memory, the size of scratch files and the device are not compared. PNG and WebP count by their pixels, gzip and ZIP by
-what is in them: a library makes their bytes. Of a page, white space between elements does not count. Left out are
-`devices`, which describes the machine, and `study`, which takes too long.
+Every command runs in its own process and folder, by the command line alone. benchmarks/same_bytes.json keeps its exit
+code, its summary, its errors, and a digest of every file. For JSON it keeps every key, so that a lost key shows. Times,
+memory, the size of scratch files and the device are not compared. PNG and WebP are compared by their pixels, gzip and ZIP
+by their contents, because a library makes their bytes. White space between elements of a page does not count. `devices`
+is left out because it describes the machine, and `study` because it takes too long.
 
 python -m benchmarks.same_bytes --check [--only NAME ...] [--keep DIR]
 python -m benchmarks.same_bytes --write [--only NAME ...]
@@ -37,7 +37,7 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[1]
 KEPT = Path(__file__).with_suffix(".json")
 LINKS = {"scene": ROOT / "samples" / "still_life", "golden": ROOT / "tests" / "golden"}
-"""What the commands find beside their folders."""
+"""Links that the commands find beside their folders."""
 LIBRARIES = ("numpy", "pyopencl", "pillow")
 
 SCENE = "../scene/point_cloud.ply"
@@ -107,7 +107,7 @@ COMMANDS = {
     "refuses-target": compress("--effort fast --max-size 1kB"),
     "refuses-memory": compress("--effort fast --memory-limit 20MiB"),
 }
-"""Words of `flexgs-edge` by name. `../NAME/` stands for what the command of that name wrote."""
+"""Arguments of `flexgs-edge` by name. `../NAME/` is the folder of the command of that name."""
 
 MASKED = {
     "device",
@@ -121,14 +121,14 @@ MASKED = {
     "view_ms",
 }
 MASKED |= {"startup_ms", "compile_ms", "warm_up_ms"}
-"""Keys of JSON whose values differ from run to run, at any depth. Compared are the keys below, and null."""
+"""Keys of JSON whose values differ from run to run, at any depth. Only the keys below them, and null, are compared."""
 MASKS = (
     (re.compile(r"(?m)^(took|memory|device): .*$"), r"\1: *"),
     (re.compile(r"(<dt>device</dt>\s*<dd>)[^<]*"), r"\1*"),
     (re.compile(r'(<span style="width:)[\d.]+(%"></span></td>\s*<td>[\d.]+ s<)'), r"\1*\2"),
     (re.compile(r"\b\d[\d.]*( ?)(ms|s|KiB|MiB|GiB)\b"), r"*\1\2"),
 )
-"""The same in summaries and pages."""
+"""Patterns of text in summaries and pages that differ from run to run."""
 
 
 def sha(data: bytes) -> str:
@@ -136,14 +136,14 @@ def sha(data: bytes) -> str:
 
 
 def masked(text: str) -> str:
-    """Text without what differs from run to run."""
+    """Text with everything masked that differs from run to run."""
     for pattern, put in MASKS:
         text = pattern.sub(put, text)
     return text
 
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value of a JSON document by its path; items of a list share one."""
+    """Every value of a JSON document with its path. Items of a list share a path."""
     if isinstance(value, dict) and value:
         for key, below in value.items():
             where = f"{path}.{key}" if path else key
@@ -162,7 +162,7 @@ def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def keys_of(document: Any) -> dict[str, Any]:
-    """A document's keys with the value, or with the digest of all values in their order."""
+    """A document's keys, each with its value, or with a digest of all its values in their order."""
     found: dict[str, list[Any]] = {}
     for path, value in leaves(document):
         found.setdefault(path, []).append(value)
@@ -173,7 +173,7 @@ def keys_of(document: Any) -> dict[str, Any]:
 
 
 class Page(HTMLParser):
-    """The elements and texts of a page, whatever white space lies between them."""
+    """Collects the elements and texts of a page, without white space between them."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -192,7 +192,7 @@ class Page(HTMLParser):
 
 
 def digest(name: str, data: bytes) -> str:
-    """What a file holds, whatever library packed it."""
+    """A digest of a file's contents that does not depend on the library that packed it."""
     if name.endswith((".png", ".webp")):
         with Image.open(io.BytesIO(data)) as image:
             return f"{image.mode} {image.width}x{image.height} {sha(image.tobytes())}"
@@ -209,7 +209,7 @@ def digest(name: str, data: bytes) -> str:
 
 
 def run(name: str, folder: Path) -> dict[str, Any]:
-    """Run a command in its folder; what it wrote."""
+    """Run a command in its folder; returns a record of everything that it wrote."""
     place = folder / name
     place.mkdir()
     words = shlex.split(COMMANDS[name])
@@ -238,7 +238,7 @@ def run(name: str, folder: Path) -> dict[str, Any]:
 
 
 def differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """What differs, by file, key or line."""
+    """Sentences about differences, by file, key or line."""
     found = []
     for item in {**before, **now}:
         old, new = before.get(item), now.get(item)
@@ -258,7 +258,7 @@ def differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
 
 
 def needed(names: Sequence[str]) -> set[str]:
-    """Commands by these names, and all whose files they read."""
+    """These commands, and all commands whose files they read."""
     found: set[str] = set()
     left = list(names)
     while left:
@@ -270,7 +270,7 @@ def needed(names: Sequence[str]) -> set[str]:
 
 
 def in_order(names: set[str]) -> list[str]:
-    """As in the table, each after those that it reads."""
+    """The commands in the order of the table, each after those whose files it reads."""
     done: list[str] = []
     while len(done) < len(names):
         done += [name for name in COMMANDS if name in names - set(done) and needed([name]) - {name} <= set(done)]
@@ -278,7 +278,7 @@ def in_order(names: set[str]) -> list[str]:
 
 
 def machine() -> dict[str, str]:
-    """The device and the libraries that the digests come from."""
+    """The device and libraries of this machine, on which digests depend."""
     done = subprocess.run(
         [sys.executable, "-m", "flexgs_edge", "devices"], cwd=ROOT, capture_output=True, text=True, check=False
     )

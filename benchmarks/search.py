@@ -1,4 +1,4 @@
-"""One step of the search: prune, quantize, dequantize, render the held-out views, compare with renders and photos.
+"""Times one step of the paper's search: prune, quantize, dequantize, render the held-out views, compare.
 
 python -m benchmarks.search [--scene fox|sample] [--device SPEC] [--repeats N]
 """
@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.harness import SCENES, Timer, backend_of, check, parse
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.io.model_folder import find_companions
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.packed.bitspec import PAPER
 from flexgs_edge.packed.quantize import quantized_bytes
@@ -41,11 +41,11 @@ def main() -> None:
     judge = Judge(Bench(renderer), scene.source, views, views.held_out)
     with renderer.load(scene.source) as original:
         judge.prepare(original)
-    # Which Gaussians go does not change the cost of a step much: by opacity and volume will do.
+    # The choice of Gaussians hardly changes the time of a step, so opacity times volume will do as a score.
     stored = scene.source.read(slice(0, scene.source.count), ["log_scales", "opacity_logits"])
     scores = stored["opacity_logits"][0] + 0.1 * stored["log_scales"].sum(axis=0)
     order = order_from_scores(scores.astype(np.float64))
-    evaluator = SceneEvaluator(scene.source, order, nonzero_sh(scene.source), PAPER, None, renderer, judge, budget)
+    evaluator = SceneEvaluator(Ranked(scene.source, order, nonzero_sh(scene.source)), PAPER, None, judge, budget)
     measured = evaluator.measure(CHOICE)
     check(measured.fidelity is not None and 15 < measured.fidelity < 60, f"fidelity {measured.fidelity}")
     with evaluator.quantized(CHOICE) as quantized:

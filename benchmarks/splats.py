@@ -1,8 +1,9 @@
-"""A view of a million random splats: work that no scene's structure helps with.
+"""Times a view of a million random splats, which have no structure that would help.
 
 python -m benchmarks.splats [--device SPEC] [--repeats N]
 
-1280x720, standard deviations of 2 pixels, opacities of 0.3 in the mean, uniform over the picture and over depths of 1 to 10.
+The picture has 1280x720 pixels. Splats have standard deviations of 2 pixels and mean opacities of 0.3; they are uniform over
+the picture and over depths of 1 to 10.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ SIGMA, OPACITY, SEED = 2.0, 0.3, 0
 
 
 def random_splats(count: int = COUNT) -> MemorySource:
-    """The scene, as a camera at the origin that looks along z sees it."""
+    """The scene, made for a camera at the origin that looks along z."""
     rng = np.random.default_rng(SEED)
     depth = rng.uniform(1, 10, count)
     x = rng.uniform(-WIDTH / 2, WIDTH / 2, count) * depth / FOCAL
@@ -49,7 +50,7 @@ def main() -> None:
     with renderer.load(random_splats()) as scene:
         image = renderer.render(scene, camera)
         check(bool(np.isfinite(image).all()), "an image of finite numbers")
-        # Some 100 splats lie over every pixel: nothing of the background comes through, and colours even out around 0.5.
+        # Some 100 splats lie over every pixel, so they hide the background, and colours average to about 0.5.
         check(bool(abs(image.mean() - 0.5) < 0.05 and image.std() < 0.25), "an even picture")
         check(np.array_equal(image, renderer.render(scene, camera)), "the same picture again")
         note = f"{COUNT} splats, {WIDTH}x{HEIGHT}, kernels built before"

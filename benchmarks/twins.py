@@ -1,4 +1,4 @@
-"""A view on the NumPy twins, which is what `--device numpy` costs.
+"""Times a view drawn by the NumPy twins, as with `--device numpy`.
 
 python -m benchmarks.twins [--scene fox|sample] [--repeats N]
 """

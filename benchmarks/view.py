@@ -1,4 +1,4 @@
-"""Views: ms by stage and ns by tile pair, hits and costs of training views, steps of a descent, the first image of a process.
+"""Times views by stage and by tile pair, scoring, steps of a descent, and the first image of a process.
 
 python -m benchmarks.view [--scene fox|sample] [--device SPEC] [--repeats N]
 """
@@ -30,14 +30,14 @@ VIEWS = 10
 
 
 def tile_pairs(renderer: Renderer) -> int:
-    """Pairs of the last view: the total behind its tile counters."""
+    """Number of tile pairs of the last view, which stands behind its tile counters."""
     buffers = renderer._buffers
     assert buffers is not None
     return int(renderer.backend.read(buffers.ends)[-1])
 
 
 def bench_views(timer: Timer, renderer: Renderer, scene: DeviceScene, cameras: list[Camera]) -> None:
-    """Whole views, then stage by stage with a wait after every kernel."""
+    """Time whole views, then their stages, with a wait after every kernel."""
     chosen = cameras[:: max(len(cameras) // VIEWS, 1)][:VIEWS]
     pairs = []
     for camera in chosen:
@@ -66,7 +66,7 @@ def bench_views(timer: Timer, renderer: Renderer, scene: DeviceScene, cameras: l
 def bench_counting(
     timer: Timer, renderer: Renderer, scene: DeviceScene, cameras: list[Camera], golden: np.ndarray | None
 ) -> None:
-    """Hits and weights of every Gaussian over the training views."""
+    """Time counting hits and weights of every Gaussian over the training views."""
     train, _ = split_views(len(cameras))
     counted = []
 
@@ -91,7 +91,7 @@ def bench_counting(
 
 
 def bench_scores(timer: Timer, renderer: Renderer, scene: DeviceScene, cameras: list[Camera]) -> None:
-    """Hit counting and removal costs over drawing the same views: each view in turn, so that all see the same machine."""
+    """Time hit counting and removal costs, relative to drawing. All three take turns view by view, under equal load."""
     statistics = Statistics.zeros(scene.count)
     ways: dict[str, Callable[[Camera], object]] = {
         "drawing": lambda camera: renderer.render(scene, camera),
@@ -112,7 +112,7 @@ def bench_scores(timer: Timer, renderer: Renderer, scene: DeviceScene, cameras: 
 
 
 def bench_descent(timer: Timer, renderer: Renderer, source: PlySource, cameras: list[Camera]) -> None:
-    """Gradients of all values of every Gaussian, and steps along them, against drawing the same views; by processor time."""
+    """Time gradients of all values, and steps along them, relative to drawing the same views, in processor time."""
     chosen = cameras[:: max(len(cameras) // VIEWS, 1)][:VIEWS]
     planes = source.read(slice(0, source.count), list(FIELD))
     rates = rates_for(cameras)
@@ -135,7 +135,7 @@ def bench_descent(timer: Timer, renderer: Renderer, source: PlySource, cameras: 
 
 
 def _processor_ms(chosen: list[Camera], run: Callable[[int], object]) -> float:
-    """Of one view, after one that does not count."""
+    """Processor time of one view in ms, after one that does not count."""
     run(0)
     start = time.process_time()
     for k in range(len(chosen)):
@@ -144,7 +144,7 @@ def _processor_ms(chosen: list[Camera], run: Callable[[int], object]) -> float:
 
 
 def bench_first_image(timer: Timer, scene: str, device: str | None) -> None:
-    """From the start of a process to its first image, without and with the compiler's cache."""
+    """Time from the start of a process to its first image, without and with the compiler's cache."""
     arguments = ["--first-image", "--scene", scene, *(["--device", device] if device else [])]
     cold: list[float] = []
     warm: list[float] = []
@@ -182,7 +182,7 @@ def main() -> None:
 def _check_image(
     renderer: Renderer, scene: DeviceScene, cameras: list[Camera], options: argparse.Namespace
 ) -> np.ndarray | None:
-    """The golden image where there is one; returns the golden hits over the training views."""
+    """Compare with the golden image if there is one; returns the golden hits over the training views."""
     path = SCENES[options.scene] / "golden.npz"
     image = np.clip(renderer.render(scene, cameras[0]), 0, 1).astype(np.float64)
     check(np.isfinite(image).all() and image.any(), "an image of finite numbers")

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs a command under a memory limit that the kernel keeps: a control group, which counts every process and the file cache.
+# Runs a command under a memory limit that the kernel enforces, by a control group. It counts all processes and the file cache.
 # shellcheck disable=SC2317 # traps and `attempt` call functions by name
 set -euo pipefail
 # shellcheck source=deploy/lib.sh
@@ -10,36 +10,36 @@ usage() {
 Usage: deploy/capped-run.sh LIMIT COMMAND [ARGUMENTS...]
 
 Runs COMMAND in a memory control group of its own. LIMIT is 512MiB (2^20), 1.5GB (10^9) or plain bytes, as for --memory-limit.
-What the processes of the command hold and the file cache that they fill count together; the kernel drops cache before it kills
-a process. Swap does not help.
+The memory of all processes of the command and their file cache count together. The kernel drops cache before it kills a
+process. Swap does not help.
 
   deploy/capped-run.sh 512MiB .venv/bin/flexgs-edge compress scene/point_cloud.ply -o scene.fgs --memory-limit 400MiB
 
-Used is what works here, in this order: cgroup version 2, version 1, a scope of systemd-run with version 2 (the user's own one, or
-for root the system's). The first two need root, or a group that was handed to the user.
+It uses the first of these that works: cgroup version 2, version 1, a scope of systemd-run with version 2 (the user's own, or for
+root the system's). The first two need root, or a group that belongs to the user.
 
   FLEXGS_CGROUP_ROOT   where control groups are mounted (default /sys/fs/cgroup)
 
-On stderr: what is used, at the end the peak of the group, the peak of its anonymous memory (sampled: shorter peaks are missed),
-and whether the cap killed something. Exit code: the command's own; 137: it was killed, by the cap if a line says so; 125: it was
-not run (LIMIT wrong, no control group to be had). Ctrl-C and TERM go to the command, which has 10 s to end. Whatever it left
-running is killed at the end, and the group removed.
+stderr gets the control group in use and, at the end, the peak of the group, the peak of its anonymous memory (sampled, so short
+peaks are missed), and whether the cap killed a process. Exit code: the command's own. 137: it was killed, by the cap if a line
+says so. 125: it was not run (wrong LIMIT, or no control group). Ctrl-C and TERM go to the command, which has 10 s to end.
+Processes that it leaves running are killed at the end, and the group is removed.
 END
 }
 
-# Codes below 125 may be the command's. env, timeout and docker take the same one.
+# Codes below 125 may be the command's. env, timeout and docker use 125 too.
 # shellcheck disable=SC2034
 FAILED=125
 CGROUPS=${FLEXGS_CGROUP_ROOT:-/sys/fs/cgroup}
 PERIOD=0.1 # seconds between samples
-GRACE=10   # seconds that the command has after a signal
+GRACE=10   # seconds that the command has to end after a signal
 
-# stdout and, but for these lines, stderr belong to the command.
+# stdout and stderr belong to the command. Only these lines on stderr are ours.
 note() { say "$@" >&"$talk"; }
 
 mib() { printf '%d.%d MiB' $(($1 >> 20)) $((($1 & 1048575) * 10 >> 20)); }
 
-# Bytes of a LIMIT; whole numbers only, as bash has no others.
+# Prints the bytes of a LIMIT, in whole numbers only, because bash has no others.
 parse_limit() {
   local text=$1 whole fraction unit bytes
   if [[ $text =~ ^\ *([0-9]{1,15})?(\.([0-9]{1,9}))?\ *([A-Za-z]*)\ *$ && -n ${BASH_REMATCH[1]}${BASH_REMATCH[3]} ]]; then
@@ -66,7 +66,7 @@ parse_limit() {
   die "LIMIT '$text': expected a number above zero and a unit such as 700000000, 1.5GB (10^9) or 512MiB (2^20)"
 }
 
-# Sets OWN to the path of this process's group in the hierarchy whose line of /proc/self/cgroup matches the pattern.
+# Sets OWN to the path of this process's group, from the line of /proc/self/cgroup that matches the pattern $1.
 own_group() {
   local line
   OWN=
@@ -75,17 +75,17 @@ own_group() {
   done </proc/self/cgroup
 }
 
-# Runs a command; where it fails, its last words go to WHY_NOT.
+# Runs a command. If it fails, its error message goes to WHY_NOT.
 attempt() {
   WHY_NOT=$({ "$@"; } 2>&1) && return
   WHY_NOT=${WHY_NOT%%$'\n'*} WHY_NOT=${WHY_NOT##*: }
   return 1
 }
 
-# Writes $1 to the file $2. In a process of its own where $1 is 0 and the file cgroup.procs: the one that writes is moved.
+# Writes $1 to the file $2. Writing 0 to cgroup.procs moves the process that writes, so do that in a process of its own.
 put() { echo "$1" >"$2"; }
 
-# Sets group to a new group in the folder $1, limited; else says why not in WHY. $2: name of the file with the limit.
+# Makes a limited group in the folder $1 and sets `group`; on failure sets WHY. $2: name of the file for the limit.
 make_group() {
   local parent=$1 limit_file=$2 file value
   group=$parent/flexgs-capped-$$
@@ -94,7 +94,7 @@ make_group() {
     group=
     return 1
   fi
-  # A folder of a hierarchy without the memory controller (or no control group at all) has no such file.
+  # The file is missing without the memory controller, or if the folder is no control group at all.
   if [ ! -e "$group/$limit_file" ]; then
     WHY="groups made in $parent have no $limit_file: the memory controller is not handed down to them"
   elif ! attempt put 0 "$group/cgroup.procs"; then
@@ -102,7 +102,7 @@ make_group() {
   elif ! attempt put "$limit" "$group/$limit_file"; then
     WHY="cannot set $group/$limit_file ($WHY_NOT)"
   else
-    # Version 2: memory.swap.max counts swap alone; version 1: memsw counts both, and swappiness helps where it is missing.
+    # In version 2, memory.swap.max counts swap alone. In version 1, memsw counts both; swappiness helps if memsw is missing.
     for file in memory.swap.max:0 memory.memsw.limit_in_bytes:"$limit" memory.swappiness:0; do
       value=${file#*:} file=$group/${file%%:*}
       if [ -e "$file" ] && ! attempt put "$value" "$file"; then note "swap: cannot set $file ($WHY_NOT)"; fi
@@ -114,8 +114,8 @@ make_group() {
   return 1
 }
 
-# Version 2. A group with processes cannot hand controllers down (but for the root), so the parents are tried after the own group.
-# With $1, the group is a scope made for this script, which then moves into a leaf of it.
+# Version 2. Only the root can hold processes and hand controllers down, so we try the own group first, then its parents.
+# With $1, the own group is a scope made for this script, and the script moves into a leaf of it.
 try_v2() {
   local place=$CGROUPS at parent
   [ -e "$place/cgroup.controllers" ] || place=$CGROUPS/unified
@@ -136,13 +136,13 @@ try_v2() {
   fi
   while :; do
     parent=$place$at
-    # From inside a container the path may be the host's: the folders that are there count.
+    # Inside a container the path may be the host's, so some of its folders may not exist.
     if [ -e "$parent/cgroup.procs" ]; then
       if ! grep -qw memory "$parent/cgroup.subtree_control"; then
         attempt put +memory "$parent/cgroup.subtree_control" || true
       fi
       if make_group "$parent" memory.max; then return 0; fi
-      # Beside a group with a limit, the command would be out of that limit's reach.
+      # Stop at a group with a limit: in a group beside it, the command would escape that limit.
       if [ -z "$at" ] || [ -n "${1:-}" ] || [ "$(cat "$parent/memory.max" 2>/dev/null || echo max)" != max ]; then return 1; fi
     elif [ -z "$at" ]; then
       return 1
@@ -151,7 +151,7 @@ try_v2() {
   done
 }
 
-# Version 1: a group inside the own one, so that whatever limits this script limits the command as well.
+# Version 1. The group goes inside the script's own group, so that limits on this script also hold for the command.
 try_v1() {
   local place=$CGROUPS/memory at
   WHY="$place has no memory.limit_in_bytes"
@@ -162,13 +162,13 @@ try_v1() {
   make_group "$place$at" memory.limit_in_bytes
 }
 
-# Starts this script again in a scope of its own; comes back only where that cannot work.
+# Starts this script again in a scope of its own. Returns only if that does not work.
 try_systemd() {
   local words=(systemd-run --scope --quiet --collect --no-ask-password -p Delegate=yes) said
   [ "$(id -u)" -eq 0 ] || words+=(--user)
   WHY="systemd-run is not installed"
   command -v systemd-run >/dev/null || return 1
-  # The scope is only asked for; the limit is set by this script, in a group inside it that holds the command and nothing else.
+  # The scope itself has no limit. Inside it, this script makes a limited group that holds only the command.
   if said=$("${words[@]}" -- "$BASH" "${BASH_SOURCE[0]}" --in-scope "$limit" true 2>&1); then
     exec "${words[@]}" -- "$BASH" "${BASH_SOURCE[0]}" --in-scope "$limit" "$@"
   fi
@@ -202,7 +202,7 @@ find_group() {
     "if control groups are mounted elsewhere, name the place in FLEXGS_CGROUP_ROOT"
 }
 
-# Does the terminal send Ctrl-C to the command itself? Then passing it on would be a second one, in the middle of its clean-up.
+# Whether the terminal sends Ctrl-C to the command itself. Then we must not pass it on: a second one would hit its clean-up.
 at_terminal() {
   local stat fields
   stat=$(<"/proc/$$/stat")
@@ -216,7 +216,7 @@ on_signal() {
   if [ "$1" != INT ] || ! at_terminal; then kill -s "$1" "$child" 2>/dev/null || true; fi
 }
 
-# Kills every process of the group, also those of groups that the command made inside; says how many there were in KILLED.
+# Kills all processes of the group, and of groups that the command made inside it. Sets KILLED to their number.
 kill_group() {
   local pids i
   KILLED=0
@@ -234,7 +234,7 @@ clean_up() {
   trap '' INT TERM HUP
   [ -n "$group" ] || return 0
   kill_group
-  for ((i = 0; i < 100; i++)); do # processes that have ended may hold the group for a moment
+  for ((i = 0; i < 100; i++)); do # the group stays busy for a moment after its processes end
     find "$group" -depth -type d -exec rmdir {} + 2>/dev/null || true
     [ -d "$group" ] || return 0
     nap
@@ -242,7 +242,7 @@ clean_up() {
   note "the group $group could not be removed"
 }
 
-# Not `read -t` on a silent pipe, which would need no process: a signal that is caught meanwhile leaves bash 5.2 hanging.
+# `read -t` on a silent pipe would need no process, but bash 5.2 hangs if it catches a signal meanwhile.
 nap() { sleep "$PERIOD" || true; }
 
 sample() {
@@ -250,7 +250,7 @@ sample() {
   mapfile -t lines 2>/dev/null <"$group/memory.stat" || true
   for line in "${lines[@]}"; do
     case $line in
-      # Both count groups inside this one. `rss` of version 1 is anonymous memory, file pages that are mapped left out.
+      # Both include groups inside this one. `total_rss` of version 1 is anonymous memory, without mapped file pages.
       "anon "* | "total_rss "*)
         now=${line#* } samples=$((samples + 1))
         if [ "$now" -gt "$anonymous" ]; then anonymous=$now; fi
@@ -320,10 +320,10 @@ for file in memory.peak memory.max_usage_in_bytes; do
 done
 note "cap: $limit bytes ($(mib "$limit")) by $used, $group"
 if [ "$(wc -l </proc/swaps)" -gt 1 ] && [ ! -e "$group/memory.swap.max" ] && [ ! -e "$group/memory.memsw.limit_in_bytes" ]; then
-  note "swap is not counted by this kernel: what is swapped out is beyond the cap"
+  note "this kernel does not count swap, so swapped memory escapes the cap"
 fi
 
-# Bash starts background commands with Ctrl-C ignored and stdin closed: neither is wanted.
+# Bash starts background commands with Ctrl-C ignored and stdin closed. The command needs both.
 (
   trap - INT QUIT TERM HUP EXIT
   exec {talk}>&-
@@ -342,7 +342,7 @@ child=$!
     fi
   done
   wait "$child" || status=$?
-} 2>/dev/null # where bash tells of killed commands in words of its own
+} 2>/dev/null # hides bash's own messages about killed commands
 report
 kill_group
 if [ "$KILLED" -gt 0 ]; then note "$KILLED processes that the command had left running were killed"; fi

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Shows by pip's own resolver that every runtime dependency, and what the extras add, has a wheel for aarch64 Linux.
+"""Checks with pip's own resolver that every dependency, of the package and its extras, has a wheel for aarch64 Linux.
 
     deploy/check-aarch64.py [3.10 3.11 3.12]     needs pip and the package index, installs nothing
 
-Takes the dependencies of setup.cfg, with the versions of constraints.txt, and the extras but for those of developers and for
+It takes the dependencies of setup.cfg with the versions of constraints.txt. Extras for developers are left out, and so is
 `lpips`: pip fetches whole wheels to look at them, and torch's are gigabytes. pip evaluates markers such as
-`python_version < "3.11"` for the Python that runs it, and may miss what an index does not say about the Python that a package
-requires: both are checked here for the Python asked for.
+`python_version < "3.11"` for the Python that runs it, and an index may not say which Python a package requires. So this
+script checks both for the wanted Python.
 Exit code 0: all resolve; 1: some do not.
 """
 
@@ -24,7 +24,7 @@ try:
     from packaging.requirements import Requirement
     from packaging.specifiers import SpecifierSet
     from packaging.utils import canonicalize_name
-except ImportError:  # pip has a copy of its own
+except ImportError:  # pip brings a copy
     from pip._vendor.packaging.requirements import Requirement
     from pip._vendor.packaging.specifiers import SpecifierSet
     from pip._vendor.packaging.utils import canonicalize_name
@@ -32,8 +32,8 @@ except ImportError:  # pip has a copy of its own
 ROOT = Path(__file__).resolve().parents[1]
 VERSIONS = ("3.10", "3.11", "3.12")
 LEFT_OUT = ("test", "dev", "lpips")
-"""Extras that are not checked; see above."""
-# What glibc 2.31 runs and newer ones too: Ubuntu 20.04 of JetPack 5 has 2.31, 22.04 of JetPack 6 has 2.35.
+"""Extras that are not checked, for the reasons above."""
+# Wheels for glibc 2.31 or older. Ubuntu 20.04 of JetPack 5 has 2.31, and 22.04 of JetPack 6 has 2.35.
 PLATFORMS = (
     "manylinux2014_aarch64",
     "manylinux_2_17_aarch64",
@@ -44,7 +44,7 @@ PLATFORMS = (
 
 
 def environment(version: str) -> dict[str, str]:
-    """What markers see on the target."""
+    """Values of markers on the target."""
     return {
         "python_version": version,
         "python_full_version": f"{version}.0",
@@ -59,12 +59,12 @@ def environment(version: str) -> dict[str, str]:
 
 
 def applies(requirement: Requirement, version: str) -> bool:
-    """Whether the target needs it."""
+    """Whether the target needs a requirement."""
     return requirement.marker is None or bool(requirement.marker.evaluate(environment(version)))
 
 
 def plain(requirement: Requirement) -> str:
-    """The requirement without its marker, which pip would evaluate for the wrong Python."""
+    """The requirement without its marker, because pip would evaluate it for the wrong Python."""
     extras = f"[{','.join(sorted(requirement.extras))}]" if requirement.extras else ""
     return f"{requirement.name}{extras}{requirement.specifier}"
 
@@ -86,7 +86,7 @@ def constraints(version: str) -> list[str]:
 
 
 def resolve(wanted: list[str], version: str) -> list[dict[str, Any]]:
-    """What pip chooses; raises `RuntimeError` with pip's words when it finds none."""
+    """The files that pip chooses. Raises `RuntimeError` with pip's message if it finds none."""
     with tempfile.TemporaryDirectory() as folder:
         limits, report = Path(folder) / "constraints.txt", Path(folder) / "report.json"
         limits.write_text("\n".join(constraints(version)) + "\n")
@@ -105,14 +105,14 @@ def resolve(wanted: list[str], version: str) -> list[dict[str, Any]]:
 
 
 def missing(chosen: list[dict[str, Any]], version: str) -> list[str]:
-    """What chosen packages require on the target and pip left out, having looked at the markers of its own Python."""
+    """Requirements of chosen packages that pip left out, because it evaluated markers for its own Python."""
     names = {canonicalize_name(item["metadata"]["name"]) for item in chosen}
     required = [Requirement(line) for item in chosen for line in item["metadata"].get("requires_dist", [])]
     return sorted({plain(r) for r in required if applies(r, version) and canonicalize_name(r.name) not in names})
 
 
 def faults(item: dict[str, Any], version: str) -> list[str]:
-    """Why a chosen file would not install on the target."""
+    """Reasons why a chosen file would not install on the target."""
     file = item["download_info"]["url"].rsplit("/", 1)[-1]
     requires = SpecifierSet(item["metadata"].get("requires_python") or "")
     found = []
@@ -124,7 +124,7 @@ def faults(item: dict[str, Any], version: str) -> list[str]:
 
 
 def check(version: str) -> bool:
-    """Resolve for one Python version and print what was chosen."""
+    """Resolve for one Python version and print the chosen files. Returns False if that fails."""
     wanted = [plain(requirement) for requirement in runtime_requirements() if applies(requirement, version)]
     try:
         chosen = resolve(wanted, version)

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Sets everything up, then compresses the bundled scene, says what was lost, and opens the result again.
+# Sets everything up, compresses the bundled scene, decompresses the result and renders two views of it.
 #
 #   deploy/demo.sh
 #
-# The results lie in demo-output/ afterwards.
+# The results are in demo-output/ afterwards.
 set -euo pipefail
 # shellcheck source=deploy/lib.sh
 . "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
@@ -13,7 +13,7 @@ code=0
 deploy/setup.sh || code=$?
 device=() way=(--effort fast)
 if [ "$code" -eq "$NO_DEVICE" ]; then
-  say "running on --device numpy, far slower: so by --method paper, which takes minutes instead of half an hour"
+  say "using --device numpy, which is far slower; so also --method paper, which is quicker and makes larger files"
   device=(--device numpy) way=(--method paper)
 elif [ "$code" -ne 0 ]; then
   exit "$code"

@@ -1,11 +1,11 @@
 # shellcheck shell=bash
-# What the scripts of this folder share; sourced, never run.
+# Shared by the scripts of this folder. They source it; nobody runs it.
 
 ROOT=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 VENV=${FLEXGS_VENV:-$ROOT/.venv}
 # shellcheck disable=SC2034
 NO_DEVICE=4 # exit code of `flexgs-edge devices`, and of setup.sh, when no OpenCL device passes the self-test
-FAILED=1 # exit code of die; a script that passes other programs' codes on takes another
+FAILED=1 # exit code of die; a script that passes on codes of other programs sets another one
 
 say() { printf '==> %s\n' "$*"; }
 
@@ -16,7 +16,7 @@ die() {
   exit "$FAILED"
 }
 
-# Sets AS_ROOT to the words that run a command as root; fails where that would need a password.
+# Sets AS_ROOT to the words that run a command as root. Fails if that would need a password.
 can_be_root() {
   if [ "$(id -u)" -eq 0 ]; then
     AS_ROOT=(env)
@@ -27,13 +27,13 @@ can_be_root() {
   fi
 }
 
-# Installs Debian packages without asking; fails quietly where there is no apt or no right to use it.
+# Installs Debian packages without asking. Fails quietly if there is no apt, or no right to use it.
 apt_install() {
   command -v apt-get >/dev/null && can_be_root || return 1
   say "apt-get install $*"
-  # The lock time-out: a fresh machine is often busy with its own updates.
+  # The lock needs a time-out, because a fresh machine is often busy with its own updates.
   local apt=("${AS_ROOT[@]}" DEBIAN_FRONTEND=noninteractive apt-get -qq -o Dpkg::Use-Pty=0 -o DPkg::Lock::Timeout=120)
-  "${apt[@]}" update || say "apt-get update failed: trying with the package lists that are there"
+  "${apt[@]}" update || say "apt-get update failed: going on with the old package lists"
   "${apt[@]}" install -y --no-install-recommends "$@" >/dev/null
 }
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Sets everything up on a small board (a Jetson, any aarch64 or x86 Linux) and compresses a scene on it.
 set -euo pipefail
-shopt -s extglob # before the functions below are read
+shopt -s extglob # must be set before bash reads the functions below
 # shellcheck source=deploy/lib.sh
 . "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
 
@@ -12,29 +12,29 @@ Usage: deploy/on-device.sh SCENE [OPTIONS OF COMPRESS...]
 Sets this checkout up (as deploy/setup.sh does), then compresses SCENE: a .ply, a .fgs or a model folder.
 
   deploy/on-device.sh garden/point_cloud.ply                       writes garden/point_cloud.fgs
-  deploy/on-device.sh garden/point_cloud.ply --effort fast         faster, some more bytes
+  deploy/on-device.sh garden/point_cloud.ply --effort fast         faster, larger file
   deploy/on-device.sh garden/point_cloud.ply -o /mnt/ssd/garden.fgs --memory-limit 2GiB
-  deploy/on-device.sh garden/point_cloud.ply --method paper                       a quick look: much larger files,
-  deploy/on-device.sh garden/point_cloud.ply --method paper -f --max-drop 0.5     again, with the scores of that call
+  deploy/on-device.sh garden/point_cloud.ply --method paper                       quickest, much larger file
+  deploy/on-device.sh garden/point_cloud.ply --method paper -f --max-drop 0.5     again, with the same scores
 
-What follows SCENE goes to `flexgs-edge compress` (.venv/bin/flexgs-edge compress --help lists it). Added unless given:
+Options after SCENE go to `flexgs-edge compress` (see .venv/bin/flexgs-edge compress --help). Added unless you give them:
 
   -o OUT.fgs           beside the scene, under its name
-  --memory-limit       a share of the memory that is free, within the limits of a container
-  --score-cache FILE   with --method paper: OUT.scores.npz; scores are made again only if scene, poses or score have changed
+  --memory-limit       a share of the free memory, within the limits of a container
+  --score-cache FILE   with --method paper: OUT.scores.npz; scores are computed again only if scene, poses or score change
 
-  FLEXGS_MEMORY_SHARE  that share in percent (default 60: CPU and GPU of such boards use the same memory)
+  FLEXGS_MEMORY_SHARE  that share in percent (default 60, because CPU and GPU of such boards share their memory)
   FLEXGS_VENV, FLEXGS_PYTHON   as for deploy/setup.sh
 
-What is used goes to stderr, the summary of `compress` to stdout. Nothing is overwritten without -f. Exit codes are those
-of `compress`; 4: no OpenCL device passes the self-test, and --device numpy (no OpenCL, far slower) was not asked for.
+Device, memory limit and scores go to stderr, the summary of `compress` to stdout. Nothing is overwritten without -f. Exit
+codes are those of `compress`. 4: no OpenCL device passes the self-test, and you did not ask for --device numpy (far slower).
 END
 }
 
-# stdout belongs to `compress`, whose --json - goes there.
+# stdout belongs to `compress`, because --json - writes there.
 note() { say "$@" >&2; }
 
-# Reads what `compress` is told, for the sake of what is added to it.
+# Reads the options of `compress`, to know which ones to add.
 read_options() {
   while [ $# -gt 0 ]; do
     case $1 in
@@ -62,7 +62,7 @@ read_options() {
 # Sets `output` to the name beside the scene.
 name_output() {
   local name=${scene%/}
-  [ ! -d "$scene" ] || name=$(cd "$scene" && pwd) # the folder . has no name
+  [ ! -d "$scene" ] || name=$(cd "$scene" && pwd) # the folder . needs its full name
   case $name in
     *.fgs) die "$scene: give the file to write with -o, since this one is the input" ;;
     *.[pP][lL][yY]) name=${name%.*} ;;
@@ -94,12 +94,12 @@ if [ -z "$output" ]; then
   [ -n "$dry_run" ] || added+=(-o "$output")
 fi
 
-# The other scripts work in the checkout, this one where it is called.
+# The other scripts work in the checkout. This one works where it is called, so VENV must be absolute.
 case $VENV in /*) ;; *) VENV=$ROOT/$VENV ;; esac
 code=0
 "$ROOT/deploy/setup.sh" >&2 || code=$?
 if [ "$code" -eq "$NO_DEVICE" ] && [ "$device" != numpy ]; then
-  note "what works on which board: docs/jetson.md; without OpenCL, and far slower: add --device numpy"
+  note "see docs/jetson.md for what works on which board; or add --device numpy, which needs no OpenCL and is far slower"
   exit "$code"
 fi
 [ "$code" -eq 0 ] || [ "$code" -eq "$NO_DEVICE" ] || exit "$code"
@@ -112,7 +112,7 @@ else
   flexgs_edge devices ${device:+--device "$device"} >&2
 fi
 
-# The default method and the free memory are the program's to know.
+# Only the program knows its default method and the free memory.
 known=$("$VENV/bin/python" -c '
 from flexgs_edge.memory.process import available_memory
 from flexgs_edge.run.options import CompressOptions
@@ -128,7 +128,7 @@ else
 fi
 
 if [ "$method" != paper ]; then
-  note "scores: --method $method measures as it goes, there is nothing to keep (--method paper is quicker, and keeps them)"
+  note "scores: --method $method measures as it goes and keeps none (--method paper is quicker and keeps them)"
 elif [ -n "$score" ] && [ "$score" != gs ] && [ "$score" != meson ]; then
   note "scores: from $score"
 else

@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Makes this checkout ready to run: a virtual environment, the package, an OpenCL runtime that works.
+# Prepares this checkout: makes a virtual environment, installs the package and, if needed, an OpenCL runtime.
 #
 #   deploy/setup.sh [EXTRAS]     EXTRAS: test, dev or test,dev (see setup.cfg)
 #
 # FLEXGS_VENV    folder of the virtual environment (default: .venv in the checkout)
 # FLEXGS_PYTHON  interpreter to make it with (default: python3)
 #
-# May be run again at any time: what is done already is not done twice.
+# You may run it again at any time. It skips steps that are done.
 # Exit code 0: ready; 4: ready, but no OpenCL device passes the self-test (only `--device numpy` works).
 set -euo pipefail
 # shellcheck source=deploy/lib.sh
@@ -36,7 +36,7 @@ make_environment() {
     "without: name in FLEXGS_PYTHON a Python 3.10 or newer that has venv or virtualenv"
 }
 
-# A stamp an extra, so that demo, tests and development do not undo each other's work.
+# Each extra has a stamp of its own, so that demo, tests and development do not undo each other's work.
 install_package() {
   local state stamp extra missing=
   state=$(cat setup.cfg pyproject.toml constraints.txt flexgs_edge/_version.py | cksum)
@@ -53,7 +53,7 @@ install_package() {
   done
 }
 
-# 0: some device passes the self-test; 4: none does, or a runtime took the process down. Anything else is a fault of ours.
+# Returns 0 if some device passes the self-test, and 4 if none does or a runtime crashed. Any other code is a fault of ours.
 self_test() {
   local code=0 report
   report=$(flexgs_edge devices --json - 2>&1) || code=$?
@@ -78,6 +78,6 @@ elif apt_install pocl-opencl-icd && self_test; then
   say "PoCL is installed and passes the self-test"
 else
   say "no OpenCL device passes the self-test"
-  say "to get one: sudo apt install pocl-opencl-icd; to see what is there: $VENV/bin/flexgs-edge devices"
+  say "to get one: sudo apt install pocl-opencl-icd; to list devices: $VENV/bin/flexgs-edge devices"
   exit "$NO_DEVICE"
 fi

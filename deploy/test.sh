@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Sets everything up and runs the whole test suite; at least 90 % of the package's lines must have run.
+# Sets everything up and runs the whole test suite. Tests must cover at least 90 % of the package's lines.
 #
 #   deploy/test.sh [PYTEST ARGUMENTS]     for example: deploy/test.sh -k container -x
 #
-# With arguments the coverage is not judged, since they mostly choose a part of the tests.
-# No working OpenCL device is a failure here, not a skip.
+# With arguments coverage is not checked, because they mostly choose a part of the tests.
+# Without a working OpenCL device this fails; nothing is skipped.
 set -euo pipefail
 # shellcheck source=deploy/lib.sh
 . "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
@@ -17,19 +17,19 @@ if [ "$code" -eq "$NO_DEVICE" ]; then
 fi
 [ "$code" -eq 0 ] || exit "$code"
 
-# Runs the kernels under a checker of memory accesses and races. Debian 13 has dropped it: those tests then skip.
+# Oclgrind runs kernels and checks memory accesses and races. Debian 13 has dropped it; its tests are skipped there.
 if ! command -v oclgrind >/dev/null; then
   apt_install oclgrind 2>/dev/null || say "no oclgrind here: its tests are skipped"
 fi
 
-# Opens the pages of reports: those tests skip where there is no browser.
+# The tests of report pages need a browser. Without one they are skipped.
 if ! command -v chromium >/dev/null && ! command -v google-chrome >/dev/null; then
   apt_install chromium 2>/dev/null || say "no browser here: the tests of report pages are skipped"
 fi
 
 if [ $# -eq 0 ]; then
-  rm -f .coverage .coverage.* # left by a run that was killed
-  # Most of the suite is Python in one thread: two processes, whole files each, so that fixtures are made once.
+  rm -f .coverage .coverage.* # a killed run leaves these
+  # Most of the suite is Python in one thread, so two processes help. Each takes whole files, so that fixtures are made once.
   set -- --numprocesses=2 --dist=loadfile --cov=flexgs_edge --cov-report=term --cov-fail-under=90
 fi
 exec "$VENV/bin/python" -m pytest "$@"

@@ -202,5 +202,6 @@ def _pixels(image: Image.Image, background: np.ndarray, path: Path) -> np.ndarra
     if mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
         colours = np.asarray(image.convert("RGBA"), np.float32) / 255.0
         alpha = colours[:, :, 3:]
-        return colours[:, :, :3] * alpha + background * (1.0 - alpha)
+        blended: np.ndarray = colours[:, :, :3] * alpha + background * (1.0 - alpha)
+        return blended
     return np.asarray(image.convert("RGB"), np.float32) / np.float32(255.0)

@@ -127,7 +127,8 @@ class Witnesses:
         steps = first + inside * ((np.arange(MARCH) + 0.5) / MARCH)[:, None]
         x, y, z = (np.floor(begin + line * steps).astype(np.int64) for begin, line in zip(start, lines))
         cells = np.take(self.smooth, (x * shape[1] + y) * shape[2] + z, mode="clip")
-        return np.exp(-cells.mean(axis=0) * inside * length)
+        clear: np.ndarray = np.exp(-cells.mean(axis=0) * inside * length)
+        return clear
 
     def agreement(self, eye: np.ndarray) -> np.ndarray:
         """[M] f64, view-dependent colour towards `eye` over its mean over all directions.

@@ -19,19 +19,19 @@ from flexgs_edge.cli.talk import State
 from flexgs_edge.errors import FlexGSError, InputError
 
 COMMANDS = {
-    "compress": "Compress a scene to the fewest bytes that hold a quality, or the best quality in a size.",
-    "decompress": "Decode a .fgs file to a PLY that every viewer opens, or convert between formats.",
-    "info": "Show what a scene file holds: counts, bits and bytes of every channel, settings.",
-    "trim": "Cut a layered .fgs file to a size, at the speed of copying.",
+    "compress": "Make a scene smaller: to a quality or to a size.",
+    "decompress": "Decode a .fgs file to a .ply, or convert between formats.",
+    "info": "Show what a scene file holds.",
+    "trim": "Cut a layered .fgs file to a size, without the original.",
     "verify": "Check every byte of a .fgs file against its checksums.",
-    "render": "Draw views of a scene as PNG files, and time them.",
-    "evaluate": "Measure what a scene lost against another: PSNR, SSIM, fidelity and drop of every view.",
-    "score": "Save the importance of every Gaussian, for --method paper: other targets then need no scoring.",
-    "study": "Make the experiments of a paper on scenes of your own: tables, charts and one page.",
-    "synth": "Make a big scene from a small one, to test memory and time with.",
-    "devices": "List the OpenCL devices, whether they work, and which one is used.",
+    "render": "Draw views of a scene as PNG files.",
+    "evaluate": "Compare a scene with its original, view by view.",
+    "score": "Save the importance of every Gaussian, for --method paper.",
+    "study": "Run experiments on your own scenes: tables and charts.",
+    "synth": "Make a large test scene from a small one.",
+    "devices": "List the OpenCL devices, and say which one is used.",
 }
-"""Subcommands and their line in the overview: spelled out here so that `--help` loads none of them."""
+"""Subcommands and the first sentence of their help: spelled out here so that `--help` loads none of them."""
 
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
@@ -43,21 +43,30 @@ _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 )
 @click.version_option(__version__, "-V", "--version", message="flexgs-edge %(version)s")
 def command() -> None:
-    """Make trained 3D Gaussian splatting scenes more than ten times smaller, without training.
+    """Make trained 3D Gaussian splatting scenes much smaller, without training.
 
-    The usual way through, for a scene with its cameras.json and images/ beside it:
+    For a scene with cameras.json and images/ beside it:
 
     \b
       flexgs-edge compress scene/point_cloud.ply -o scene.fgs
       flexgs-edge info scene.fgs
       flexgs-edge decompress scene.fgs -o decoded.ply
 
-    A scene (INPUT) is a .ply in INRIA's layout, a .fgs, .spz, .sog or .compressed.ply file, or the folder that the 3DGS training
-    program writes. The summary goes to stdout, everything else to stderr; --json gives the same record to programs.
-    Nothing is overwritten without -f.
+    A scene (INPUT) is a .ply in INRIA's layout, a .fgs, .spz, .sog or .compressed.ply file, or the folder that 3DGS training
+    writes. The summary goes to stdout, logs and errors to stderr. --json FILE writes the same record for programs; with
+    --json - it goes to stdout, and the summary to stderr. Files that exist are overwritten only with -f.
 
-    Exit codes: 0 done; 2 misuse, bad input or a damaged file; 3 target not reachable; 4 no usable device; 5 memory limit
-    or disk too small; 130 interrupted; 1 a fault of this program. COMMAND --help explains each command, with examples.
+    \b
+    Exit codes:
+      0    done
+      1    a fault of this program
+      2    misuse, bad input or a damaged file
+      3    target not reachable
+      4    no usable device
+      5    memory limit or disk too small
+      130  interrupted
+
+    COMMAND --help explains a command, with examples.
     """
 
 

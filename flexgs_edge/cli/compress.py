@@ -8,223 +8,218 @@ import click
 from click.core import ParameterSource
 
 from flexgs_edge.cli import shared_options, talk, value_types
+from flexgs_edge.cli.help_page import EFFORT, MACHINES, METHOD, OUTPUT, VIEWS, ExpertCommand, option
 
-
-@click.command(cls=shared_options.SectionCommand)
-@shared_options.scene_argument
-@shared_options.option(
-    "Output",
-    "-o",
-    "--output",
-    metavar="OUT",
-    help="File to write: .fgs, .spz, .sog or .compressed.ply (a .fgs needs none with --dry-run).",
+REACH = "What to reach (give one target; default: --max-drop 1.0)"
+USUAL = (
+    "max_drop",
+    "min_fidelity",
+    "max_worst_drop",
+    "max_size",
+    "min_ratio",
+    "best_effort",
+    "cameras",
+    "images",
+    "antialiased",
+    "views_margin",
+    "effort",
+    "memory_limit",
+    "device",
+    "output",
+    "layers",
+    "report",
+    "json_path",
+    "dry_run",
+    "force",
+    "quiet",
 )
-@shared_options.option("Output", "--dry-run", is_flag=True, help="Do everything but write; the size shown is exact.")
-@shared_options.report_option
-@shared_options.option(
-    "Target (one of them; default --max-drop 1.0)",
+"""Options of the first page, in order; `--expert` shows the others too."""
+MORE = """\b
+More examples:
+  flexgs-edge compress point_cloud.ply -o a.fgs --method paper --score-cache s.npz
+  flexgs-edge compress point_cloud.ply -o b.fgs --method paper --score-cache s.npz --max-drop 2
+      the paper's method, for two targets; the second run reuses the scores
+  flexgs-edge compress point_cloud.ply -o c.fgs --method paper --prune-rate 0.3 --sh-rate 0.4
+      fixed rates, no search
+  flexgs-edge compress point_cloud.ply -o d.fgs --cluster local:2
+      draws views in two processes
+  flexgs-edge compress big.ply -o big.fgs --memory-limit 1GiB --scratch /data/tmp --resume
+      for a scene larger than memory; goes on after an interruption
+"""
+
+
+@click.command(cls=ExpertCommand, usual=USUAL, more=MORE)
+@shared_options.scene_argument
+@option(
+    REACH,
     "--max-drop",
     metavar="DB",
     type=float,
-    help="Fewest bytes that lose at most so many dB of PSNR: against the photos where there are photos, else modelled.",
+    help="Smallest file that loses at most DB of PSNR against the photos. Without photos the loss is estimated.",
 )
-@shared_options.option(
-    "Target (one of them; default --max-drop 1.0)",
+@option(
+    REACH,
     "--min-fidelity",
     metavar="DB",
     type=float,
-    help="Fewest bytes whose renders keep a PSNR of at least so many dB against the original's renders (40: about 1 dB of drop).",
+    help="Smallest file with this PSNR to the original's renders.",
 )
-@shared_options.option(
-    "Target (one of them; default --max-drop 1.0)",
+@option(
+    REACH,
     "--max-worst-drop",
     metavar="DB",
     type=float,
-    help="With --max-drop or --min-fidelity: no deciding view may lose more than this either.",
+    help="With one of the two above: no view may lose more.",
 )
-@shared_options.option(
-    "Target (one of them; default --max-drop 1.0)",
-    "--max-size",
-    type=value_types.SIZE,
-    help="Best quality in a file of at most so many bytes, such as 8MB (10^6) or 8MiB (2^20).",
-)
-@shared_options.option(
-    "Target (one of them; default --max-drop 1.0)",
-    "--min-ratio",
-    metavar="R",
-    type=float,
-    help="Best quality in a file R times smaller than the PLY (248 bytes a Gaussian at SH degree 3).",
-)
-@shared_options.option(
-    "Target (one of them; default --max-drop 1.0)",
-    "--best-effort",
-    is_flag=True,
-    help="Write the closest point when the target cannot be met (exit code 0 then, not 3).",
-)
+@option(REACH, "--max-size", type=value_types.SIZE, help="Best quality in at most this size, such as 8MB or 8MiB.")
+@option(REACH, "--min-ratio", metavar="R", type=float, help="Best quality in a file R times smaller than the .ply.")
+@option(REACH, "--best-effort", is_flag=True, help="If the target cannot be met, write the closest result.")
 @shared_options.photos_options
-@shared_options.select_option
-@shared_options.drawing_options
-@shared_options.option(
-    "Method",
-    "--method",
-    type=click.Choice(["best", "paper"]),
-    default="best",
-    show_default=True,
-    help="best: measured removal costs, colour refit and an entropy coder. paper: FlexGaussian's, bit-packed without entropy "
-    "coding: four to six times the bytes at the same drop, in a fraction of the seconds.",
-)
-@shared_options.option(
-    "Method",
-    "--unseen",
-    metavar="keep|drop|N%",
-    default="keep",
-    show_default=True,
-    help="Gaussians that no training pose sees (best only): kept without SH, dropped, or the largest N % of them kept.",
-)
-@shared_options.option(
-    "Views",
+@option(
+    VIEWS,
     "--views-margin",
     is_flag=True,
-    help="Make three poses of every two given ones and score them too (best only): nearer to what is seen, farther from it and "
-    "in between, so that what only such views show stays.",
+    help="Also use generated camera views: closer, farther and in between. For scenes that people walk through. "
+    "Slower, slightly larger files.",
 )
-@shared_options.option(
-    "Method", "--refit/--no-refit", default=True, help="Refit colours to what was pruned and quantized (best only)."
+@shared_options.select_option
+@shared_options.drawing_options
+@shared_options.base_psnr_option
+@shared_options.drop_invalid_option
+@option(
+    EFFORT,
+    "--effort",
+    metavar="WORD",
+    type=click.Choice(["fast", "balanced", "thorough", "max"]),
+    default="balanced",
+    show_default=True,
+    help="fast, balanced, thorough or max (.fgs only). More effort: smaller files, slower.",
 )
-@shared_options.option(
-    "Method",
+@option(
+    MACHINES,
+    "--scratch",
+    metavar="DIR",
+    help="Folder for scratch files, written if a scene does not fit into the memory limit. Default: beside OUT.",
+)
+@option(
+    MACHINES,
+    "--resume",
+    is_flag=True,
+    help="Save the progress in the scratch folder. After an interruption, the same command goes on from there. "
+    "The bytes stay the same.",
+)
+@option(
+    MACHINES,
+    "--cluster",
+    metavar="ADDRESS|local:N",
+    help="Draw views in N processes here (local:N) or on a Dask cluster, such as tcp://HOST:8786. Needs "
+    "pip install 'flexgs-edge[cluster]'. The bytes stay the same.",
+)
+@option(OUTPUT, "-o", "--output", metavar="OUT", help="File to write: .fgs, .spz, .sog or .compressed.ply.")
+@option(
+    OUTPUT,
     "--layers",
     metavar="N",
     type=int,
     default=1,
     show_default=True,
-    help="Up to 4 layers that each double the bytes (best only): `trim` then cuts the file to a size without the original.",
+    help="Layers, up to 4, that `flexgs-edge trim` can cut. More: slightly larger file.",
 )
-@shared_options.option(
-    "Run",
-    "--scratch",
-    metavar="DIR",
-    help="Folder for scratch files, used when a scene does not fit into the memory limit (best only). Default: beside OUT.",
+@shared_options.report_option
+@option(OUTPUT, "--dry-run", is_flag=True, help="Write nothing (no -o needed). The size shown is exact.")
+@option(
+    METHOD,
+    "--method",
+    type=click.Choice(["best", "paper"]),
+    default="best",
+    show_default=True,
+    help="best: the smallest files. paper: the FlexGaussian paper's method; faster, much larger files.",
 )
-@shared_options.option(
-    "Run",
-    "--resume",
-    is_flag=True,
-    help="Keep every round of the search in the scratch folder until the run is done, and go on from those of a run of the same "
-    "scene, poses and options that was cut short (best only): the bytes are those of one run.",
+@option(
+    METHOD,
+    "--unseen",
+    metavar="keep|drop|N%",
+    default="keep",
+    show_default=True,
+    help="What to do with Gaussians that no training view sees. keep: without view-dependent colour. drop: leave them out. "
+    "N%: only the largest and most opaque N %.",
 )
-@shared_options.option(
-    "Run",
-    "--cluster",
-    metavar="ADDRESS|local:N",
-    help="Draw the scored poses and the views that are compared on a Dask cluster, such as tcp://HOST:8786, or in N processes "
-    "here (best only; needs pip install 'flexgs-edge[cluster]'). The bytes are those of one machine.",
+@option(
+    METHOD,
+    "--refit/--no-refit",
+    default=True,
+    help="Adjust colours to what was removed and rounded. Off: faster, larger files. Default: on.",
 )
-@shared_options.option(
-    "Method",
+@option(
+    METHOD,
+    "--distil",
+    metavar="STEPS",
+    type=int,
+    help="Fine-tune all remaining Gaussians against renders of the original, one view a step. Needs no photos; .fgs only. "
+    "Slower, smaller files. 0: off. Default: off; with --effort max, 10 steps a scored view.",
+)
+@option(
+    METHOD,
     "--score",
     metavar="gs|meson|FILE",
     default="gs",
     show_default=True,
-    help="Importance of Gaussians (paper only): gs (opacity, volume, pixels hit), meson (MesonGS), or a .npy/.npz file with a "
-    "number each.",
+    help="Importance of a Gaussian. gs: opacity, volume and pixels hit. meson: as MesonGS. FILE: .npy or .npz, one number "
+    "a Gaussian.",
 )
-@shared_options.option(
-    "Method",
-    "--save-scores",
-    metavar="FILE",
-    help="Write the scores (paper only) to a .npy file, for --score in later runs.",
-)
-@shared_options.option(
-    "Method",
+@option(METHOD, "--save-scores", metavar="FILE", help="Write the scores to a .npy file, for --score in later runs.")
+@option(
+    METHOD,
     "--score-cache",
     metavar="FILE",
-    help="Keep the scores (paper only) in FILE; a later run takes them if scene, poses and score are the same, else makes them "
-    "anew.",
+    help="Keep the scores in FILE. Later runs with the same scene, views and --score reuse them.",
 )
-@shared_options.option(
-    "Method",
+@option(
+    METHOD,
     "--prune-rate",
     metavar="P",
     type=float,
-    help="Remove this share of the Gaussians, from 0 to 1: with --sh-rate, instead of a search (paper only).",
+    help="Remove this share of the Gaussians, from 0 to 1, without a search. Needs --sh-rate.",
 )
-@shared_options.option(
-    "Method",
+@option(
+    METHOD,
     "--sh-rate",
     metavar="S",
     type=float,
-    help="Take the SH above degree 0 from this further share of the Gaussians, from 0 to 1 (paper only).",
+    help="Remove the view-dependent colour of a further share of the Gaussians, from 0 to 1. Needs --prune-rate.",
 )
-@shared_options.option(
-    "Method",
+@option(
+    METHOD,
     "--bits",
     metavar="SPEC",
     default="paper",
     show_default=True,
-    help="Bits for each value (paper only): paper (xyz=16, dc=8, scale=8, rot=8, opacity=4, rest=4), what shall differ from it, "
-    "such as rest=3,dc=7, auto (sensitivity search), or rtn8, rtn4, ... (one width for all, one range a channel: the "
-    "baseline that fails).",
+    help="Bits of each value. paper: xyz=16,dc=8,scale=8,rot=8,opacity=4,rest=4. A list such as rest=3,dc=7: the others as in "
+    "paper. auto: searched. rtn8, rtn4, ...: as many for all values (a weak baseline).",
 )
-@shared_options.option(
-    "Method",
+@option(
+    METHOD,
     "--groups",
     metavar="N",
     type=int,
-    help="Ranges for each channel (paper only; there 1000). Default: one for about 512 Gaussians.",
+    help="Ranges of each channel. More: better, larger files. Default: one for about 512 Gaussians.",
 )
-@shared_options.base_psnr_option
-@shared_options.option(
-    "Method",
-    "--effort",
-    type=click.Choice(["fast", "balanced", "thorough", "max"]),
-    default="balanced",
-    show_default=True,
-    help="Steps of the search: best 1, 2 or 5 whole results, with more rounds and poses each; paper 4, 10 or 32 after its "
-    "list (other formats: 4, 6 or 10 files). max: as balanced, with --distil (.fgs only). Counted, never timed: same command, "
-    "same bytes.",
-)
-@shared_options.option(
-    "Method",
-    "--distil",
-    metavar="STEPS",
-    type=int,
-    help="Move all that is kept towards the original's own renders (no photos), one view a step; 0: do not (best, .fgs only). "
-    "Default: 10 steps a scored pose with --effort max, else none.",
-)
-@shared_options.drop_invalid_option
 @shared_options.run_options
 def command(input: str, output: str | None, json_path: str | None, quiet: bool, **options: Any) -> None:
-    """Compress a scene: the fewest bytes that hold a quality, or the best quality in a size.
+    """Make a scene smaller: to a quality or to a size.
 
-    INPUT is a .ply in INRIA's layout, a .fgs, .spz, .sog or .compressed.ply, or a model folder of the 3DGS training program.
-    Cameras and an images/ folder beside it are used and named in the summary; a lone scene gets views made from itself.
-    The training poses tell what each Gaussian is worth; then a search finds which to remove, which lose their view-dependent
-    colour and how finely the rest is kept, and measures each step by rendering. The figures in the summary are measured on
-    the finished file. With -o OUT.spz, .sog or .compressed.ply every step writes that format and measures what it decodes to,
-    so its own losses count.
+    INPUT is a .ply, .fgs, .spz, .sog or .compressed.ply file, or the folder that 3DGS training writes. Cameras and photos
+    beside it are used.
 
     \b
     Examples:
       flexgs-edge compress point_cloud.ply -o scene.fgs
-          at most 1 dB worse against the photos
-      flexgs-edge compress output/garden -o garden.fgs --images data/garden/images_4 --max-drop 0.5
-          a model folder with photos elsewhere
+      flexgs-edge compress output/garden -o garden.fgs --images data/garden/images_4
       flexgs-edge compress point_cloud.ply -o scene.fgs --max-size 8MB
-          the best that fits
-      flexgs-edge compress point_cloud.ply -o scene.fgs --effort fast
-          three fifths of the seconds, 7 to 32 % more bytes (a sample scene, a real one)
-      flexgs-edge compress point_cloud.ply -o scene.fgs --effort max
-          a third fewer bytes, in about twice the time
-      flexgs-edge compress point_cloud.ply -o a.fgs --method paper --score-cache s.npz
-      flexgs-edge compress point_cloud.ply -o b.fgs --method paper --score-cache s.npz --max-drop 2
-          the paper's method: score once, then try another target
-      flexgs-edge compress point_cloud.ply -o scene.fgs --method paper --prune-rate 0.3 --sh-rate 0.4
-          fixed rates, no search
-      flexgs-edge compress point_cloud.ply -o scene.spz --max-drop 0.5
-          for viewers of that format (needs pip install 'flexgs-edge[formats]')
-
-    Exit code 3 says that the target cannot be met, and names the closest point.
+      flexgs-edge compress point_cloud.ply -o scene.fgs --effort fast  # faster, larger
+      flexgs-edge compress point_cloud.ply -o scene.spz  # needs flexgs-edge[formats]
+    Measured times and sizes: docs/results/speed.md
+    Exit code 3: the target cannot be met; the message names the closest result.
     """
     progress = talk.start(quiet, json_path, options["force"], options["report"])
     from flexgs_edge.commands.compress import compress

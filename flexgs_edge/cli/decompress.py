@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("input", metavar="INPUT", type=click.Path())
-@shared_options.option(
-    "Output", "-o", "--output", metavar="OUT", required=True, help="File to write: .ply, .spz, .sog or .compressed.ply."
+@help_page.option(
+    help_page.OUTPUT,
+    "-o",
+    "--output",
+    metavar="OUT",
+    required=True,
+    help="File to write: .ply, .spz, .sog or .compressed.ply.",
 )
-@shared_options.option(
-    "Run",
+@help_page.option(
+    help_page.DEVICE,
     "--device",
     metavar="SPEC",
-    help="What decodes a large .fgs of --method best: an OpenCL processor (its number, part of its name, or cpu), or numpy: the "
-    "same bits, four times slower. Default: the first CPU, where there are enough Gaussians to make up for opening it.",
+    help="OpenCL CPU that decodes a large .fgs of --method best: its number, part of its name, or cpu. numpy: the same "
+    "bits, slower. Default: the first CPU for a large scene, else numpy.",
 )
 @shared_options.memory_option
-@shared_options.force_option
-@shared_options.json_option
-@shared_options.talk_options
+@shared_options.write_options
 def command(
     input: str,
     output: str,
@@ -32,12 +35,16 @@ def command(
     json_path: str | None,
     quiet: bool,
 ) -> None:
-    """Decode a .fgs file to a PLY that every viewer opens, or convert between formats.
+    """Decode a .fgs file to a .ply, or convert between formats.
 
-    INPUT is a .fgs, .ply, .spz, .sog or .compressed.ply, or a model folder. A .ply is written in INRIA's layout: x y z, normals
-    (zero), colours, opacity, scales and rotations as 32-bit floats, little endian. Gaussians that lost their SH above degree
-    0 get zeros there. Decoding a .fgs is exact: the same bits on every machine. Other formats round values in their own ways, and
-    need the extra: pip install 'flexgs-edge[formats]'. To make such a file smaller, with its losses measured, use compress.
+    INPUT is a .fgs, .ply, .spz, .sog or .compressed.ply file, or a model folder. Decoding a .fgs is exact: the same bits on
+    every machine.
+
+    A .ply has INRIA's layout: x y z, normals (zero), colours, opacity, scales and rotations, as 32-bit floats, little endian.
+    Gaussians without view-dependent colour get zeros for it.
+
+    Formats of other programs need pip install 'flexgs-edge[formats]', and round values in their own ways. To make such a file
+    smaller, and to see what is lost, use compress.
 
     \b
     Examples:

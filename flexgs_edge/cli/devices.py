@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 from flexgs_edge.commands.devices import device_lines
 from flexgs_edge.errors import DeviceError
 
 
-@click.command(cls=shared_options.SectionCommand)
-@shared_options.option(
-    "Run", "--device", metavar="SPEC", help="Show which device this would choose: a number, part of a name, cpu or gpu."
+@click.command(cls=help_page.SectionCommand)
+@help_page.option(
+    help_page.DEVICE,
+    "--device",
+    metavar="SPEC",
+    help="Say which device this would choose: a number, part of a name, cpu or gpu.",
 )
-@shared_options.force_option
-@shared_options.json_option
-@shared_options.talk_options
+@shared_options.write_options
 def command(device: str | None, force: bool, json_path: str | None, quiet: bool) -> None:
-    """List the OpenCL devices, their limits, whether they pass the self-test, and which one is used and why.
+    """List the OpenCL devices, and say which one is used.
 
-    The self-test builds and runs a small kernel and compares its result: a runtime that is installed need not work.
+    Shows the limits of every device, and whether it passes a self-test. The self-test runs a small kernel and compares the
+    result, because an installed device may still fail.
 
     \b
     Examples:
@@ -27,7 +29,7 @@ def command(device: str | None, force: bool, json_path: str | None, quiet: bool)
       flexgs-edge devices --device gpu
       flexgs-edge devices --json - 2>/dev/null
 
-    Exit code 4: no device works (or not the one asked for); the message says what to install.
+    Exit code 4: no device works, or not the one asked for. The message says what to install.
     """
     talk.start(quiet, json_path, force)
     from flexgs_edge.kernels.choose_device import choose_device, list_devices

@@ -6,28 +6,28 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @shared_options.scene_argument
-@shared_options.option(
+@help_page.option(
     "Quality",
     "--against",
     metavar="REF",
     required=True,
-    help="The original: any scene, such as its .ply or model folder.",
+    help="The original (REF): any scene file or model folder.",
 )
-@shared_options.option(
+@help_page.option(
     "Quality",
     "--lpips",
     is_flag=True,
-    help="Also measure LPIPS (AlexNet), about 3 s a megapixel: needs flexgs-edge[lpips] and AlexNet's weights, 244 MB.",
+    help="Also measure LPIPS (AlexNet). Slow. Needs pip install 'flexgs-edge[lpips]' and AlexNet's weights.",
 )
-@shared_options.base_psnr_option
 @shared_options.report_option
 @shared_options.photos_options
 @shared_options.drawing_options
+@shared_options.base_psnr_option
 @shared_options.drop_invalid_option
 @shared_options.run_options
 def command(
@@ -41,11 +41,13 @@ def command(
     quiet: bool,
     **options: Any,
 ) -> None:
-    """Measure what a scene lost against another one, view by view, mean and worst.
+    """Compare a scene with its original, view by view.
 
-    Fidelity is the PSNR (with SSIM, and LPIPS if asked for) between the two scenes' renders. With photos, drop is the PSNR
-    against the photos that was lost on the way from REF to INPUT, in dB. Cameras and photos beside REF are used unless
-    given, else those beside INPUT. The held-out views are measured; all views with --holdout 0.
+    Fidelity is the PSNR between the renders of INPUT and those of REF, in dB. SSIM is measured too. Drop is the PSNR that was
+    lost against the photos, in dB; without photos it is estimated. The summary shows the mean and the worst view.
+
+    Only held-out views are measured; --holdout 0 measures all. Cameras and photos are those beside REF, else those beside
+    INPUT.
 
     \b
     Examples:
@@ -53,7 +55,6 @@ def command(
       flexgs-edge evaluate decoded.ply --against point_cloud.ply --cameras cameras.json --images photos
       flexgs-edge evaluate scene.fgs --against point_cloud.ply --holdout 0 --json quality.json
       flexgs-edge evaluate scene.fgs --against point_cloud.ply --report page
-          figures and pictures in page/index.html
       flexgs-edge evaluate scene.fgs --against point_cloud.ply --lpips
     """
     progress = talk.start(quiet, json_path, force, report)

@@ -7,24 +7,24 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 from flexgs_edge.errors import InputError
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("file", metavar="FILE", type=click.Path())
-@shared_options.option(
-    "Errors",
+@help_page.option(
+    "What channels are worth",
     "--errors",
     is_flag=True,
-    help="Also measure what each channel and SH degree of a .fgs is worth: the bytes saved and the quality lost with one bit "
-    "less of it, and without it. Takes as long as drawing the views some 15 times.",
+    help="Measure the bytes saved and the quality lost with one bit less of each channel and SH degree, and without it. "
+    "Slow: draws every view many times.",
 )
-@shared_options.option(
-    "Errors",
+@help_page.option(
+    "What channels are worth",
     "--picture",
     metavar="FILE",
-    help="Draw what --errors measures as a .png or .svg (needs pip install 'flexgs-edge[charts]').",
+    help="Draw what --errors measures as a .png or .svg. Needs pip install 'flexgs-edge[charts]'.",
 )
 @shared_options.cameras_option
 @shared_options.holdout_option
@@ -35,19 +35,17 @@ def command(
 ) -> None:
     """Show what a scene file holds.
 
-    For a .fgs: Gaussians, SH degree, bits and bytes of every channel and SH degree, layers, the settings it was made with
-    and the target it reached (files that trim cut are decoded for this; use verify to check every byte). For other
-    scene files and model folders: counts, and what lies beside it.
+    For a .fgs: Gaussians, SH degree, bits and bytes of every channel, layers, settings, and the target it reached. For other
+    scene files and model folders: counts, and the cameras and photos beside them. To check every byte, use verify.
 
-    --errors draws the file's own views again with less of each channel: the held-out ones of the cameras beside the file or
-    given, else of automatic ones. All options of views, device and memory are for it.
+    --errors also measures what each channel of a .fgs is worth. It draws held-out views of the cameras beside the file, or
+    generated views. The options of views, memory and device are for --errors only.
 
     \b
     Examples:
       flexgs-edge info scene.fgs
       flexgs-edge info scene.fgs --json - 2>/dev/null
       flexgs-edge info scene.fgs --errors --picture scene.png
-          what each channel is worth
     """
     progress = talk.start(quiet, json_path, force)
     if not errors:

@@ -6,20 +6,21 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk, value_types
+from flexgs_edge.cli import help_page, shared_options, talk, value_types
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @shared_options.scene_argument
-@shared_options.option(
-    "Output", "-o", "--output", metavar="DIR", required=True, help="Folder for the PNG files; made if missing."
+@help_page.option(
+    help_page.OUTPUT, "-o", "--output", metavar="DIR", required=True, help="Folder for the PNG files; made if missing."
 )
 @shared_options.cameras_option
-@shared_options.option(
-    "Views",
+@help_page.option(
+    help_page.VIEWS,
     "--views",
     type=value_types.VIEWS,
-    help="Views to draw, counted from 0 in order of name: 0,8,16 or START:STOP:STEP such as 0:50:8. Default: all.",
+    help="Views to draw, counted from 0 in order of name: a list such as 0,8,16, or START:STOP:STEP such as 0:50:8. "
+    "Default: all.",
 )
 @shared_options.drawing_options
 @shared_options.drop_invalid_option
@@ -27,10 +28,10 @@ from flexgs_edge.cli import shared_options, talk, value_types
 def command(
     input: str, output: str, views: list[int] | None, force: bool, json_path: str | None, quiet: bool, **options: Any
 ) -> None:
-    """Draw views of a scene as PNG files, named after the cameras.
+    """Draw views of a scene as PNG files.
 
-    Near plane, background, extent and antialiasing are those that a .fgs was made with, unless given. The time of a view is
-    the median over all that were drawn; opening the device, compiling kernels and writing files are not in it.
+    The files are named after the cameras. A .fgs says how it is drawn: near plane, background, extent and antialiasing.
+    Options override that. The summary shows the median time of a view, without start-up and without writing files.
 
     \b
     Examples:

@@ -6,14 +6,14 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @shared_options.scene_argument
-@shared_options.option("Output", "-o", "--output", metavar="SCORES.npy", required=True, help="NumPy file to write.")
-@shared_options.option(
-    "Method",
+@help_page.option(help_page.OUTPUT, "-o", "--output", metavar="SCORES.npy", required=True, help="NumPy file to write.")
+@help_page.option(
+    "Score",
     "--score",
     type=click.Choice(["gs", "meson"]),
     default="gs",
@@ -27,11 +27,11 @@ from flexgs_edge.cli import shared_options, talk
 def command(
     input: str, output: str, score: str, force: bool, json_path: str | None, quiet: bool, **options: Any
 ) -> None:
-    """Score every Gaussian over the training poses, and save the scores.
+    """Save the importance of every Gaussian, for --method paper.
 
-    The file holds one float64 a Gaussian, in the scene's order: the logarithm of the score, -inf for those that no
-    training pose sees. `compress --method paper --score FILE` then takes only a search. Photos are not compared, but
-    scale the views where they are smaller than the cameras say.
+    The training views are drawn to score the Gaussians. The file holds one float64 for each Gaussian, in the scene's order:
+    the logarithm of the score, or -inf if no training view sees it. `compress --method paper --score FILE` then skips scoring.
+    Photos are not compared. Photos smaller than the cameras say scale the views down.
 
     \b
     Examples:

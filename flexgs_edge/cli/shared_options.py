@@ -2,199 +2,154 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
-
 import click
 
+from flexgs_edge.cli.help_page import DEVICE, FAULTS, OUTPUT, VIEWS, option, stack
 from flexgs_edge.cli.talk import set_debug
 from flexgs_edge.cli.value_types import COLOUR, SIZE
 from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, DEFAULT_NEAR, MAX_VIEW_WIDTH
 
-Decorated = TypeVar("Decorated", bound=Callable[..., Any])
-LAST = "Run"
-"""The section of what every command has: shown after what is its own."""
-
-
-class SectionOption(click.Option):
-    """An option that appears under a heading of its own in `--help`."""
-
-    def __init__(self, *args: Any, section: str = "Options", **kwargs: Any) -> None:
-        self.section = section
-        super().__init__(*args, **kwargs)
-
-
-class SectionCommand(click.Command):
-    """A command whose `--help` groups options by `SectionOption.section`."""
-
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        sections: dict[str, list[tuple[str, str]]] = {}
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx) if isinstance(parameter, click.Option) else None
-            if record is not None:
-                sections.setdefault(getattr(parameter, "section", LAST), []).append(record)
-        for name in sorted(sections, key=lambda name: name == LAST):
-            with formatter.section(name):
-                formatter.write_dl(sections[name])
-
-
-def option(section: str, *names: str, **kwargs: Any) -> Callable[[Decorated], Decorated]:
-    """A `click.option` under a heading."""
-    return click.option(*names, cls=SectionOption, section=section, **kwargs)
-
-
-def stack(*decorators: Callable[[Any], Any]) -> Callable[[Decorated], Decorated]:
-    """Several decorators as one, in the order in which `--help` shall show them."""
-
-    def apply(function: Decorated) -> Decorated:
-        for decorator in reversed(decorators):
-            function = decorator(function)
-        return function
-
-    return apply
-
-
 scene_argument = click.argument("input", metavar="INPUT", type=click.Path())
 cameras_option = stack(
     option(
-        "Views",
+        VIEWS,
         "--cameras",
         metavar="PATH",
-        help="Camera poses: INRIA's cameras.json, a COLMAP model's folder, a transforms.json, or a folder with one of them; "
-        "auto makes views from the scene itself, none uses none. Default: what lies beside the scene, else auto.",
+        help="cameras.json, transforms.json, a COLMAP model, or a folder with one. auto: generated views. none: no views. "
+        "Default: cameras beside the scene, else auto.",
     ),
     option(
-        "Views",
+        VIEWS,
         "--ignore-distortion",
         is_flag=True,
-        help="Take the poses of distorted lenses as if they had none; photos of such lenses are not compared.",
+        help="Use cameras with lens distortion as if they had none. Their photos are not compared. Default: refuse them.",
     ),
 )
 images_option = option(
-    "Views",
+    VIEWS,
     "--images",
     metavar="DIR",
-    help="Folder of photos named after the cameras; `none` leaves photos alone. Default: images/ beside the scene.",
+    help="Photos, named after the cameras. none: no photos. Default: images/ beside the scene.",
 )
 holdout_option = option(
-    "Views",
+    VIEWS,
     "--holdout",
     metavar="N",
     type=int,
     default=DEFAULT_HOLDOUT,
     show_default=True,
-    help="Every N-th view by name is held out (the first, the N+1st, ...); 0 holds out none.",
+    help="Hold out every N-th view by name, from the first. Held-out views measure quality, the others are training views. "
+    "0: hold out none.",
 )
 select_option = option(
-    "Views",
+    VIEWS,
     "--select",
     type=click.Choice(["test", "train"]),
     default="test",
     show_default=True,
-    help="Views that decide where to stop: the held-out ones, or the training poses (then fidelity and modelled drop decide).",
+    help="Views that decide if the target is met: held-out ones (test) or training views (train). Training views are not "
+    "compared with photos.",
 )
 drawing_options = stack(
     option(
-        "Views",
+        VIEWS,
         "--resolution",
         metavar="PIXELS",
         type=int,
         default=MAX_VIEW_WIDTH,
         show_default=True,
-        help="Wider views are scaled down to this width; smaller is faster and less exact.",
+        help="Largest width of a view. Wider views are scaled down. Smaller is faster and less exact.",
     ),
     option(
-        "Views",
+        VIEWS,
         "--near",
         metavar="Z",
         type=float,
-        help=f"Near plane in scene units: closer Gaussians are not drawn. Default: the file's, else {DEFAULT_NEAR}.",
+        help=f"Near plane: Gaussians closer than Z scene units are not drawn. Default: the file's, else {DEFAULT_NEAR}.",
     ),
     option(
-        "Views",
+        VIEWS,
         "--background",
         type=COLOUR,
-        help="black, white, #rrggbb, or red,green,blue from 0 to 1. Default: the file's (or cfg_args'), else black.",
+        help="black, white, #rrggbb, or red,green,blue from 0 to 1. Default: as the file or cfg_args says, else black.",
     ),
     option(
-        "Views",
+        VIEWS,
         "--extent",
         type=click.Choice(["exact", "inria"]),
-        help="Reach of a splat: the exact ellipse of alpha >= 1/255, or INRIA's 3 sigma in whole tiles. Default: exact.",
+        help="Pixels that a splat reaches. exact: where alpha >= 1/255. inria: whole tiles up to 3 sigma, slower. "
+        "Default: as the file says, else exact.",
     ),
     option(
-        "Views",
+        VIEWS,
         "--antialiased/--no-antialiased",
         default=None,
-        help="Compensate opacities for the dilation, for models trained so (INRIA's --antialiasing, gsplat's antialiased, "
-        "Mip-Splatting). Default: the file's (or cfg_args'), else not.",
+        help="For models trained with antialiasing. Default: as the file or cfg_args says, else off.",
     ),
 )
 base_psnr_option = option(
-    "Quality",
+    VIEWS,
     "--base-psnr",
     metavar="DB",
     type=float,
     default=DEFAULT_BASE_PSNR,
     show_default=True,
-    help="PSNR of the original against its photos that the modelled drop starts from, in dB: cautious where unknown.",
+    help="The modelled drop (the estimate without photos) assumes this PSNR of the original against its photos. "
+    "Higher is more cautious.",
 )
 drop_invalid_option = option(
-    "Run",
+    VIEWS,
     "--drop-invalid",
     is_flag=True,
-    help="Leave Gaussians with NaN, infinity or zero rotations out instead of refusing.",
+    help="Leave out Gaussians with NaN, infinity or a zero rotation. Default: refuse the scene.",
 )
 device_option = option(
-    "Run",
+    DEVICE,
     "--device",
     metavar="SPEC",
-    help="OpenCL device: its number, part of its name, cpu or gpu (see `flexgs-edge devices`); numpy runs the NumPy twins: "
-    "the same results, far slower. Default: the first GPU that works, else a CPU.",
+    help="OpenCL device: number, name, cpu or gpu; or numpy (far slower). Default: the first GPU that works, else a CPU.",
 )
 memory_option = option(
-    "Run",
+    DEVICE,
     "--memory-limit",
     type=SIZE,
-    help="Most memory for the whole run, such as 600MiB or 2GB; work is cut into parts that fit. Default: 3/4 of what is free.",
+    help="Most memory for the run, such as 600MiB or 2GB. Less is slower. Default: 3/4 of the free memory.",
 )
-force_option = option("Run", "-f", "--force", is_flag=True, help="Overwrite files that exist.")
+force_option = option(OUTPUT, "-f", "--force", is_flag=True, help="Overwrite files that exist.")
 report_option = option(
-    "Output",
+    OUTPUT,
     "--report",
     metavar="DIR",
-    help="Write a page to DIR/index.html: figures, the search, bytes, views with original and result under a slider, cameras; "
-    "and the record to DIR/result.json.",
+    help="Write a page about the result: DIR/index.html.",
 )
 json_option = option(
-    "Run",
+    OUTPUT,
     "--json",
     "json_path",
     metavar="FILE",
-    help="Write the result as JSON to FILE; - writes it to stdout and moves the summary to stderr.",
+    help="Write the result as JSON to FILE; - is stdout.",
 )
-talk_options = stack(
-    option("Run", "-q", "--quiet", is_flag=True, help="No log and no progress bars; the summary stays."),
-    option(
-        "Run",
-        "--debug",
-        is_flag=True,
-        is_eager=True,
-        expose_value=False,
-        callback=set_debug,
-        help="Show tracebacks of errors.",
-    ),
+quiet_option = option(OUTPUT, "-q", "--quiet", is_flag=True, help="Show no log and no progress bars.")
+debug_option = option(
+    FAULTS,
+    "--debug",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=set_debug,
+    help="Show tracebacks of errors.",
 )
-
-run_options = stack(device_option, memory_option, force_option, json_option, talk_options)
+write_options = stack(json_option, force_option, quiet_option, debug_option)
+"""What every command has."""
+run_options = stack(memory_option, device_option, write_options)
 """What every command has that works on a device and writes something."""
 photos_options = stack(cameras_option, images_option, holdout_option)
 """Where the views are, and which of them judge."""
 study_options = stack(
-    base_psnr_option, photos_options, select_option, drawing_options, drop_invalid_option, run_options
+    photos_options, select_option, drawing_options, base_psnr_option, drop_invalid_option, run_options
 )
 """What every study has."""
 results_option = option(
-    "Output", "-o", "--output", metavar="DIR", required=True, help="Folder for the results; made if missing."
+    OUTPUT, "-o", "--output", metavar="DIR", required=True, help="Folder for the results; made if missing."
 )
 """Where a study writes."""

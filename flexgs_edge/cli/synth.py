@@ -4,35 +4,38 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("output", metavar="OUT.ply", type=click.Path())
-@shared_options.option(
-    "Scene", "--from", "input", metavar="SCENE", required=True, help="The scene to make it from: any INPUT of compress."
+@help_page.option(
+    "Scene",
+    "--from",
+    "input",
+    metavar="SCENE",
+    required=True,
+    help="The scene to start from: any scene file or model folder.",
 )
-@shared_options.option(
+@help_page.option(
     "Scene",
     "--gaussians",
     metavar="N",
     type=int,
     required=True,
-    help="Gaussians to write, exactly; at least as many as SCENE has.",
+    help="Number of Gaussians to write, at least as many as SCENE has.",
 )
-@shared_options.option(
+@help_page.option(
     "Scene",
     "--seed",
     metavar="N",
     type=int,
     default=0,
     show_default=True,
-    help="Chooses which Gaussians get one part more than others.",
+    help="Chooses which Gaussians are split into one part more than others.",
 )
 @shared_options.memory_option
-@shared_options.force_option
-@shared_options.json_option
-@shared_options.talk_options
+@shared_options.write_options
 def command(
     output: str,
     input: str,
@@ -43,15 +46,14 @@ def command(
     json_path: str | None,
     quiet: bool,
 ) -> None:
-    """Make a big scene from a small one, to test memory and time with.
+    """Make a large test scene from a small one.
 
-    Up to 8 times the Gaussians of SCENE, each is split along its longest axes into parts that look like it together (the bundled
-    sample in 2, 4 and 8 times its Gaussians is at 47, 44 and 40 dB of its own renders). Beyond that, copies of the scene stand
-    side by side in a grid: as much work, another picture. The scene is written as it is made: memory does not grow with N. The
-    same scene, N and seed give the same bytes.
+    Use it to test memory and time. Up to eight times the Gaussians of SCENE, each Gaussian is split into parts that look like
+    it together. Beyond that, copies of the scene stand side by side in a grid: as much work, another picture. Memory does not
+    grow with N. The same scene, N and seed give the same bytes.
 
-    If SCENE has cameras, cameras.json is written beside OUT.ply: the same poses for one copy; for more, each pose in the next
-    copy in turn, so that every copy is seen. There are no photos of such scenes: targets are fidelity, size or ratio.
+    If SCENE has cameras, cameras.json is written beside OUT.ply. For one copy the cameras are the same. For more copies, each
+    camera moves to the next copy in turn, so that every copy is seen. Such scenes have no photos.
 
     \b
     Examples:

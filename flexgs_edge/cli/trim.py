@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import shared_options, talk, value_types
+from flexgs_edge.cli import help_page, shared_options, talk, value_types
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("input", metavar="IN.fgs", type=click.Path())
-@shared_options.option("Output", "-o", "--output", metavar="OUT.fgs", required=True, help="File to write.")
-@shared_options.option(
-    "Output",
+@help_page.option(help_page.OUTPUT, "-o", "--output", metavar="OUT.fgs", required=True, help="File to write.")
+@help_page.option(
+    help_page.OUTPUT,
     "--max-size",
     type=value_types.SIZE,
     required=True,
-    help="Bytes that it may have, such as 800kB (10^3) or 1MiB (2^20): as many whole layers as fit are kept.",
+    help="Largest size of the new file, such as 800kB or 1MiB.",
 )
-@shared_options.force_option
-@shared_options.json_option
-@shared_options.talk_options
+@shared_options.write_options
 def command(input: str, output: str, max_size: int, force: bool, json_path: str | None, quiet: bool) -> None:
-    """Cut a layered .fgs file to a size, at the speed of copying.
+    """Cut a layered .fgs file to a size, without the original.
 
-    Needs neither the original nor cameras: the file's layers run from coarse to fine, and any number of the first ones is a
-    valid scene. The new file says in info what it was cut from.
+    compress --layers writes layers, from coarse to fine. trim keeps as many of the first layers as fit. The result is a valid
+    scene, and info says what it was cut from. This takes as long as copying the file.
 
     \b
     Examples:

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 from flexgs_edge.errors import FormatError
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("file", metavar="FILE.fgs", type=click.Path())
-@shared_options.force_option
-@shared_options.json_option
-@shared_options.talk_options
+@shared_options.write_options
 def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
     """Check every byte of a .fgs file against its checksums.
 
-    Names every part with its place, and those that are damaged. Reads the file in pieces, so any size will do.
+    Lists the parts of the file and marks the damaged ones. Reads the file in pieces: a large file needs no more memory.
 
     \b
     Examples:
       flexgs-edge verify scene.fgs
       flexgs-edge verify scene.fgs -q > /dev/null && echo whole
 
-    Exit code 0: every part is whole. 2: something is damaged.
+    Exit code 0: every part is whole. Exit code 2: something is damaged.
     """
     talk.start(quiet, json_path, force)
     from flexgs_edge.commands.verify import verify, verify_json, verify_text

@@ -276,7 +276,7 @@ def _load_whole(header: PlyHeader) -> np.ndarray:
         with open(header.path, "rb") as file:
             file.seek(header.data_offset)
             stream = _HeaderThenData(header, file)
-            rows = PlyData.read(stream, mmap=False)["vertex"].data
+            rows: np.ndarray = PlyData.read(stream, mmap=False)["vertex"].data
             rest = len(file.read() if header.order else file.read().strip())
     except (PlyParseError, ValueError, UnicodeDecodeError, OverflowError, MemoryError) as error:
         raise FormatError(f"{header.path}: {error}") from error

@@ -1,1 +1,1 @@
-"""What stays and how finely: one folder a method, one door each (`method.py`)."""
+"""Methods of compression: each decides which Gaussians stay and how finely they are coded. Enter a folder by `method.py`."""

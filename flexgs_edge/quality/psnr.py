@@ -52,7 +52,7 @@ def mse_of_psnr(decibel: float) -> float:
     >>> mse_of_psnr(30.0)
     0.001
     """
-    return 10.0 ** (-decibel / 10.0)
+    return float(10.0 ** (-decibel / 10.0))
 
 
 def mean_psnr(values: Sequence[float | None]) -> float | None:
@@ -93,7 +93,7 @@ def modelled_drop(error: float, base_psnr: float = DEFAULT_BASE_PSNR) -> float:
 
 def error_for_drop(decibel: float, base_psnr: float = DEFAULT_BASE_PSNR) -> float:
     """Mean squared error against the original's renders at a modelled drop of `decibel`."""
-    return mse_of_psnr(base_psnr) * (10.0 ** (decibel / 10.0) - 1.0)
+    return mse_of_psnr(base_psnr) * (float(10.0 ** (decibel / 10.0)) - 1.0)
 
 
 def fidelity_for_drop(decibel: float, base_psnr: float = DEFAULT_BASE_PSNR) -> float | None:

@@ -14,7 +14,8 @@ def window() -> np.ndarray:
     """[SSIM_WINDOW] f32, the weights of the Gaussian window, with the sum 1."""
     away = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
     taps = np.exp(-0.5 * np.square(away / SSIM_SIGMA))
-    return (taps / taps.sum()).astype(np.float32)
+    window: np.ndarray = (taps / taps.sum()).astype(np.float32)
+    return window
 
 
 def ssim_bytes(width: int, height: int) -> int:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from flexgs_edge.report.html import text
+from flexgs_edge.report.html import render
 from flexgs_edge.report.material import Rig
 
 SIDE = 360
@@ -19,18 +20,6 @@ FAR = 0.35
 """The scene's points widen the plan by at most so many times the cameras' own extent: some scenes reach to the horizon."""
 MOST_NAMES = 400
 """With more cameras their names (seen under a pointer) are left out: a page is not a list."""
-
-STYLE = """
-.plans { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 19rem), 1fr)); gap: 1rem;
-  align-items: start; }
-.plans figure { margin: 0; }
-.plan { display: block; width: 100%; background: var(--band); border-radius: 6px; font-size: 12px; font-weight: 600; }
-.plan .points { fill: none; stroke: var(--soft); stroke-width: 1.4; stroke-linecap: round; opacity: .65; }
-.plan .wedge { fill: var(--mark); fill-opacity: .1; stroke: var(--mark); stroke-opacity: .55; stroke-width: .7; }
-.plan .stand { fill: var(--mark); }
-.plan .held { fill: var(--warm); stroke: var(--warm); } .plan .held.wedge { fill-opacity: .2; }
-.plan text { fill: var(--ink); paint-order: stroke; stroke: var(--band); stroke-width: 3px; }
-"""
 
 
 def plans(rig: Rig, numbers: Mapping[str, int]) -> str:
@@ -45,16 +34,18 @@ def plans(rig: Rig, numbers: Mapping[str, int]) -> str:
     low, high = extent(rig, np.stack([across, away, up]))
     # One scale for both, so that they can be compared.
     scale = SIDE * (1 - 2 * ROOM) / max(float((high - low)[:2].max()), 1e-12)
-    top = _plan("seen from above", rig, numbers, (across, away), (low[[0, 1]], high[[0, 1]]), scale, 0)
-    side = _plan("seen from the side", rig, numbers, (across, up), (low[[0, 2]], high[[0, 2]]), scale, 1)
-    held = len(rig.held_out)
-    key = f"{len(rig.names) - held} training" + (f", {held} held out" if held else "")
-    marks = _mark("stand") + f" training &ensp;{_mark('stand held')} held out &ensp;" if held else ""
-    scene = "dots: the scene; " if len(rig.points) else ""
-    return (
-        f'<div class="plans">{top}{side}</div>\n<p class="key">{marks}'
-        f"{key} views; {scene}wedges: where cameras look; numbers: the pictures above. Up is what the cameras call up, on "
-        "average.</p>"
+    return render(
+        "plans.html",
+        plans=[
+            _plan("seen from above", rig, (across, away), (low[[0, 1]], high[[0, 1]]), scale, 0),
+            _plan("seen from the side", rig, (across, up), (low[[0, 2]], high[[0, 2]]), scale, 1),
+        ],
+        width=SIDE,
+        numbers=numbers,
+        named=len(rig.names) <= MOST_NAMES,
+        training=len(rig.names) - len(rig.held_out),
+        held_out=len(rig.held_out),
+        points=len(rig.points),
     )
 
 
@@ -100,13 +91,12 @@ def extent(rig: Rig, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _plan(
     title: str,
     rig: Rig,
-    numbers: Mapping[str, int],
     basis: tuple[np.ndarray, np.ndarray],
     ends: tuple[np.ndarray, np.ndarray],
     scale: float,
     half: int,
-) -> str:
-    """One plan; `half`: which half angle (0 width, 1 height) the wedges open by."""
+) -> dict[str, Any]:
+    """Places of one plan; `half`: which half angle (0 width, 1 height) the wedges open by."""
     rows = np.stack(basis)
     low, high = ends
     rim = ROOM * SIDE
@@ -116,7 +106,7 @@ def _plan(
     offset = np.array([(SIDE - scale * (high - low)[0]) / 2, (height - size) / 2])
 
     def at(points: np.ndarray) -> np.ndarray:
-        flat = (points @ rows.T - low) * scale + offset
+        flat: np.ndarray = (points @ rows.T - low) * scale + offset
         flat[:, 1] = height - flat[:, 1]
         return flat
 
@@ -125,36 +115,27 @@ def _plan(
     reach = np.minimum(rig.reach[:, half], 1.5)[:, None]
     feet = at(rig.centers)
     left, right = (at(rig.centers + length * (forward + sign * reach * side)) for sign in (-1, 1))
-    words = f"Plan of {len(rig.names)} cameras, {title}"
-    parts = [f'<svg class="plan" viewBox="0 0 {SIDE} {height:.0f}" role="img" aria-label="{text(words)}">']
-    parts.append(_points(at(rig.points) if len(rig.points) else np.zeros((0, 2)), height))
     # Held-out cameras last: they are few and shall not be covered.
     order = sorted(range(len(rig.names)), key=lambda i: (i in rig.held_out, i))
-    for i in order:
-        kind = " held" if i in rig.held_out else ""
-        a, b, c = (f"{p[0]:.1f} {p[1]:.1f}" for p in (feet[i], left[i], right[i]))
-        name = f"<title>{text(rig.names[i])}</title>" if len(order) <= MOST_NAMES else ""
-        parts.append(f'<path class="wedge{kind}" d="M{a}L{b}L{c}Z"/>')
-        parts.append(f'<circle class="stand{kind}" cx="{feet[i][0]:.1f}" cy="{feet[i][1]:.1f}" r="2.4">{name}</circle>')
-    for i in order:
-        if rig.names[i] in numbers:
-            x, y = np.clip(feet[i] + (5, -5), (2, 12), (SIDE - 12, height - 4))
-            parts.append(f'<text x="{x:.1f}" y="{y:.1f}">{numbers[rig.names[i]]}</text>')
-    return "\n".join(["<figure>", *parts, f"</svg><figcaption>{title}</figcaption></figure>"])
+    return {
+        "title": title,
+        "height": height,
+        "dots": _dots(at(rig.points), height) if len(rig.points) else [],
+        "stands": [
+            {
+                "name": rig.names[i],
+                "held_out": i in rig.held_out,
+                "foot": tuple(feet[i]),
+                "left": tuple(left[i]),
+                "right": tuple(right[i]),
+                "label": np.clip(feet[i] + (5, -5), (2, 12), (SIDE - 12, height - 4)),
+            }
+            for i in order
+        ],
+    }
 
 
-def _points(points: np.ndarray, height: float) -> str:
+def _dots(points: np.ndarray, height: float) -> list[tuple[int, int]]:
+    """Whole places within the plan, each once."""
     inside = points[((points >= 0) & (points <= (SIDE, height))).all(axis=1)]
-    if not len(inside):
-        return ""
-    return '<path class="points" d="' + "".join(_dots(inside)) + '"/>'
-
-
-def _dots(points: np.ndarray) -> Iterable[str]:
-    return (f"M{x:.0f} {y:.0f}h0" for x, y in dict.fromkeys((round(x), round(y)) for x, y in points))
-
-
-def _mark(kind: str) -> str:
-    return (
-        f'<svg class="plan" viewBox="0 0 16 16" aria-hidden="true"><circle class="{kind}" cx="8" cy="8" r="5"/></svg>'
-    )
+    return list(dict.fromkeys((round(x), round(y)) for x, y in inside))

@@ -26,4 +26,5 @@ def css_ramp() -> str:
 def error_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """[H, W] f32 from 0 to 1: the largest difference of the channels of two [H, W, 3] images, in units of `ERROR_SCALE`."""
     difference = np.abs(np.clip(image, 0.0, 1.0) - np.clip(reference, 0.0, 1.0)).max(axis=2)
-    return np.minimum(difference / np.float32(ERROR_SCALE), np.float32(1.0))
+    shares: np.ndarray = np.minimum(difference / np.float32(ERROR_SCALE), np.float32(1.0))
+    return shares

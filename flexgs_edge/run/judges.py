@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from flexgs_edge.memory.storage import Storage
 from flexgs_edge.packed.quantize import QuantizedScene
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
@@ -42,6 +43,11 @@ class Judges:
         run = self._run
         words = {"with_photos": reports, "base_psnr": run.options.base_psnr, "reports": reports}
         return Judge(self._bench, run.source, run.seen, indices, **words)
+
+    @property
+    def storage(self) -> Storage:
+        """Where large arrays of the run lie."""
+        return self._bench.renderer.storage
 
     @contextmanager
     def original(self) -> Iterator[DeviceScene]:

@@ -47,4 +47,5 @@ def open_scene(path: str | os.PathLike[str], readers: Mapping[str, str] = READER
     if not suffixes:
         raise InputError(f"{path}: unknown kind of scene {place.suffix!r}; {supported}")
     module, _, name = readers[max(suffixes, key=len)].partition(":")
-    return getattr(import_module(module), name)(place)
+    source: SceneSource = getattr(import_module(module), name)(place)
+    return source

@@ -1,4 +1,4 @@
-"""What every experiment gives back: a table, a chart of the same numbers, and what they say."""
+"""The result of an experiment: a table, a chart of the same numbers, and sentences about them."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ class Experiment:
     Parameters
     ----------
     key : str
-        Name of its files.
+        Name of its files, without suffix.
     title : str
-        For people.
+        Title on the page.
     question : str
-        What was done, and what the columns mean where their heads do not say it.
+        What was done, and what columns mean if their heads do not say it.
     table : Table
-        What was measured.
+        The measurements.
     chart : Chart
-        Drawn from the table's rows.
+        A chart of the table's rows.
     findings : tuple of str
-        What the numbers say: sentences made from the table.
+        Sentences made from the table's numbers.
     beside : tuple of Beside
-        The paper's own figures, where it gives some.
+        Figures of the FlexGaussian paper, if it gives some.
     timed : bool
-        The table holds times, so it differs from run to run.
+        Whether the table holds times, so that it differs from run to run.
     """
 
     key: str
@@ -52,7 +52,7 @@ class Experiment:
     timed: bool = False
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """The record for programs."""
         return {
             "experiment": self.key,
             "title": self.title,

@@ -1,4 +1,4 @@
-"""Tables of experiments: rows once, as CSV, JSON and HTML."""
+"""Tables of experiments, which are written as CSV, JSON and HTML."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from flexgs_edge.report import html
+from flexgs_edge.report.html import count
 
 Cell = str | int | float | bool | None
 Row = Mapping[str, Cell]
@@ -22,9 +22,9 @@ class Column:
     Parameters
     ----------
     name : str
-        Key of the rows, and head in CSV and JSON.
+        Key in the rows, in CSV and in JSON.
     head : str
-        Head for people, with the unit.
+        Head on the page, with the unit.
     """
 
     name: str
@@ -33,9 +33,9 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """What an experiment measured: rows that hold exactly the columns, in their order.
+    """The measurements of an experiment. Every row holds exactly the columns, in their order.
 
-    Numbers are rounded when the rows are made: CSV, JSON, page and charts then show the same ones.
+    Numbers are rounded when rows are made, so that CSV, JSON, page and charts show the same ones.
     """
 
     columns: tuple[Column, ...]
@@ -48,11 +48,11 @@ class Table:
                 raise ValueError(f"row {number}: expected the columns {', '.join(names)}, found {', '.join(row)}")
 
     def values(self, column: str, **where: Cell) -> list[Any]:
-        """The column's cells of the rows whose other cells are as in `where`."""
+        """Cells of `column` in the rows whose other cells equal those in `where`."""
         return [row[column] for row in self.rows if all(row[key] == cell for key, cell in where.items())]
 
     def to_csv(self) -> bytes:
-        """UTF-8 with a head line and LF; an empty cell is null, floats read back as the same numbers."""
+        """CSV in UTF-8 with a head line and LF. None is an empty cell, and floats read back exactly."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(column.name for column in self.columns)
@@ -60,18 +60,16 @@ class Table:
         return text.getvalue().encode()
 
     def to_json(self) -> list[dict[str, Cell]]:
-        """The rows as plain records."""
+        """The rows as dicts."""
         return [dict(row) for row in self.rows]
 
-    def to_html(self) -> str:
-        """A table for the page."""
-        return html.table(
-            [column.head for column in self.columns], [[_words(cell) for cell in row.values()] for row in self.rows]
-        )
+    def words(self) -> list[list[str]]:
+        """The rows' cells as people read them."""
+        return [[_words(cell) for cell in row.values()] for row in self.rows]
 
 
 def json_bytes(record: Any) -> bytes:
-    """A record as JSON text; NaN and infinity are faults."""
+    """A record as JSON text; raises `ValueError` for NaN and infinity."""
     return (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
 
 
@@ -100,5 +98,4 @@ def _words(cell: Cell) -> str:
         return "yes" if cell else "no"
     if isinstance(cell, float):
         return f"{cell:.7g}"
-    # Sizes are read by digit groups; a narrow no-break space keeps them in one piece.
-    return f"{cell:,}".replace(",", "\N{NARROW NO-BREAK SPACE}") if isinstance(cell, int) else cell
+    return count(cell) if isinstance(cell, int) else cell

@@ -1,4 +1,7 @@
-"""A scene on the bench: opened and scored once, then measured at any setting, each setting once."""
+"""A scene of a study: opened and scored once, then measured at any setting.
+
+Each setting is measured once and remembered, because several experiments ask for the same ones.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ import numpy as np
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.steps import SearchResult, Step
 from flexgs_edge.goals.target import Measurement, Target
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.methods.paper.search import adapt
@@ -32,12 +35,12 @@ from flexgs_edge.views.bench import Bench
 LOG = logging.getLogger("flexgs_edge")
 
 RANK_BYTES = 24
-"""Bytes a row and score that the bench and its evaluator hold: order, rank, and the rows with SH above each rank."""
+"""Bytes for each row and score: order, rank, and the number of rows with SH above each rank."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What is done to the scene: rates, bits, groups per channel, and the score that ranks."""
+    """How a scene is compressed: rates, bits, groups a channel, and the score that ranks its rows."""
 
     choice: Choice = EVERYTHING
     bits: BitSpec = PAPER
@@ -60,17 +63,17 @@ class StudyScene:
     Parameters
     ----------
     name : str
-        Of the scene, for tables and folders.
+        Name of the scene, for tables and folders.
     run : Run
-        As `compress` has it; the plan's views and figure decide here too.
+        As for `compress`. The plan's views and figure decide here too.
     bench : Bench
-        Draws.
+        Draws the views.
     judge : Judge
-        With the original's renders.
+        Prepared, with the original's renders.
     orders : dict
-        Rows from the least important, [N] i64, by score.
+        [N] i64 by name of the score: rows, least important first.
     has_sh : np.ndarray
-        [N] bool.
+        [N] bool, rows with SH that are not zero.
     """
 
     def __init__(
@@ -89,7 +92,7 @@ class StudyScene:
 
     @property
     def plan(self) -> Plan:
-        """What decides."""
+        """Which views and which figure decide."""
         assert self.run.plan is not None
         return self.run.plan
 
@@ -100,12 +103,12 @@ class StudyScene:
 
     @property
     def target(self) -> Target:
-        """What the search of this study aims at."""
+        """The target of this study's search."""
         return self.run.target
 
     @property
     def figure(self) -> str:
-        """The column that decides: `drop` with photos, else `modelled_drop`."""
+        """Name of the column that decides: `drop` with photos, else `modelled_drop`."""
         return self.plan.figure.replace(" ", "_")
 
     @property
@@ -119,51 +122,48 @@ class StudyScene:
             f"over {views}"
         )
 
+    def ranked(self, order: np.ndarray) -> Ranked:
+        """The scene with its rows in another order ([N] i64, least important first)."""
+        return Ranked(self.run.source, order, self.has_sh)
+
     def evaluator(self, setting: Setting) -> SceneEvaluator:
-        """The pipeline's evaluator, set to the bits, groups and score of `setting`, until it is asked for again."""
+        """The evaluator of `compress`, with the bits, groups and score of `setting`. The next call changes it."""
         if setting.score not in self._evaluators:
             self._evaluators[setting.score] = SceneEvaluator(
-                self.run.scene.source,
-                self.orders[setting.score],
-                self.has_sh,
-                setting.bits,
-                setting.groups,
-                self.bench.renderer,
-                self.judge,
-                self.run.budget,
+                self.ranked(self.orders[setting.score]), setting.bits, setting.groups, self.judge, self.run.budget
             )
         evaluator = self._evaluators[setting.score]
         evaluator.bits, evaluator.groups = setting.bits, setting.groups
         return evaluator
 
     def size(self, setting: Setting) -> int:
-        """Exact bytes of the file; costs nothing."""
+        """Exact bytes of the file. Nothing is measured."""
         return self.evaluator(setting).size(setting.choice)
 
     def point(self, setting: Setting) -> Point:
-        """Measure a setting, or remember it."""
+        """Measure a setting, unless it was measured before."""
         if setting not in self._points:
             found = self.evaluator(setting).measure(setting.choice)
             self._points[setting] = Point(setting, self.size(setting), found)
         return self._points[setting]
 
     def points(self, settings: Sequence[Setting], label: str) -> list[Point]:
-        """Measure several settings, under a progress bar."""
+        """Measure several settings, with a progress bar."""
         return [self.point(setting) for setting in self.run.progress.track(settings, label, len(settings))]
 
     def adapt(self, target: Target, on_step: Callable[[Step], None] | None = None) -> SearchResult:
-        """The paper's search for `target` over this bench's points; the closest point where it cannot be met."""
+        """Search for `target` as the paper does, with remembered points; the closest point if nothing holds."""
         return adapt(_Remembering(self), target, self.run.options.effort, best_effort=True, on_step=on_step)
 
     @property
     def search(self) -> SearchResult:
-        """The search for the study's own target; made when first asked for."""
+        """The search for the study's own target. It runs at the first use."""
         if self._search is None:
             self._search = self.adapt(self.target)
         return self._search
 
     def figures(self, size: int, found: Measurement) -> dict[str, Cell]:
-        """Cells of `FIGURES`: bytes and quality."""
+        """Cells of the columns `FIGURES`: bytes and quality."""
         return {
             "size": size,
             "ratio": round(self.run.scene.ply_bytes / size, 3),
@@ -173,11 +173,11 @@ class StudyScene:
         }
 
     def cells(self, point: Point) -> dict[str, Cell]:
-        """Cells of `FIGURES` of a point."""
+        """Cells of the columns `FIGURES` for a point."""
         return self.figures(point.size, point.measurement)
 
     def error(self, point: Point) -> float:
-        """Mean squared error against the original's renders, mean over the views."""
+        """Mean squared error against the original's renders, averaged over the views."""
         return error_for_drop(point.measurement.modelled_drop, self.run.options.base_psnr)
 
 
@@ -188,11 +188,11 @@ FIGURES = {
     "fidelity": "fidelity (dB)",
     "modelled_drop": "modelled drop (dB)",
 }
-"""Columns that every measured row ends with, and their heads."""
+"""Columns at the end of every measured row, and their heads."""
 
 
 class _Remembering:
-    """The evaluator that a search gets: what the bench has measured is not measured again."""
+    """The evaluator for a search. It measures nothing that the study has measured before."""
 
     def __init__(self, studied: StudyScene) -> None:
         self.studied = studied
@@ -218,7 +218,7 @@ def open_study_scene(
     FlexGSError
         As `compress`.
     """
-    # The plan refuses scenes without cameras and splits without training poses, in the words of `compress`.
+    # Planning refuses scenes without cameras, and splits without training poses, as `compress` does.
     run = open_planned(path, options, progress)
     source, views, plan, clock = run.source, run.seen, run.plan, run.clock
     assert plan is not None
@@ -247,7 +247,7 @@ def open_study_scene(
 
 
 def scene_names(paths: Sequence[str | Path]) -> list[str]:
-    """A short name for every scene, no two alike: the file's, or its folder's where the file is a `point_cloud`.
+    """A short, unique name for every scene: the file's name, or its folder's if the file is a `point_cloud`.
 
     >>> scene_names(["a/fox/point_cloud.ply", "b/fox/point_cloud/iteration_7000/point_cloud.ply", "garden.fgs"])
     ['fox', 'fox-2', 'garden']

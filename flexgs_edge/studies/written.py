@@ -1,4 +1,4 @@
-"""What a study found on a scene, for people and machines, and its files."""
+"""The results of a study on a scene: as text, as a record for programs, and as files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flexgs_edge.studies.study_scene import StudyScene
 
 @dataclass(frozen=True)
 class SceneStudy:
-    """What was found on one scene."""
+    """The experiments on one scene, with facts about scene, views and device."""
 
     name: str
     scene: SceneInfo
@@ -33,7 +33,7 @@ class SceneStudy:
 
     @classmethod
     def of(cls, studied: StudyScene, experiments: list[Experiment]) -> SceneStudy:
-        """The experiments made on a bench."""
+        """The results of `experiments` on `studied`."""
         return cls(
             studied.name,
             scene_info(studied.run.scene),
@@ -66,13 +66,14 @@ class SceneStudy:
 
 @dataclass(frozen=True)
 class WrittenStudy:
-    """What a study of one scene found and wrote.
+    """The results of a study of one scene, and their folder.
 
     Parameters
     ----------
     output : str
         The folder.
     scene : SceneStudy
+        The results.
     """
 
     output: str
@@ -95,7 +96,7 @@ class WrittenStudy:
 
 
 def write_scene(place: Path, scene: SceneStudy) -> Section:
-    """Write every experiment's rows and chart into a folder that is there; its section of the page."""
+    """Write every experiment's rows and chart into an existing folder; returns their section of the page."""
     drawn = []
     for experiment in scene.experiments:
         png, svg = picture(experiment.chart)

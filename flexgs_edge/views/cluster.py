@@ -82,7 +82,9 @@ class Cluster:
         if processes is not None and hasattr(os, "setpriority"):
             # Niceness of this thread is inherited by the processes it starts; the main process keeps its own.
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
-        import distributed  # slow to import
+        import distributed as dask  # slow to import
+
+        distributed: Any = dask  # it has no types
 
         self._lost = distributed.KilledWorker
         if processes is not None:

@@ -21,7 +21,8 @@ HALF_LARGEST = float(np.finfo(np.float16).max)
 
 def to_half(values: np.ndarray) -> np.ndarray:
     """Round to half precision, clipped to its range: an infinity would become NaN in every sum."""
-    return np.clip(values, -HALF_LARGEST, HALF_LARGEST).astype(np.float16)
+    half: np.ndarray = np.clip(values, -HALF_LARGEST, HALF_LARGEST).astype(np.float16)
+    return half
 
 
 class References:

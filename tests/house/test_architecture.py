@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 LONGEST_MODULE = 450
-HEAVY = ("pyopencl", "skimage", "scipy", "matplotlib", "plyfile", "PIL", "tqdm")
+HEAVY = ("pyopencl", "skimage", "scipy", "matplotlib", "plyfile", "PIL", "tqdm", "jinja2", "markupsafe")
 
 
 def lint_imports(folder: Path, contract: str | None = None) -> subprocess.CompletedProcess[str]:
@@ -67,6 +67,8 @@ def copy(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("opencl", "scene/source.py", "import flexgs_edge.kernels.session"),  # through a third module
         ("plyfile", "cameras/read.py", "def late() -> None:\n    import plyfile"),
         ("plots", "studies/result_tables.py", "import matplotlib"),
+        ("pages", "run/reporter.py", "def late() -> None:\n    import jinja2"),
+        ("pages", "studies/page.py", "import markupsafe"),
         ("distributed", "views/worker.py", "import distributed"),
     ],
 )
@@ -100,7 +102,7 @@ def modules_after(statement: str, repository: Path) -> set[str]:
         (
             "import flexgs_edge.kernels.twins, flexgs_edge.codec.open_fgs, flexgs_edge.methods.best.method\n"
             "import flexgs_edge.methods.paper.method, flexgs_edge.methods.foreign.method, flexgs_edge.commands.compress",
-            ("pyopencl", "skimage", "matplotlib", "plyfile"),
+            ("pyopencl", "skimage", "matplotlib", "plyfile", "jinja2"),
         ),
     ],
     ids=["package", "help", "rooms without a device"],

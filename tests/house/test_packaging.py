@@ -55,20 +55,28 @@ def python_files(repository: Path) -> set[str]:
     return {str(path.relative_to(repository)) for path in (repository / "flexgs_edge").rglob("*.py")}
 
 
+def template_files(repository: Path) -> set[str]:
+    folder = repository / "flexgs_edge" / "report" / "templates"
+    return {str(path.relative_to(repository)) for path in folder.iterdir()}
+
+
 def test_every_package_is_listed_in_setup_cfg(repository: Path) -> None:
     listed = set(read_configuration(repository / "setup.cfg")["options"]["packages"])
     found = {*find_packages(str(repository), include=["flexgs_edge*"]), "flexgs_edge.cl_kernels"}
     assert listed == found, "correct [options] packages in setup.cfg"
 
 
-def test_the_wheel_holds_the_package_and_the_kernels(repository: Path, archives: tuple[Path, Path]) -> None:
+def test_the_wheel_holds_the_package_the_templates_and_the_kernels(
+    repository: Path, archives: tuple[Path, Path]
+) -> None:
     files = {name for name in files_of(archives[1]) if ".dist-info/" not in name}
-    assert files == python_files(repository) | {f"flexgs_edge/cl_kernels/{name}" for name in kernel_files(repository)}
+    kernels = {f"flexgs_edge/cl_kernels/{name}" for name in kernel_files(repository)}
+    assert files == python_files(repository) | template_files(repository) | kernels
 
 
 def test_the_sdist_can_be_built_from_and_holds_no_tests(repository: Path, archives: tuple[Path, Path]) -> None:
     files = files_of(archives[0])
-    assert python_files(repository) <= files
+    assert python_files(repository) | template_files(repository) <= files
     assert {f"cl_kernels/{name}" for name in kernel_files(repository)} <= files
     assert {"LICENSE", "README.md", "CHANGELOG.md", "constraints.txt", "setup.cfg", "pyproject.toml"} <= files
     assert {"docs/design.md", "docs/format.md"} <= files
@@ -112,7 +120,15 @@ for path in sorted(kernel_dir().glob("*.cl")):
 """
 
 
-def test_an_installed_wheel_finds_its_kernels(repository: Path, archives: tuple[Path, Path], tmp_path: Path) -> None:
+FIND_TEMPLATES = """
+from flexgs_edge.report.html import environment
+print(*environment().list_templates(), sep="\\n")
+"""
+
+
+def test_an_installed_wheel_finds_its_kernels_and_templates(
+    repository: Path, archives: tuple[Path, Path], tmp_path: Path
+) -> None:
     target = tmp_path / "site"
     command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--no-compile"]
     subprocess.run([*command, "--target", str(target), str(archives[1])], check=True, capture_output=True)
@@ -120,6 +136,8 @@ def test_an_installed_wheel_finds_its_kernels(repository: Path, archives: tuple[
     assert Path(package) == target / "flexgs_edge" / "__init__.py"
     assert Path(kernels) == target / "flexgs_edge" / "cl_kernels"
     assert set(files) == {name for name in kernel_files(repository) if name.endswith(".cl")}
+    found = run_in(tmp_path, FIND_TEMPLATES, PYTHONPATH=str(target))
+    assert found == sorted(Path(name).name for name in template_files(repository))
 
 
 def test_an_editable_install_finds_the_kernels_of_the_checkout(repository: Path, tmp_path: Path) -> None:

@@ -40,6 +40,6 @@ def test_healthy_kernels_stay_green(tmp_path: Path) -> None:
 
 def test_the_page_lists_all_of_them() -> None:
     page = TABLE.read_text()
-    for mutation in MUTATIONS:
-        assert f"| {mutation.name} |" in page
+    listed = [name for line in page.splitlines() if line.startswith("| `") for name in line.split("|")[2].split(";")]
+    assert sorted(name.strip() for name in listed) == sorted(mutation.name for mutation in MUTATIONS)
     assert "survived" not in page

@@ -12,12 +12,12 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
-from html import escape
 from pathlib import Path
 
 import click
 import numpy as np
 import pytest
+from markupsafe import escape
 from PIL import Image
 
 from flexgs_edge.cameras.read import read_cameras
@@ -295,7 +295,7 @@ def test_csv_json_page_and_chart_say_the_same(study: tuple[PaperStudy, Path]) ->
             assert value in shown or any(math.isclose(value * 1e6, cell) for cell in shown), (experiment.key, value)
     assert page.count("data:image/svg+xml;base64,") == len(scene.experiments)
     assert not re.search(r'(src|href)="(?!data:|#)', page), "nothing is fetched"
-    assert all(escape(words) in page for experiment in scene.experiments for words in experiment.findings)
+    assert all(str(escape(words)) in page for experiment in scene.experiments for words in experiment.findings)
 
 
 def chart_values(chart: object) -> list[float]:

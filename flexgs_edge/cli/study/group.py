@@ -7,20 +7,20 @@ import click
 from flexgs_edge.cli.lazy_group import LazyGroup
 
 COMMANDS = {
-    "paper": "The FlexGaussian paper's evaluation: nine experiments on the paper's method, beside its own figures.",
-    "rate": "Bytes against quality: both methods at many ratios, other programs' formats, and best without each of its parts.",
-    "speed": "Speed against accuracy: drawing, scoring, measuring and whole runs, and how times grow.",
-    "stability": "Where methods break: bits, pruning, views, poses, far origins, generations and the searches.",
+    "paper": "Repeat the FlexGaussian paper's experiments on your scenes.",
+    "rate": "Chart bytes against quality for a scene.",
+    "speed": "Chart speed against accuracy for a scene.",
+    "stability": "Find where methods break on a scene.",
 }
-"""Subcommands and their line in the overview."""
+"""Subcommands and the first sentence of their help."""
 
 
 @click.group(cls=LazyGroup, commands_from=("flexgs_edge.cli.study", COMMANDS))
 def command() -> None:
-    """Make experiments on scenes of your own: tables, charts and one page.
+    """Run experiments on your own scenes: tables and charts.
 
-    Every study writes a folder: index.html with all charts, and for every experiment its rows as CSV and JSON and its chart as
-    PNG and SVG. Charts need matplotlib: pip install 'flexgs-edge[charts]'.
+    A study writes a folder: index.html with all charts, the rows of every experiment as CSV and JSON, and its chart as PNG and
+    SVG. Charts need pip install 'flexgs-edge[charts]'. Studies draw and compress a scene many times: expect long runs.
 
     \b
     Examples:

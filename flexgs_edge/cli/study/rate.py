@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
 class RatiosType(click.ParamType):
@@ -29,42 +29,40 @@ class RatiosType(click.ParamType):
 RATIOS = RatiosType()
 
 
-def effort_option(name: str, default: str, text: str) -> Callable[[shared_options.Decorated], shared_options.Decorated]:
+def effort_option(name: str, default: str, text: str) -> Callable[[help_page.Decorated], help_page.Decorated]:
     """A choice of effort."""
     efforts = click.Choice(["fast", "balanced", "thorough"])
-    return shared_options.option("Points", name, type=efforts, default=default, show_default=True, help=text)
+    return help_page.option("Points", name, type=efforts, default=default, show_default=True, help=text)
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
-@shared_options.option(
+@help_page.option(
     "Points",
     "--ratios",
     type=RATIOS,
     default="8,16,32,64,128,256",
     show_default=True,
-    help="Ratios to the PLY that best and paper aim at.",
+    help="Ratios to the .ply that both methods aim at.",
 )
-@effort_option("--effort", "balanced", "Steps of the search for these points, as for compress.")
-@shared_options.option(
+@effort_option("--effort", "balanced", "Effort of the search at these ratios, as for compress.")
+@help_page.option(
     "Points",
     "--ablations",
     type=RATIOS,
     default="16,64",
     show_default=True,
-    help="Ratios at which best is measured without each of its parts; none leaves this out.",
+    help="Ratios for --method best without each of its parts; none: skip this.",
 )
-@effort_option(
-    "--ablation-effort", "fast", "Steps of the search without a part, and of the whole method that it is held against."
-)
-@shared_options.option(
+@effort_option("--ablation-effort", "fast", "Effort of the search at --ablations. Less is faster.")
+@help_page.option(
     "Points",
     "--distilled",
     type=RATIOS,
     default="32,64,128",
     show_default=True,
-    help="Ratios at which best is measured with --effort max as well; none leaves this out.",
+    help="Ratios for --method best with --effort max, which is slow; none: skip this.",
 )
 @shared_options.study_options
 def command(
@@ -80,13 +78,15 @@ def command(
 ) -> None:
     """Chart bytes against quality for a scene.
 
-    Both methods of compress at several ratios; the whole scene as .spz, .sog and .compressed.ply, where the extra is installed
-    (pip install 'flexgs-edge[formats]'); and best without each of its parts: measured costs, measuring again, the refit, the SH
-    degree of each Gaussian, the context coder. Every file is judged by the same views: photos held out where there are some.
+    \b
+      - both methods of compress, at several ratios
+      - the whole scene as .spz, .sog and .compressed.ply
+        (if installed: pip install 'flexgs-edge[formats]')
+      - --method best without each of its parts: measured costs, measuring
+        again, the refit, the SH degree of each Gaussian, the context coder
 
-    DIR appears when everything is done: index.html, and the rows and charts of rate, fidelity and parts as CSV, JSON, PNG and
-    SVG; rate.csv has all points. A scene of 200 000 Gaussians takes half an hour on two CPU cores, and some minutes more with
-    points that are distilled.
+    The same views judge every file: held-out photos where there are some. Results appear in DIR when all is done: open
+    DIR/index.html; rate.csv has all points. More ratios and more effort take longer.
 
     \b
     Examples:

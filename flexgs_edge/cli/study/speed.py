@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
 class PartsType(click.ParamType):
@@ -23,31 +23,43 @@ class PartsType(click.ParamType):
 PARTS = PartsType()
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
-@shared_options.option(
+@help_page.option(
     "Parts",
     "--parts",
     type=PARTS,
     default="drawing,scoring,sampling,presets,scaling",
     show_default=True,
-    help="What to measure.",
+    help="What to measure. Fewer parts are faster.",
 )
-@shared_options.option(
-    "Parts", "--repeats", type=int, default=5, show_default=True, help="Rounds of timing; the least counts."
+@help_page.option(
+    "Parts",
+    "--repeats",
+    metavar="N",
+    type=int,
+    default=5,
+    show_default=True,
+    help="Repeats of each timing; the shortest counts. More is slower, more exact.",
 )
-@shared_options.option(
-    "Parts", "--trials", type=int, default=200, show_default=True, help="Samples of tiles of every size, for sampling."
+@help_page.option(
+    "Parts",
+    "--trials",
+    metavar="N",
+    type=int,
+    default=200,
+    show_default=True,
+    help="Random samples of each size, for sampling. More is slower, more exact.",
 )
-@shared_options.option(
+@help_page.option(
     "Parts",
     "--max-drop",
     metavar="DB",
     type=float,
     default=1.0,
     show_default=True,
-    help="Target of the whole runs, and of the paper's search that scoring and sampling build on.",
+    help="Loss of PSNR that whole runs and searches aim at.",
 )
 @shared_options.study_options
 def command(
@@ -63,16 +75,15 @@ def command(
     """Chart speed against accuracy for a scene.
 
     \b
-    drawing   time of a view against its PSNR to the exact one: fewer SH, splats
-              left out by opacity, extents, half precision, small pictures
-    scoring   time of scoring against what it is worth at one size, by the number
-              of views scored; and how stable the ranks are
-    sampling  fidelity estimated from a part of the tiles, with its interval
-    presets   time of whole runs of compress against the ratio that they find
-    scaling   how times grow with Gaussians, pixels and views
+      drawing   time of a view against its PSNR to the exact one: fewer SH,
+                faint splats left out, half precision, small pictures
+      scoring   time of scoring against the quality at one size, by the
+                number of views scored
+      sampling  fidelity estimated from a part of each view
+      presets   time of whole runs of compress against the ratio reached
+      scaling   time by number of Gaussians, pixels and views
 
-    DIR appears when everything is done: index.html, and every part's rows and chart as CSV, JSON, PNG and SVG. Times are those of
-    this machine; close other programs.
+    Results appear in DIR when all is done: open DIR/index.html. Times are those of this machine: close other programs.
 
     \b
     Examples:

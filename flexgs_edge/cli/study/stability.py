@@ -6,44 +6,42 @@ from typing import Any
 
 import click
 
-from flexgs_edge.cli import shared_options, talk
+from flexgs_edge.cli import help_page, shared_options, talk
 
 
-@click.command(cls=shared_options.SectionCommand)
+@click.command(cls=help_page.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
-@shared_options.option(
+@help_page.option(
     "Points",
     "--quick",
     is_flag=True,
-    help="Few points of every experiment, on views 120 pixels wide: a minute in place of a quarter of an hour.",
+    help="Fewer points and small views: much faster, less exact.",
 )
-@shared_options.option(
+@help_page.option(
     "Points",
     "--max-drop",
     metavar="DB",
     type=float,
     default=1.0,
     show_default=True,
-    help="Target of the results that are moved, looked at from elsewhere and compressed again.",
+    help="Loss of PSNR that compressed results aim at.",
 )
 @shared_options.study_options
 def command(scene: str, output: str, quick: bool, json_path: str | None, quiet: bool, **options: Any) -> None:
-    """Chart where methods break on a scene, and where ours stops standing.
+    """Find where methods break on a scene.
 
     \b
-    bits, groups, strays   fewer bits, other groups and orders of rows, stray values
-    pruning, views, halves more removed, in eight ways; scores from few views, or
-                           from one side
-    heldout, distance,     the worst view; poses nearer, farther, between and above
-    poses                  the path, other lenses and sizes; the worst tile
-    moves                  far from the origin, other units, turned
-    generations            compressed again and again; two targets in a row
-    search                 the searches on rough, flat and noisy curves
+      bits, groups, strays   fewer bits, other groups of rows, stray values
+      pruning, views, halves more removed; scores from few views, or one side
+      heldout, distance,     the worst view; cameras nearer, farther, between
+      poses                  and above the path; other lenses and sizes
+      moves                  scenes moved far away, scaled, turned
+      generations            compressed again and again
+      search                 searches on rough, flat and noisy curves
 
-    best, paper and simple baselines: plain rounding, removing Gaussians or SH alone, simple scores. A method has broken where it
-    loses more than 3 dB, or ends in an error. DIR appears when everything is done: index.html, and every experiment's rows and
-    chart as CSV, JSON, PNG and SVG. A scene of 200 000 Gaussians takes a quarter of an hour on two CPU cores.
+    Compares both methods with simple baselines: plain rounding, removing Gaussians or SH alone, simple scores. A method breaks
+    where it loses far too much PSNR or ends in an error. Results appear in DIR when all is done: open DIR/index.html.
 
     \b
     Examples:

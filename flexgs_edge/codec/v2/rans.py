@@ -239,7 +239,7 @@ def normalize(weights: Sequence[int] | np.ndarray) -> np.ndarray:
     total = int(weights.sum())
     if total <= 0 or np.count_nonzero(weights) > TOTAL // 2 or weights.min() < 0 or total >= 1 << 48:
         raise StreamError("weights: wanted some above 0")
-    freqs = np.maximum(weights * TOTAL // total, weights > 0)
+    freqs: np.ndarray = np.maximum(weights * TOTAL // total, weights > 0)
     order = np.argsort(-freqs, kind="stable")[: np.count_nonzero(weights)]
     missing = TOTAL - int(freqs.sum())
     while missing:

@@ -52,7 +52,8 @@ def fexp2_within(x: np.ndarray) -> np.ndarray:
     p = np.full_like(f, EXP2_POLY[-1])
     for coefficient in EXP2_POLY[-2::-1]:
         p = fma(p, f, f32(coefficient))
-    return (p.view(np.int32) + i).view(f32)
+    power: np.ndarray = (p.view(np.int32) + i).view(f32)
+    return power
 
 
 def flog2(x: np.ndarray) -> np.ndarray:

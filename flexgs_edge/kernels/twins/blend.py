@@ -68,7 +68,8 @@ def _fixed(lanes: np.ndarray, unit: float, tiles: int) -> np.ndarray:
     eight = lanes[:, :8] + lanes[:, 8:]
     four = eight[:, :4] + eight[:, 4:]
     total = (four[:, 0] + four[:, 2]) + (four[:, 1] + four[:, 3])
-    return np.clip(total * f32(unit), -largest, largest).astype(np.int64)
+    fixed: np.ndarray = np.clip(total * f32(unit), -largest, largest).astype(np.int64)
+    return fixed
 
 
 PLANES = {

@@ -1,1 +1,1 @@
-"""The default method: measured costs, one multiplier, one search."""
+"""The default method, `best`: measured costs, rounds of pruning, one multiplier, one search (docs/best.md)."""

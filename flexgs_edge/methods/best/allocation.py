@@ -1,4 +1,7 @@
-"""One multiplier decides for every Gaussian: removed, or kept with SH up to some degree."""
+"""Rate-distortion allocation: one multiplier decides for every Gaussian what happens to it.
+
+A Gaussian is removed, or kept with SH up to some degree, whichever has the least cost + multiplier * bits.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +14,17 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.costs import RemovalCosts
 
 SH_FACTOR = 2.0
-"""Costs of dropped SH count this much. We measure them one Gaussian at a time. But neighbours on a surface lose the
-same part of their view-dependent colour, and these errors add up: docs/results/tuning.md#sh_factor"""
+"""Factor on the costs of dropping SH. We measure them one Gaussian at a time. But neighbours on a surface lose the same
+part of their view-dependent colour, and these errors add up: docs/results/tuning.md#sh_factor"""
 REMOVAL_FACTOR = 1.3
-"""Costs of removal count this much, for the same reason: what goes in one cut is measured one by one."""
+"""Factor on the costs of removal, for the same reason: one cut removes many Gaussians, and we measure them one by one."""
 
 
 @dataclass(frozen=True)
 class BitModel:
-    """What a Gaussian costs.
+    """Bits that a Gaussian takes in the file.
 
-    These are fixed. Asking the coder for its own bits near the answer takes time and does not make files smaller:
+    The defaults are fixed. Asking the coder for its own bits near the answer takes time and does not make files smaller:
     docs/results/tuning.md#bitmodel
 
     Parameters
@@ -41,15 +44,16 @@ class BitModel:
 
 
 def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
-    """The cheapest of {removed, SH 0, ..., SH D} under cost + multiplier * bits, each Gaussian for itself.
+    """Choose the cheapest of {removed, SH 0, ..., SH D} by cost + multiplier * bits, for each Gaussian by itself.
 
-    Gaussians that no pose sees stay, without SH: nothing is known of them.
+    Gaussians that no pose sees stay, without SH, because no cost of theirs is known.
 
     Parameters
     ----------
     costs : RemovalCosts
         Squared errors.
     bits : BitModel
+        Bits of a Gaussian by SH degree.
     multiplier : float
         Squared error that a bit is worth.
 
@@ -70,7 +74,7 @@ def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.n
 
 
 def choose_one_degree(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
-    """As `choose`, but with one SH degree for all that are kept: for formats where SH that are zero take as much as any."""
+    """As `choose`, but with one SH degree for all rows, for formats in which zero SH take as many bytes as others."""
     top = len(costs.sh)
     nothing = np.zeros_like(costs.removal)
     removal = REMOVAL_FACTOR * costs.removal
@@ -92,7 +96,7 @@ def drop_bands(
     y0: float,
     storage: Storage = IN_MEMORY,
 ) -> dict[str, np.ndarray]:
-    """Rows of planes, without the SH above their degrees, whose mean colour is added to the constant.
+    """Take rows of planes and drop the SH above their degrees; the mean colour of these is added to the constant.
 
     Parameters
     ----------
@@ -101,11 +105,13 @@ def drop_bands(
     rows : np.ndarray
         [m] i64, ascending.
     degrees : np.ndarray
-        [m] u8, the SH degree that each of them keeps.
+        [m] u8, the SH degree that each row keeps.
     sh_mean : np.ndarray
         [D, 3, n] f32, mean colour of the bands above each lower degree.
     y0 : float
-        The constant basis function.
+        Value of the constant basis function.
+    storage : Storage
+        Where the new arrays live.
 
     Returns
     -------
@@ -116,7 +122,7 @@ def drop_bands(
     if top == 0:
         return {name: storage.take(values, rows) for name, values in planes.items()}
     kept = {name: storage.empty((len(planes[name]), len(rows)), np.float32) for name in ("sh_dc", "sh_rest")}
-    # Taken and cleared at once: a second pass would write and read all planes of a scene in scratch files again.
+    # Taken and cleared in one pass: with scratch files, a second pass would write and read all planes again.
     for part, found in read_ahead(planes["means"].shape[1], sh_mean, planes["sh_dc"], planes["sh_rest"]):
         here = slice(*np.searchsorted(rows, (part.start, part.stop)).tolist())
         inside, some = rows[here] - part.start, degrees[here]

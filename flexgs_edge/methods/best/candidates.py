@@ -1,4 +1,7 @@
-"""What a search has seen: whole results, which of them is better, and where the next one should be looked for."""
+"""The candidates that a search has seen, and the multiplier at which it should look next.
+
+A candidate is a finished result: refitted, coded and measured.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +14,20 @@ from flexgs_edge.goals.line import NEAREST, next_point
 from flexgs_edge.goals.target import Measurement, Target
 
 Product = TypeVar("Product")
-"""What a step makes: a grid, or a finished file."""
+"""Type of the product of a candidate: a grid, or a finished file."""
 
 SLOPE = 0.7
 """Slope of the log of the drop over the log of the multiplier before two points are measured:
 docs/results/tuning.md#slope"""
 SIZE_SLOPE = -0.45
-"""The same for the log of the size."""
+"""Slope of the log of the size over the log of the multiplier."""
 LARGEST_STRIDE = 1.2
-"""Largest change of the log of the multiplier between two steps."""
+"""Largest change of the log of the multiplier between two candidates."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One whole result that the search looked at.
+    """A finished result that the search made and measured.
 
     Parameters
     ----------
@@ -35,11 +38,13 @@ class Candidate:
     size : int
         Bytes of the file.
     measurement : Measurement
+        Quality of the result.
     excess : float
-        By how much the target was missed; zero or less holds.
+        Log of loss (or size) over its limit: the target holds at zero or less.
     seconds : float
+        Time that making and measuring took.
     left_out : int
-        Gaussians that no scored pose sees and that would have made all others coarser (see `Kept`).
+        Gaussians that no scored pose sees and that were left out because the grid would be coarser with them.
     """
 
     multiplier: float
@@ -53,13 +58,25 @@ class Candidate:
 
     @property
     def holds(self) -> bool:
-        """The target holds here."""
+        """Whether this candidate meets the target."""
         return self.excess <= 0.0
 
 
 @dataclass(frozen=True)
 class RateResult(Generic[Product]):
-    """The answer of a search: what to write and the way to it."""
+    """The answer of a search.
+
+    Parameters
+    ----------
+    product : Product
+        A grid, or a finished file.
+    chosen : Candidate
+        The best candidate, which `product` belongs to.
+    reached : bool
+        Whether it meets the target.
+    steps : tuple of Candidate
+        All candidates in the order of the search.
+    """
 
     product: Product
     chosen: Candidate
@@ -68,15 +85,15 @@ class RateResult(Generic[Product]):
 
 
 def misses(steps: Sequence[Candidate]) -> int:
-    """How many of the last results missed the target."""
+    """How many candidates in a row missed the target, up to the last one."""
     return next((count for count, step in enumerate(reversed(steps)) if step.holds), len(steps))
 
 
 def bounds(steps: Sequence[Candidate], by_size: bool) -> tuple[float, float]:
-    """Logs of the multipliers between which the answer lies, away from both ends; infinite where none is known.
+    """Logs of the two multipliers between which the answer lies, a little inside of both; infinite where none is known.
 
-    One end is the farthest result that holds, the other the nearest miss beyond it. Misses before it are void: refits go on
-    from each other, and had not come as far then.
+    One end is the farthest candidate that holds, the other the nearest miss beyond it. Other misses do not count: each
+    refit goes on from the last one, so early misses were refitted less.
     """
     sign = -1.0 if by_size else 1.0
     low = max((sign * math.log(s.multiplier) for s in steps if s.holds), default=-math.inf)
@@ -87,6 +104,6 @@ def bounds(steps: Sequence[Candidate], by_size: bool) -> tuple[float, float]:
 
 
 def next_multiplier(steps: Sequence[Candidate], target: Target) -> float:
-    """Where the excess is expected to be just below zero, in the log of the multiplier."""
+    """The multiplier at which the excess should be just below zero."""
     slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
     return math.exp(next_point([(math.log(s.multiplier), s.excess) for s in steps], slope, LARGEST_STRIDE))

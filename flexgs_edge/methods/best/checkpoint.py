@@ -1,4 +1,4 @@
-"""The rounds of a path kept in a folder, so that a run that was killed goes on from its last finished round."""
+"""`--resume`: saves the rounds of a search in a folder, so that a killed run goes on from its last finished round."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from flexgs_edge.scene.fields import FIELD
 LOG = logging.getLogger("flexgs_edge")
 
 DONE = "done"
-"""File of a round that is there last: without it the round was cut short."""
+"""File that is written last. A round without it was cut short."""
 
 
 class Checkpoint:
-    """A folder with a folder for each finished round of one path.
+    """A folder with one folder for each finished round of a search.
 
     Parameters
     ----------
     folder : path
-        Made if missing. Its name says which path it is of.
+        Made if missing. Its name holds the fingerprint of the search.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -45,17 +45,17 @@ class Checkpoint:
             raise InputError(f"{self.folder}: cannot keep the state of the run there ({error.strerror})") from error
 
     def has(self, number: int) -> bool:
-        """Whether a round was finished."""
+        """Whether round `number` was finished."""
         return (self._place(number) / DONE).is_file()
 
     @property
     def key(self) -> str:
-        """What the folder's name says of the path."""
+        """The fingerprint in the folder's name."""
         return self.folder.name.rpartition("-")[2]
 
     @property
     def rounds(self) -> int:
-        """Finished rounds."""
+        """How many rounds were finished."""
         number = 0
         while self.has(number):
             number += 1
@@ -70,7 +70,7 @@ class Checkpoint:
         return arrays
 
     def save(self, number: int, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
-        """Keep a round; whatever an earlier run left of it is written over.
+        """Save a round. Remains of an earlier run are written over.
 
         Raises
         ------
@@ -111,9 +111,9 @@ class Checkpoint:
 def open_checkpoint(
     run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera], folder: Path
 ) -> Checkpoint:
-    """Where the path of a search keeps its rounds: a folder named by all that they depend on."""
+    """Open the folder for the rounds of a search. Its name holds a fingerprint of all that they depend on."""
     options = run.options
-    # A path that leads to a descent keeps views from between the poses as well.
+    # Rounds that lead to a descent also keep references from between the scored poses.
     distils = distil_steps(options, len(scored)) > 0
     words = f"path {EFFORTS[options.effort].keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r} {distils}"
     assert options.near is not None and options.extent is not None

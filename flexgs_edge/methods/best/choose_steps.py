@@ -1,8 +1,8 @@
-"""Grid steps of equal slope: the last bit of every kind of value buys the same squared error, one multiplier for all.
+"""Quantization step sizes of equal slope: the last bit of every kind of value buys the same squared error.
 
-For a fine grid of step d the squared error is s d^2 and n values cost -n log2 d bits, so the multiplier (squared error a bit)
-asks for d = sqrt(multiplier * n / (2 ln 2 * s)). For colours s is known from the weights; for geometry it is measured by
-moving one kind of value at a time as a trial grid would.
+For a fine grid of step size d the squared error is s d^2, and n values cost -n log2 d bits. A multiplier (squared error
+that a bit is worth) therefore asks for d = sqrt(multiplier * n / (2 ln 2 * s)). For colours s follows from the weights.
+For geometry it is measured: one kind of value at a time is moved as a trial grid would move it.
 """
 
 from __future__ import annotations
@@ -27,24 +27,31 @@ GEOMETRY = ("position", "scale", "rotation", "opacity")
 VALUES = {"position": 3, "scale": 3, "rotation": 3, "opacity": 1}
 CHANGES = {"position": "means", "scale": "log_scales", "rotation": "quats", "opacity": "opacity_logits"}
 SMALLEST_THREE = 1.051
-"""Mean square of the turn that errors of three stored components make, the fourth following from them, over theirs: mean of
-1 + |xyz|^2 / (3 w^2) over random rotations in their canonical form."""
+"""Mean square error of a rotation over that of its three stored components. The fourth component follows from these, so
+its error adds up: the mean of 1 + |xyz|^2 / (3 w^2) over random rotations in their canonical form."""
 GEOMETRY_MENDED = 2.0
-"""The colour refit that follows takes back about half of the geometry's error:
+"""Factor on squared errors of geometry: the colour refit that follows takes back about half of them:
 docs/results/tuning.md#geometry_mended"""
 CHROMA = 2.0
-"""Steps of Co and Cg in steps of Y. Squared errors in red, green, blue: 3 dY^2 + dCo^2 / 2 + 3/4 dCg^2, so equal slopes ask
-for sqrt(6) and 2."""
+"""Step sizes of Co and Cg in step sizes of Y. The squared error in red, green and blue is 3 dY^2 + dCo^2 / 2 + 3/4 dCg^2.
+So equal slopes ask for sqrt(6) and 2."""
 
 
 @dataclass(frozen=True)
 class Slopes:
-    """Squared error (pixels, three channels, all scored poses) per row and squared step, by kind of geometry."""
+    """How fast errors grow with step sizes of geometry.
+
+    Parameters
+    ----------
+    per_row : dict
+        Squared error over squared step size and row, by kind of geometry, summed over pixels, three channels and all
+        scored poses.
+    """
 
     per_row: dict[str, float]
 
     def step(self, kind: str, multiplier: float) -> float:
-        """The step of `kind` for a multiplier."""
+        """The step size of `kind` for a multiplier."""
         slope = max(self.per_row[kind], 1e-30)
         return math.sqrt(GEOMETRY_MENDED * multiplier * VALUES[kind] / (2 * math.log(2) * slope))
 
@@ -52,14 +59,28 @@ class Slopes:
 def probe_slopes(
     renderer: Renderer, planes: dict[str, np.ndarray], origin: np.ndarray, cameras: Sequence[Camera], most: int
 ) -> Slopes:
-    """Measure the slopes of the geometry on `most` poses at the most, evenly spread among the scored ones."""
+    """Measure the slopes of the geometry; the scene is drawn five times from at most `most` poses.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        With nothing loaded.
+    planes : dict
+        Stored planes ([width, n] f32 by field); not changed.
+    origin : np.ndarray
+        [3] f64, as in `SceneSource`.
+    cameras : sequence of Camera
+        All scored poses. Those to draw from are evenly spread among them.
+    most : int
+        Most poses to draw from.
+    """
     count, some = planes["means"].shape[1], min(most, len(cameras))
     views = [cameras[i * len(cameras) // some] for i in range(some)]
     with renderer.load(MemorySource(planes, origin=origin)) as scene:
         reference = [to_half(renderer.render(scene, camera)) for camera in renderer.in_turn(scene, views)]
     smallest = np.concatenate([scales.min(axis=0) for _, (scales,) in read_ahead(count, planes["log_scales"])])
     size = float(np.exp(np.median(smallest.astype(np.float64))))
-    # Small enough that squared errors grow with squared steps, large enough to stand clear of half precision references.
+    # Small enough that squared errors grow with squared steps; large enough to exceed the rounding of half precision.
     trial = {"position": size / 4, "scale": 0.1, "rotation": 0.03, "opacity": 0.2}
     per_row = {}
     for kind in GEOMETRY:
@@ -78,10 +99,10 @@ def probe_slopes(
 def _on_trial_grid(planes: dict[str, np.ndarray], kind: str, step: np.float32) -> np.ndarray:
     """The field that changes when values of one kind are rounded to multiples of `step`.
 
-    All but opacities get errors of the same mean square instead, along and about each Gaussian's own axes, with signs from the
-    digits of its opacity. Where a grid begins depends on the scene's unit and axes, and the errors of a few large
-    Gaussians with it: they would move the slopes. All errors have one size, so it matters little which Gaussian gets
-    which sign.
+    Only opacities are rounded. Other values get errors of the same mean square, along and about each Gaussian's own axes,
+    with signs from the digits of its opacity. A real grid would begin at a place that depends on the scene's unit and
+    axes. The errors of a few large Gaussians would depend on it too, and so would the slopes. All errors have one size,
+    so it matters little which Gaussian gets which sign.
     """
     if kind != "opacity":
         digits = planes["opacity_logits"][0].view(np.uint32).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
@@ -92,7 +113,8 @@ def _on_trial_grid(planes: dict[str, np.ndarray], kind: str, step: np.float32) -
             return (planes["log_scales"] + errors).astype(np.float32)
         if kind == "rotation":
             return tilted(planes["quats"], errors * math.sqrt(SMALLEST_THREE)).astype(np.float32)
-        return (planes["means"] + turned(planes["quats"], errors)).astype(np.float32)
+        moved: np.ndarray = (planes["means"] + turned(planes["quats"], errors)).astype(np.float32)
+        return moved
     return (np.rint(planes["opacity_logits"] / step) * step).astype(np.float32)
 
 
@@ -104,14 +126,20 @@ def _squared_error(image: np.ndarray, reference: np.ndarray) -> float:
 def choose_steps(
     slopes: Slopes, weight2: np.ndarray, degrees: np.ndarray, sh_degree: int, multiplier: float
 ) -> StepSizes:
-    """Steps of every kind for a multiplier.
+    """Step sizes of every kind of value for a multiplier.
 
     Parameters
     ----------
+    slopes : Slopes
+        Of the geometry.
     weight2 : np.ndarray
-        [n] sum of squared weights of the kept Gaussians: an error e of a coefficient in luma costs 3 w2 (Y e)^2.
+        [n] f64, sums of squared weights of the kept Gaussians: an error e of a coefficient in luma costs 3 w2 (Y e)^2.
     degrees : np.ndarray
-        [n] SH degree kept.
+        [n] u8, SH degree kept.
+    sh_degree : int
+        SH degree of the scene.
+    multiplier : float
+        Squared error that a bit is worth.
     """
 
     def colour(rows: np.ndarray) -> float:
@@ -125,14 +153,14 @@ def choose_steps(
 
 
 def holdable(steps: StepSizes, planes: dict[str, np.ndarray]) -> StepSizes:
-    """`steps`, made coarser where the grid could not hold the planes' values: far outliers, or a multiplier near zero."""
+    """`steps`, made coarser where codes could not hold the planes' values: far outliers, or a multiplier near zero."""
 
     def finest(name: str, codes: int = CODE_LIMIT - 2) -> float:
         return max((float(max(-low, high)) for low, high in _ranges(planes[name])), default=0.0) / codes
 
     width = max((float(high - low) for low, high in _ranges(planes["means"])), default=0.0)
     least = 2.0**-70
-    colours = CODE_LIMIT // 4  # Co reaches twice the coefficients, and refits move them
+    colours = CODE_LIMIT // 4  # Co reaches twice the coefficients, and refits move the coefficients
     finest_sh = finest("sh_rest", colours)
     return StepSizes(
         position=max(steps.position, width / (2**POSITION_BITS - 2), finest("means"), least),
@@ -158,17 +186,19 @@ def _ranges(planes: np.ndarray) -> list[tuple[np.float32, np.float32]]:
 
 
 def reachable(steps: StepSizes, planes: dict[str, np.ndarray], seen: np.ndarray) -> np.ndarray:
-    """[n] bool: rows that a grid of these steps can hold beside those that some pose sees.
+    """[n] bool: rows that some pose sees, and all others that a grid of these step sizes can hold too.
 
-    One Gaussian far away, in no view, would ask for position steps as large as the scene itself:
+    Without this, one Gaussian far away and in no view could ask for position steps as large as the scene itself:
     docs/results/stability.md
 
     Parameters
     ----------
+    steps : StepSizes
+        As chosen.
     planes : dict
-        [width, n] f32 by field.
+        Stored planes ([width, n] f32 by field).
     seen : np.ndarray
-        [n] bool; these are always in: `holdable` makes room for them.
+        [n] bool, rows that some pose sees. They are always in, because `holdable` makes steps coarser for them.
     """
     if not seen.any():
         return np.ones(len(seen), bool)

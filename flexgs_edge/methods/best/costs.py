@@ -1,7 +1,7 @@
 """Measured costs: the squared error of removing a Gaussian, and of dropping its SH to each lower degree.
 
-One pass over the training poses gives both. The costs are those of one change alone, all other splats staying as they are;
-what was removed together is measured by the next pass.
+One pass over the scored poses gives both. Each cost is that of one change alone, with all other splats as they are.
+Errors of Gaussians that were removed together show only in the next pass.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.sums import Maker, ViewSums
 
 MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
-"""Where the sums of moments stop (colours of some thousands in every view)."""
+"""Sums of moments saturate here. Only colours of some thousands in every view reach it."""
 
 
 @dataclass
@@ -35,11 +35,11 @@ class RemovalCosts:
     Attributes
     ----------
     removal : np.ndarray
-        [N] f64, of removing the Gaussian (exact with the other splats' hits frozen).
+        [N] f64, cost of removing the Gaussian. It is exact if the hits of all other splats stay the same.
     weight2 : np.ndarray
         [N] f64, sum of squared weights (alpha T)^2; 0 for Gaussians that no pose sees.
     sh : np.ndarray
-        [D, N] f64, of keeping SH up to degree L = 0 .. D-1 only, with `sh_mean[L]` added to the colour.
+        [D, N] f64, cost of keeping SH only up to degree L = 0 .. D-1, with `sh_mean[L]` added to the colour.
     sh_mean : np.ndarray
         [D, 3, N] f32, mean colour over poses (weighted by weight2) of the bands above L.
     """
@@ -51,7 +51,7 @@ class RemovalCosts:
 
     @classmethod
     def of(cls, parts: Sequence[CostParts], storage: Storage = IN_MEMORY) -> RemovalCosts:
-        """Costs over all poses, from sums over some of them each."""
+        """Costs over all poses, from sums that each cover a part of the poses."""
         levels, count = parts[0].moments.shape[0], len(parts[0].removal)
         costs = cls.empty(levels, count, storage)
         for rows, found in read_ahead(count, *(getattr(part, name) for name in PART_NAMES for part in parts)):
@@ -59,9 +59,9 @@ class RemovalCosts:
                 np.asarray(sum(found[at : at + len(parts)])) for at in range(0, len(found), len(parts))
             )
             divisor = np.where(weight2 > 0, weight2, 1.0)
-            # Rounding may leave a variance of nothing slightly below zero.
+            # A variance of zero may come out slightly negative by rounding.
             variance = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
-            # A sum that stopped growing must not look like no variance at all.
+            # A saturated sum must not look like no variance at all.
             put_rows(costs.removal, rows, removal)
             put_rows(costs.weight2, rows, weight2)
             put_rows(costs.sh, rows, np.where(moments[:, 3] >= MOMENT_FULL, moments[:, 3], variance))
@@ -77,14 +77,15 @@ class RemovalCosts:
 
 @dataclass
 class CostParts:
-    """Sums over some poses that costs are made of; sums over others add up with them.
+    """Sums over a part of the poses, from which costs are computed; sums over other parts can be added.
 
     Attributes
     ----------
     removal, weight2 : np.ndarray
         [N] f64, as in `RemovalCosts`.
     moments : np.ndarray
-        [D, 4, N] f64: of the colour of the bands above each degree, times the squared weight (three channels), and of its square.
+        [D, 4, N] f64, sums over the colour of the bands above each degree: three of squared weight times colour, one of
+        squared weight times squared colour.
     """
 
     removal: np.ndarray
@@ -121,18 +122,20 @@ class _Wide:
 
 
 def cost_sums(renderer: Renderer, degree: int, first: int = 0) -> Maker:
-    """Sums over views of what costs are made of; removal sums begin at plane `first` of a view's.
+    """Maker of the sums over views from which costs are computed.
 
     Parameters
     ----------
     degree : int
         SH degree of the scene, or 0 to leave the costs of dropping SH degrees out.
+    first : int
+        Plane of a view's sums at which the removal sums begin.
     """
     return partial(_ChunkCosts, renderer, degree, first)
 
 
 def cost_parts(levels: int, count: int, storage: Storage) -> CostParts:
-    """Parts of `count` rows of SH degree `levels`, to be filled by `put_costs`."""
+    """Empty sums for `count` rows of SH degree `levels`, to be filled by `put_costs`."""
     one, two = (storage.empty((count,), np.float64) for _ in range(2))
     return CostParts(one, two, storage.empty((levels, 4, count), np.float64))
 
@@ -151,16 +154,20 @@ def measure_costs(
     sh_costs: bool = True,
     progress: Progress = SILENT,
 ) -> RemovalCosts:
-    """One scoring pass: about twice the cost of rendering the poses.
+    """Measure costs in one pass, which takes about twice the time of rendering the poses.
 
     Parameters
     ----------
     bench : Bench
+        Draws the views.
     scene : DeviceScene
+        Loaded with room for the sums of this pass.
     cameras : sequence of Camera
         The scored poses.
     sh_costs : bool
-        Measure the costs of dropping SH degrees as well (empty arrays otherwise).
+        Measure the costs of dropping SH degrees too (default). Otherwise their arrays are empty.
+    progress : Progress
+        Told of each view.
     """
     degree = scene.sh_degree if sh_costs else 0
     costs = ViewSums(bench, scene, [cost_sums(bench.renderer, degree)])

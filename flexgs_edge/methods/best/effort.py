@@ -1,4 +1,7 @@
-"""How much work a search by measured costs spends: counted, never timed."""
+"""`--effort`: how much work the method `best` spends.
+
+Work is counted and never timed, so the same command gives the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -11,37 +14,38 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.run.options import CompressOptions
 
 LEAST_VIEWS = 6
-"""Least poses for a step of the refit. Steps from fewer fit the scored poses ever better and all others ever worse:
+"""Least poses for a step of the refit. Steps from fewer poses overfit the scored poses, and all others get worse:
 docs/results/tuning.md#least_views"""
 
 MENDED = 0.66
-"""Loss after the first round of the colour refit over the loss before it, until a candidate tells:
+"""Expected loss after the first round of the colour refit, divided by the loss before it, until a candidate tells:
 docs/results/tuning.md#mended"""
 LARGEST_STEP = 4
-"""Most pixels from one to the next: splats of one or two pixels must not fall between them in every view."""
+"""Largest distance in pixels between those that we look at. Splats of one or two pixels must not fall between them
+in every view."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much work a search spends; fixed counts.
+    """How much work a search spends, as fixed counts.
 
     Parameters
     ----------
     keep : float
-        Share of the Gaussians that stays in each round of the path.
+        Share of the Gaussians that stays in each round of pruning.
     refit_rounds : int
-        Rounds on all coefficients before SH are put on their grid (one on the constant follows). None in `fast`, where
-        they would cost more time than their bytes are worth: docs/results/tuning.md#refit_rounds
+        Rounds of the refit on all coefficients before SH are put on their grid. One round on the constant follows. `fast`
+        has none, because they cost more time there than their bytes are worth: docs/results/tuning.md#refit_rounds
     subsets : int
-        Steps a round at most, as for `refit_colours`.
+        Most steps of a round, as for `refit_colours`.
     steps : int
-        Whole results that are measured, at most while something holds.
+        Most candidates, unless none of them holds.
     close : float
-        Excess (log of loss over limit) that ends the search when it is no farther below the target.
+        The search ends when a candidate is no farther than this below the target (log of limit over loss).
     few : int
-        Least scored poses, where there are as many: docs/results/tuning.md#few
+        Least scored poses, if there are as many: docs/results/tuning.md#few
     views : int
-        Most scored poses: more than `few` where these have too few pixels.
+        Most scored poses. We take more than `few` if these have too few pixels.
     pixels : int
         Least pixels of all scored poses for each Gaussian. We look at every k-th pixel in both directions, with the
         largest k that leaves as many. More pixels take longer, fewer make files larger: docs/results/tuning.md#pixels
@@ -49,9 +53,9 @@ class Effort:
         `MENDED` at this effort: the fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
         makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#mended
     probed : int
-        Most poses that trial grids are judged on: docs/results/tuning.md#probed
+        Most poses that trial grids are measured on: docs/results/tuning.md#probed
     passes : float
-        Times that the descent to the first whole result looks at every scored pose; 0: colours are refitted instead.
+        How often the descent to the first candidate looks at every scored pose. 0 (default): colours are refitted instead.
     """
 
     keep: float
@@ -67,20 +71,20 @@ class Effort:
     passes: float = 0.0
 
     def poses_of(self, pixels: Sequence[int], count: int) -> int:
-        """How many poses to score of those that have so many pixels, for `count` Gaussians."""
+        """How many poses to score for `count` Gaussians; `pixels` are those of each pose, in order."""
         enough = int(np.searchsorted(np.cumsum(pixels), self.pixels * count)) + 1
         return min(max(self.few, enough), self.views, len(pixels))
 
     def subsets_of(self, poses: int) -> int:
-        """Steps a round for so many scored poses."""
+        """Steps of a round for `poses` scored poses."""
         return max(min(self.subsets, poses // LEAST_VIEWS), 1)
 
 
 def sampled_poses(cameras: Sequence[Camera], pixels: int) -> list[Camera]:
-    """The views at every pixel, or at as large a part of them as leaves `pixels` of all.
+    """The views at every pixel, or at every k-th one, with the largest k that leaves `pixels` in all.
 
-    The part is the same lattice in every view, begun at another pixel from view to view in the order of their names: ties among
-    poses, which rounding of a scene that was moved may break, decide no pixel.
+    The lattice is the same in every view, but begins at another pixel, by the order of the views' names. Names do not
+    depend on the order of the poses, where a moved scene may break ties in another way.
     """
     step = 1
     while step < LARGEST_STEP and sum(_lattice(camera, step + 1) for camera in cameras) >= pixels:
@@ -109,5 +113,5 @@ EFFORTS = {
 
 
 def distil_steps(options: CompressOptions, poses: int) -> int:
-    """Steps of the descent to the first whole result; 0 for none."""
+    """Steps of the descent to the first candidate; 0 for none."""
     return round(EFFORTS[options.effort].passes * poses) if options.distil is None else options.distil

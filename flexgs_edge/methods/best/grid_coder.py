@@ -1,4 +1,4 @@
-"""Codes the grids of a search, and tells what they cost."""
+"""Codes the grids of a search with the real coder, so that their sizes are exact."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import coding_device
 
 SETTINGS_MOST = 1536
-"""Bytes that the settings in the header take at most: the search counts them before they are known."""
+"""Most bytes of the settings in the header. The search counts them before they are known."""
 
 
 class GridCoder:
-    """Codes the grids of a search. The last one stays coded, so that writing it is copying.
+    """Codes grids. The last one stays coded, so that writing it only copies bytes.
 
     Parameters
     ----------
     renderer : Renderer
-        Its device codes where it can.
+        Its device codes if it can.
     """
 
     def __init__(self, renderer: Renderer) -> None:
@@ -37,20 +37,20 @@ class GridCoder:
         return encode_grid(grid, device=device, storage=self._renderer.storage)
 
     def encoded(self, grid: GridScene) -> Encoded:
-        """The grid as it will lie in a file."""
+        """The coded grid."""
         if self._last is None or self._last[0] is not grid:
             self._last = None
             encoded = self._encode(grid)
-            # Of a scene in scratch files even the bytes of the file may be too many.
+            # If a scene needs scratch files, even the bytes of its file may be too many for memory.
             self._last = grid, encoded if self._renderer.storage.spills else encoded.finished()
         return self._last[1]
 
     def bits(self, grid: GridScene) -> BitModel:
-        """What its Gaussians cost; no stream is written for that."""
+        """Bits of its Gaussians. No stream is written for this."""
         return bit_model(grid, self._encode(grid))
 
     def size(self, grid: GridScene, settings: Mapping[str, Any] | None = None) -> int:
-        """Bytes of the file that `write` makes; without `settings`, which a search does not know yet, at most."""
+        """Bytes of the file that `write` makes. A search does not know the `settings` yet: without them it is an upper bound."""
         size = coded_size(grid, settings or {}, encoded=self.encoded(grid))
         return size + SETTINGS_MOST if settings is None else size
 
@@ -60,7 +60,7 @@ class GridCoder:
 
 
 def bit_model(grid: GridScene, encoded: Encoded) -> BitModel:
-    """What the Gaussians of a coded grid cost.
+    """Bits of the Gaussians of a coded grid.
 
     The information in the SH is shared among their coefficients; the rest among the rows.
     """

@@ -1,4 +1,8 @@
-"""The search for a `.fgs`: candidates along one multiplier, each refitted, coded and measured."""
+"""The search for a `.fgs`: candidates at different multipliers, each refitted, coded and measured.
+
+A candidate is a finished result: geometry on its grid, colours refitted, bytes counted, quality measured. Probes are
+cheaper results without a refit. They tell where the next candidate should lie.
+"""
 
 from __future__ import annotations
 
@@ -26,39 +30,39 @@ from flexgs_edge.methods.best.refit.distil import Schedule, distil
 from flexgs_edge.methods.best.rounds import PruneRounds
 
 FINE_COLOUR = 2.0**-8
-"""Colour steps before the refit, as a share of the final ones: only geometry shall move."""
+"""Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
 FURTHER = 0.92
-"""Loss after each further round of the colour refit over the round before it: docs/results/tuning.md#further"""
+"""Loss after a further round of the colour refit, divided by the loss before it: docs/results/tuning.md#further"""
 DRIFT = -0.12
-"""What a second refit adds to the excess. It goes on where the first one ended: docs/results/tuning.md#drift"""
+"""Change of the excess by a second refit, which goes on where the first one ended: docs/results/tuning.md#drift"""
 DISTILLED = 0.4
-"""Loss after a descent over the loss before it, until a candidate tells. This is cautious on purpose: a further descent
-can go on from a candidate that holds with fewer Gaussians, but not with more: docs/results/tuning.md#distilled"""
+"""Expected loss after a descent, divided by the loss before it, until a candidate tells. It is cautious on purpose: a
+further descent can keep fewer Gaussians than the one that it goes on from, but not more: docs/results/tuning.md#distilled"""
 DRIFT_DISTILLED = -0.3
-"""`DRIFT` of a further descent: docs/results/tuning.md#drift_distilled"""
+"""Change of the excess by a further descent (as `DRIFT`): docs/results/tuning.md#drift_distilled"""
 PRUNED_DISTILLED = 1.6
-"""`PRUNED_PART` where a descent follows: it takes more back than pruning may lose."""
+"""`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
 FURTHER_STEPS = 0.4
-"""Steps of a further descent, which goes on where the last one ended, as a share of those of the first."""
+"""Steps of a further descent, as a share of the first one's. It goes on where the last one ended."""
 FURTHER_RATE = 0.5
-"""Its rates, as a share of those that the first began with."""
+"""Rates of a further descent, as a share of the first one's."""
 FULL_RATES, LEAST_RATE = 41.0, 0.25
-"""Fidelity before a descent up to which it goes at full rates, dB, and the least share of them: `rate_from`."""
+"""Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
 DECAY = 0.8
-"""Part of that which the next refit adds again. It is above zero because refits fit the scored poses too well:
+"""Share of the last drift that the next refit adds again. It is above zero because refits overfit the scored poses:
 docs/results/tuning.md#decay"""
 FARTHER = 0.05
-"""Excess below the target that is aimed at for each result that missed it, from the second in a row on."""
+"""How much farther below the target we aim for each candidate in a row that missed it, from the second on."""
 PROBES = 4
-"""Most probes between two candidates. A probe has no refit of its own, so it is cheap."""
+"""Most probes between two candidates."""
 FARTHEST = 2.0
 """Largest change of the log of the multiplier by all probes of one aim."""
 
 
 def rate_from(fidelity: float | None) -> float:
-    """Share of its rates that a descent from a fidelity goes at: as the root of the mean squared error.
+    """Share of the full rates for a descent that starts at `fidelity` dB; it follows the root of the mean squared error.
 
-    Where there is little error left, full steps break more than they mend: docs/results/tuning.md#rate_from
+    With little error left, full steps would break more than they repair: docs/results/tuning.md#rate_from
     """
     return 1.0 if fidelity is None else max(min(1.0, 10 ** ((FULL_RATES - fidelity) / 20)), LEAST_RATE)
 
@@ -69,12 +73,19 @@ class GridSearch(MultiplierSearch[GridScene]):
     Parameters
     ----------
     rounds : PruneRounds
+        Snapshots to choose from.
     size_of : callable
-        Exact bytes of a grid's file.
+        Bytes of a grid's file.
     measure : callable
         Quality of a grid's decoded planes.
+    effort : Effort
+        How much work to spend.
+    refit : bool
+        Refit the colours of each candidate (default).
+    on_step : callable, optional
+        Called with each candidate.
     steps : int
-        Views that the descent to the first whole result looks at; 0: colours are refitted instead.
+        Views that the descent to the first candidate looks at. 0 (default): colours are refitted instead.
     """
 
     def __init__(
@@ -94,7 +105,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         self._slopes: Slopes | None = None
         self._mended: Refitted | None = None
         self._descents: list[tuple[float, Refitted]] = []
-        # Where SH are not refitted, a result has nothing from the one before.
+        # Without a refit of SH, a candidate takes nothing over from the one before.
         self._drift = DRIFT_DISTILLED if steps else DRIFT if effort.refit_rounds else 0.0
         self._expected = 0.0
 
@@ -103,28 +114,28 @@ class GridSearch(MultiplierSearch[GridScene]):
         return to_grid(kept.planes, kept.degrees, steps, self.rounds.origin, storage=self.rounds.storage)[0]
 
     def _probe(self, multiplier: float, target: Target) -> float:
-        """The excess of a multiplier's result without a refit of its own."""
+        """Excess of a probe: the grid of a multiplier, without a refit of its own."""
         grid = self._before_refit(multiplier)
         if target.limit_bytes is not None:
             return target.excess(self.size_of(grid), None)
         return target.excess(0, self.measure(values_of(grid, self.rounds.storage), estimate=True))
 
     def _aim(self, multiplier: float, steps: Sequence[Candidate], target: Target) -> float:
-        """Probe to where a whole result should lie just below the target: what a refit changes is about the same everywhere."""
+        """Probe for the multiplier whose candidate should be just below the target. A refit changes the excess alike nearby."""
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
         offset = math.log(self._mended_part()) if self.refit and not by_size else 0.0
         if steps:
             offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
             if self.refit and not by_size:
-                # Those probes have the colours of the last refit; the next one goes on from them.
+                # Probes have the colours of the last refit, and the next refit goes on from these.
                 if len(steps) > 1:
                     self._drift = DECAY * (self._drift + steps[-1].excess - self._expected)
-                # Whatever the reason that results keep missing: go farther each time.
+                # If candidates keep missing, for whatever reason, aim farther each time.
                 offset += self._drift + FARTHER * max(misses(steps) - 1, 0)
         low, high = bounds(steps, by_size)
         place = min(max(math.log(multiplier), low), high)
-        # Curves that are flat, where nothing holds, must not send the search to the end of numbers.
+        # If nothing holds and the curve is flat, the search must not run away to infinity.
         low, high = max(low, place - FARTHEST), min(high, place + FARTHEST)
         seen: list[tuple[float, float]] = []
         self._expected = AIM
@@ -140,20 +151,20 @@ class GridSearch(MultiplierSearch[GridScene]):
         return math.exp(place)
 
     def _mended_part(self) -> float:
-        """Loss after the first whole result's refit, or descent, over the loss before it, as far as it is known before."""
+        """Expected loss after the first candidate's refit or descent, divided by the loss before it."""
         if self.steps:
             return DISTILLED
         return self.effort.mended * FURTHER ** (self.effort.refit_rounds - 1)
 
     def _choice(self, multiplier: float) -> tuple[Kept, StepSizes]:
-        """What a multiplier keeps, with the colours of the last refit, and the grid steps."""
+        """The rows that a multiplier keeps, with the colours of the last refit, and the step sizes of the grid."""
         kept = self.kept(multiplier)
         mended = self._descended(multiplier) if self.steps else self._mended
         if mended is not None:
             kept.planes = mended.apply(kept.rows, kept.degrees, kept.planes, self.rounds.storage)
         snapshot = self.rounds.snapshots[kept.snapshot]
         if self._slopes is None:
-            # Once, near the answer: slopes of a row change little from snapshot to snapshot, and a step must not jump there.
+            # Measured once, near the answer: slopes change little between snapshots, and steps must not jump there.
             self._slopes = probe_slopes(
                 self.rounds.renderer, snapshot.planes, self.rounds.origin, self.rounds.cameras, self.effort.probed
             )
@@ -176,16 +187,16 @@ class GridSearch(MultiplierSearch[GridScene]):
         return found, grid
 
     def _descended(self, multiplier: float) -> Refitted | None:
-        """Values of the last descent that kept what this multiplier keeps and more.
+        """Values of the last descent that kept all that this multiplier keeps; None if there is none.
 
-        Not of one that kept less: its values make up for the Gaussians that it lacked. With these back, they make up
-        for too much: docs/results/tuning.md#descended
+        A descent that kept fewer Gaussians will not do. Its values make up for the missing ones, which are back now:
+        docs/results/tuning.md#descended
         """
         before = [(at, mended) for at, mended in self._descents if at <= multiplier]
         return max(before, key=lambda pair: pair[0])[1] if before else None
 
     def _distilled(self, multiplier: float, kept: Kept, steps: StepSizes) -> GridScene:
-        """All values moved towards the original's renders with the grid in view, on the grid, and the constant refitted."""
+        """Move all values towards the references, put them on the grid, and refit the constant colour."""
         rounds = self.rounds
         first = self._descended(multiplier) is None
         count, rate = (self.steps, 1.0) if first else (math.ceil(FURTHER_STEPS * self.steps), FURTHER_RATE)
@@ -221,7 +232,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         return recolour(grid, moved["sh_dc"], moved["sh_rest"])
 
     def _finish(self, kept: Kept, steps: StepSizes) -> GridScene:
-        """Geometry on its grid, all colours refitted, SH on their grid, the constant refitted, the constant on its grid."""
+        """Put geometry on its grid, refit all colours, put SH on their grid, refit the constant colour, put it on its grid."""
         rounds, storage, planes = self.rounds, self.rounds.storage, kept.planes
         fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
         fine = holdable(fine, planes)

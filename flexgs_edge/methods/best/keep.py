@@ -1,4 +1,7 @@
-"""Scenes that were compressed before: kept as they are where they fit the target."""
+"""Keeps a scene that was compressed before as it is, if it already fits a target of bytes.
+
+Another search would prune and round it once more, and lose quality for nothing.
+"""
 
 from __future__ import annotations
 
@@ -23,26 +26,32 @@ from flexgs_edge.views.bench import Bench
 LOG = logging.getLogger("flexgs_edge")
 
 LAYERS_COST = 1.06
-"""Most bytes of a layered file over those of one without: neighbours on the curve are farther apart in it.
+"""Most bytes of a layered file over those of a file without layers: neighbours on the curve are farther apart in it.
 docs/results/tuning.md#layers_cost"""
 KEPT_COPIES = 4
-"""Times a scene's planes that looking for its grid holds: as read, in order, decoded, and codes."""
+"""Copies of a scene's planes that looking for its grid holds: as read, in order, decoded, and codes."""
 
 
 def kept_as_it_is(
     run: Run[CompressOptions], bench: Bench, coder: GridCoder, judge: Judge, settings_known: bool = True
 ) -> tuple[GridScene, SearchResult] | None:
-    """A scene that lies on a grid of ours and fits the target's bytes already, with nothing lost; else None.
+    """The scene on its old grid if it was compressed before and already fits the target's bytes; else None.
 
-    So it is for files that were compressed before. Another search would prune and round what is pruned and rounded:
+    Nothing is lost then. Another search would prune and round the scene once more:
     docs/results/tuning.md#kept-as-it-is.
 
     Parameters
     ----------
     run : Run
-        Its scene is a `.fgs`, or a PLY that one was decompressed to and nobody changed.
+        Planned. Only a `.fgs`, or an unchanged PLY that a `.fgs` was decompressed to, lies on a grid.
+    bench : Bench
+        Draws the views.
+    coder : GridCoder
+        Tells the bytes of the file.
+    judge : Judge
+        Prepared on the views that decide.
     settings_known : bool
-        The file will say of itself what `make_settings` says; otherwise the size leaves room for any settings.
+        The header will hold what `make_settings` returns (default). Otherwise the size leaves room for any settings.
     """
     source, target = run.source, run.target
     limit, steps = target.limit_bytes, steps_of(source.comments)
@@ -54,7 +63,7 @@ def kept_as_it_is(
     if grid is None:
         return None
     layers_cost = 1.0 if run.options.layers == 1 else LAYERS_COST
-    size = coder.size(grid, {})  # without what the file says of itself, which holds the measurement
+    size = coder.size(grid, {})  # without settings: they hold the measurement, which is not there yet
     if round(layers_cost * size) > limit:
         return None
     with bench.renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:

@@ -1,4 +1,7 @@
-"""What a multiplier keeps, and the colours that a refit of it gave."""
+"""The Gaussians that a multiplier keeps, and the values that a refit of them gave.
+
+A search hands these from candidate to candidate, so that each refit goes on from the last one.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,17 @@ COLOURS = ("sh_dc", "sh_rest")
 
 @dataclass
 class Refitted:
-    """Values after a refit (colours) or a descent (all), by row of the scene (ascending): where the next one starts."""
+    """Values after a refit (colours) or a descent (all fields), from which the next one starts.
+
+    Attributes
+    ----------
+    rows : np.ndarray
+        [n] i64, places in the rows of `PruneRounds`, ascending.
+    degrees : np.ndarray
+        [n] u8, SH degrees at the time of the refit.
+    planes : dict
+        The changed fields ([width, n] f32 by field).
+    """
 
     rows: np.ndarray
     degrees: np.ndarray
@@ -31,7 +44,7 @@ class Refitted:
         storage: Storage = IN_MEMORY,
         fields: Iterable[str] = COLOURS,
     ) -> Refitted:
-        """Of the changed fields of `planes`, whose columns belong to `rows[order]`; rows ascending."""
+        """Take the changed `fields` of `planes`, whose columns belong to `rows[order]`, back into the order of `rows`."""
         back = storage.empty((len(order),), np.int64)
         back[order] = np.arange(len(order))
         return cls(rows, degrees, {name: storage.take(planes[name], back) for name in fields})
@@ -39,7 +52,7 @@ class Refitted:
     def apply(
         self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray], storage: Storage = IN_MEMORY
     ) -> dict[str, np.ndarray]:
-        """`planes` with these values: geometry wherever a row was kept, colours where it was with the same SH degree."""
+        """`planes` with these values: geometry of every row that was refitted, colours only if its SH degree was the same."""
         if not len(self.rows) or not len(rows):
             return planes
         changed = {name: storage.empty(planes[name].shape, planes[name].dtype) for name in self.planes}
@@ -52,7 +65,7 @@ class Refitted:
             for name, values in changed.items():
                 same = np.flatnonzero(alike if name in COLOURS else kept)
                 to, places = read_rows(planes[name], part).copy(), at[same] - span.start
-                # Of colours a grid may have lost its highest degrees: coefficients are channel by channel.
+                # The grid may lack the highest SH degrees. Coefficients lie channel by channel, so we go by channel.
                 channels = 3 if name in COLOURS else 1
                 both = (v.reshape(channels, -1, v.shape[-1]) for v in (to, self.planes[name]))
                 for held, new in zip(*both, strict=True):
@@ -64,22 +77,22 @@ class Refitted:
 
 @dataclass
 class Kept:
-    """What a multiplier keeps.
+    """The Gaussians that a multiplier keeps.
 
     Attributes
     ----------
     snapshot : int
-        Number of the snapshot that was asked.
+        Number of the snapshot that they were chosen from.
     rows : np.ndarray
-        [n] i64, rows of the scene.
+        [n] i64, places in the rows of `PruneRounds`, ascending.
     planes : dict
-        Of these rows, with SH dropped.
+        Stored planes of these rows ([width, n] f32 by field), with SH dropped.
     degrees : np.ndarray
         [n] u8, SH degrees.
     weight2 : np.ndarray
         [n] f64, sums of squared weights.
     left_out : int
-        Rows that would have asked for coarser steps of all others, and went.
+        How many rows were left out because the grid would be coarser with them (`reachable`).
     """
 
     snapshot: int
@@ -90,7 +103,7 @@ class Kept:
     left_out: int = 0
 
     def take(self, keep: np.ndarray, storage: Storage = IN_MEMORY) -> Kept:
-        """Some of the rows: [n] bool."""
+        """The rows for which `keep` ([n] bool) is True."""
         if keep.all():
             return self
         rows = np.flatnonzero(keep)

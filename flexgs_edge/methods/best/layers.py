@@ -1,4 +1,7 @@
-"""Layers: rows ordered so that a file cut at a layer's end is the best scene of those bytes that needs no new decision."""
+"""Layers: rows are ordered by importance, so that a file that is cut after a layer still decodes to a good scene.
+
+Nothing is computed again when a file is cut: cutting drops the least important Gaussians.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,10 @@ from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
 
 HALF = 0.485
-"""Share of the bits that stays from layer to layer: a file cut to half its bytes shall hold a whole layer, header included."""
+"""Share of the bits that stays when the last layer is cut off. It is below .5, so that half of a file's bytes hold the other
+layers and the header."""
 ROUND = 0.8
-"""Share of the bits that one measurement of costs decides on: removed Gaussians interact."""
+"""Share of the bits that stays before costs are measured again. Removed Gaussians interact, so costs go out of date."""
 
 
 def assign_layers(
@@ -32,19 +36,30 @@ def assign_layers(
     cameras: Sequence[Camera],
     progress: Progress = SILENT,
 ) -> GridScene:
-    """The same Gaussians, the ones that matter most a bit first, in `layers` layers that each double the bytes.
+    """Sort the Gaussians into `layers` layers by cost of removal for each bit; each layer doubles the bytes.
 
-    The costs of removal are measured again after each fifth of the bits, on the scene as it decodes: a cut file has no refit.
+    Costs are measured again after each fifth of the bits, on the decoded scene, because a cut file has no refit.
     Gaussians that no pose sees come last.
 
     Parameters
     ----------
+    grid : GridScene
+        The scene to sort.
     layers : int
-        From 1 (none) to 4.
+        From 1 (no layers) to 4.
     bits : BitModel
-        What the coder takes for a row of each SH degree.
+        Bits that the coder takes for a row of each SH degree.
+    bench : Bench
+        Draws the views.
     cameras : sequence of Camera
         The scored poses.
+    progress : Progress
+        Told of each view.
+
+    Returns
+    -------
+    GridScene
+        The same Gaussians in the order of their layers.
     """
     spent = np.array([bits.of_degree(degree) for degree in range(grid.sh_degree + 1)])[grid.sh_degrees]
     layer = np.zeros(grid.count, np.uint8)

@@ -1,4 +1,7 @@
-"""`--views-margin`: poses that nobody took are scored as well, nearer to what is seen, farther from it and in between."""
+"""`--views-margin`: generated poses are scored too: closer to the scene, farther from it, and between given poses.
+
+They protect Gaussians that matter only from such views. This makes files slightly larger, and scoring slower.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +16,19 @@ from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.depths import visible_depths
 
 NEARER, FARTHER = 0.5, 2.0
-"""Distances of the poses that we make, as parts of their own pose's. They come on top of the given ones: in their place
-they make files larger. Scenes differ in what is missing, so there are nearer and farther ones:
+"""Distances of generated poses from the scene, in distances of the given pose. Generated poses come on top of the given
+ones; in place of them they would make files larger. Scenes differ in which views are missing, so we make both kinds:
 docs/results/tuning.md#nearer"""
 BETWEEN, FAR = 8, 2
-"""One of so many given poses has one half way to the nearest pose in the place of a nearer one, or a farther one as well."""
+"""One of `BETWEEN` given poses gets a pose half way to its nearest neighbour instead of a nearer one. One of `FAR` given
+poses gets a farther one too."""
 
 
 def with_margin(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """At most `most` of `cameras` to score, the first ones, and three made from every two of them.
+    """The first `most` of `cameras` to score, and three generated poses for every two of them.
 
-    One from each is `NEARER`, but of eight one is half way to the nearest pose instead; one from every second is `FARTHER`.
+    Each given pose gets a nearer one; one of eight gets one half way to its nearest neighbour instead. Every second
+    pose also gets a farther one.
 
     Parameters
     ----------
@@ -33,6 +38,8 @@ def with_margin(renderer: Renderer, source: SceneSource, cameras: Sequence[Camer
         The original.
     cameras : sequence of Camera
         All training poses, the most important first.
+    most : int
+        Most given poses.
     """
     real = list(cameras[:most])
     made = []

@@ -1,4 +1,8 @@
-"""`--method best`: measured costs in rounds of pruning, one multiplier, grids of equal slope, the real coder."""
+"""`--method best`, the default: rate-distortion optimization with measured costs.
+
+`compress` chooses poses and storage, prunes in rounds, searches for the best candidate, writes it and measures it. The
+search asks for exact sizes (`GridCoder`) and measured quality (`Judge`).
+"""
 
 from __future__ import annotations
 
@@ -62,9 +66,9 @@ def compress(run: Run[CompressOptions], bench: Bench, output: Path | None) -> Ma
     run : Run
         Planned, with views and a target.
     bench : Bench
-        Draws; gets the storage that the search needs.
+        Draws the views. Its renderer gets the storage that the search needs.
     output : Path or None
-        `None` in a dry run.
+        The file to write; `None` in a dry run.
 
     Raises
     ------
@@ -94,7 +98,21 @@ def compress(run: Run[CompressOptions], bench: Bench, output: Path | None) -> Ma
             with run.clock.stage("layers"):
                 bits = GridCoder(bench.renderer).bits(grid)
                 grid = assign_layers(grid, run.options.layers, bits, bench, poses.cameras, run.progress)
-        size, quality = _write(run, bench, coder, grid, search, judges, output, kept)
+        settings = make_settings(run, search)
+        if output is None:
+            size, quality = _tried(run, coder, grid, settings, judges)
+        else:
+            with temporary_name(output, run.options.force, None if kept is None else kept.key) as place:
+                with run.clock.stage("write"):
+                    size = coder.write(place, grid, settings)
+                limit = run.target.limit_bytes
+                if search.reached and limit is not None and size > limit:
+                    raise TargetError(
+                        f"{run.target.describe()}: {run.options.layers} layers make the file {size} bytes; "
+                        "ask for fewer layers"
+                    )
+                quality = judges.measure(decoded(open_fgs(place), bench.renderer))
+            LOG.info("wrote %s, %s", output, format_size(size))
         if kept is not None:
             kept.remove()
         storage.close()
@@ -111,39 +129,20 @@ def compress(run: Run[CompressOptions], bench: Bench, output: Path | None) -> Ma
         )
 
 
-def _write(
-    run: Run[CompressOptions],
-    bench: Bench,
-    coder: GridCoder,
-    grid: GridScene,
-    search: SearchResult,
-    judges: Judges,
-    output: Path | None,
-    kept: Checkpoint | None,
+def _tried(
+    run: Run[CompressOptions], coder: GridCoder, grid: GridScene, settings: dict[str, Any], judges: Judges
 ) -> tuple[int, Quality]:
-    """Write the file under another name, measure what it decodes to, and only then give it its name."""
-    settings, target = make_settings(run, search), run.target
-    if output is None:
-        if run.reporter is not None:
-            run.reporter.read_contents_of(lambda place: coder.write(place, grid, settings))
-        size = coder.size(grid, settings)
-        return size, judges.measure(MemorySource(values_of(grid, bench.renderer.storage), origin=grid.origin))
-    with temporary_name(output, run.options.force, None if kept is None else kept.key) as place:
-        with run.clock.stage("write"):
-            size = coder.write(place, grid, settings)
-        if search.reached and target.limit_bytes is not None and size > target.limit_bytes:
-            raise TargetError(
-                f"{target.describe()}: {run.options.layers} layers make the file {size} bytes; ask for fewer layers"
-            )
-        quality = judges.measure(decoded(open_fgs(place), bench.renderer))
-    LOG.info("wrote %s, %s", output, format_size(size))
-    return size, quality
+    """Bytes and quality of the file in a dry run. A report reads the contents from a file that is removed afterwards."""
+    if run.reporter is not None:
+        run.reporter.read_contents_of(lambda place: coder.write(place, grid, settings))
+    size = coder.size(grid, settings)
+    return size, judges.measure(MemorySource(values_of(grid, judges.storage), origin=grid.origin))
 
 
 def grid_search(
     options: CompressOptions, coder: GridCoder, search: type[GridSearch] = GridSearch
 ) -> SearchMaker[GridScene]:
-    """Searches for the grid of a `.fgs`."""
+    """Make searches for the grid of a `.fgs`."""
 
     def size_of(grid: GridScene) -> int:
         size = coder.size(grid)
@@ -166,18 +165,22 @@ def search_best(
     judge: Judge,
     checkpoint: Checkpoint | None = None,
 ) -> tuple[Product, SearchResult]:
-    """What to write, and the steps that led to it.
+    """Search, and return the product to write and all candidates that led to it.
 
     Parameters
     ----------
     make : callable
         `grid_search`, or the search for a file of another format.
     run : Run
-        Its scene is held in the storage of `bench.renderer` as a whole.
+        Planned. The storage of `bench.renderer` holds its scene as a whole.
+    bench : Bench
+        Draws the views.
     poses : ScoredPoses
         From `scored_poses`.
     judge : Judge
         Prepared on the views that decide.
+    checkpoint : Checkpoint, optional
+        Keeps the rounds for a later run (`--resume`).
 
     Raises
     ------
@@ -201,16 +204,20 @@ def open_rounds(
     make: Callable[..., PruneRounds] = PruneRounds,
     checkpoint: Checkpoint | None = None,
 ) -> Iterator[PruneRounds]:
-    """The rounds that searches go through, at their start; several targets may share them, the weakest compression first.
+    """Open the rounds of pruning for one search, or for several that share them, the weakest compression first.
 
     Parameters
     ----------
+    run : Run
+        Planned.
+    bench : Bench
+        Draws the views.
     scored : sequence of Camera
         From `scored_poses`.
     make : callable, optional
         Builds the rounds from the arguments of `PruneRounds`.
     checkpoint : Checkpoint, optional
-        Where the rounds are kept.
+        Keeps the rounds for a later run.
     """
     renderer, source, options, budget = bench.renderer, run.source, run.options, run.budget
     storage, steps = renderer.storage, distil_steps(options, len(scored))
@@ -219,13 +226,13 @@ def open_rounds(
     else:
         size, least = needed_bytes(renderer, source, scored, options)
     budget.require("a search by measured costs", size + least)
-    budget.take("the scene and its path", size)
+    budget.take("the scene and its search", size)
     try:
         planes = read_all(source, storage)
         with References(storage.folder) as references:
             with run.clock.stage("search"):
                 rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
-                # Neighbours in space become neighbours in memory: views take less time.
+                # Neighbours in space become neighbours in memory, so views are drawn faster.
                 rows = storage.take(rows, near_rows(storage.take(planes["means"], rows), storage))
                 rounds = make(
                     bench,
@@ -240,7 +247,7 @@ def open_rounds(
                     between=poses_between(scored) if steps else (),
                     **({} if checkpoint is None else {"checkpoint": checkpoint}),
                 )
-            del planes  # the rounds have their own
+            del planes  # the rounds have copies of their own
             yield rounds
     finally:
         budget.give(size)
@@ -253,7 +260,7 @@ def search_rounds(
     judge: Judge,
     on_step: Callable[[Step], None] | None = None,
 ) -> tuple[Product, SearchResult]:
-    """`search_best` through rounds that are there."""
+    """Search as `search_best` does, from rounds that are open already."""
     renderer, source = rounds.bench.renderer, run.source
 
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
@@ -277,12 +284,12 @@ def search_rounds(
 
 
 def alive(logits: np.ndarray) -> np.ndarray:
-    """[n] bool: opacity reaches 1/255 (the renderer culls the rest everywhere, so they go first and cost nothing)."""
+    """[n] bool: opacity reaches 1/255. The renderer never draws the other rows, so removing them costs no quality."""
     return logits >= np.float32(-np.log(1 / ALPHA_MIN - 1) - 1e-3)
 
 
 def as_step(step: Candidate, count: int) -> Step:
-    """The step as every search records it: rates are shares of the scene's rows."""
+    """The candidate as a step in a record of any method: rates are thousandths of the scene's `count` rows."""
     prune = round(1000 * (1 - step.count / count))
     return Step(
         choice=Choice(prune, min(round(1000 * (step.count - step.sh_count) / count), 1000 - prune)),

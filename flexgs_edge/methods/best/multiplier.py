@@ -1,4 +1,9 @@
-"""The search over one multiplier, shared by `.fgs` and other formats."""
+"""The search over one multiplier, shared by `.fgs` and other formats.
+
+The multiplier is the Lagrange multiplier (lambda) of the rate: the squared error that one bit is worth. It decides which
+Gaussians stay, with which SH degree, and how fine the grid is. The search looks for the multiplier whose file just meets
+the target.
+"""
 
 from __future__ import annotations
 
@@ -25,38 +30,41 @@ LOG = logging.getLogger("flexgs_edge")
 
 
 class Measure(Protocol):
-    """Quality of planes ([width, n] f32 by field); with `estimate` a good guess, in a part of the time."""
+    """Quality of planes ([width, n] f32 by field). With `estimate` it is a good guess that takes less time."""
 
     def __call__(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement: ...
 
 
 PRUNED_PART = 0.45
-"""Part of the allowed loss that pruning alone uses up when a candidate meets the target. The search starts there:
+"""Share of the allowed loss that pruning alone uses up when a candidate meets the target. The search starts there:
 docs/results/tuning.md#pruned_part"""
 MOST_ROUNDS = 24
+"""Most rounds of pruning."""
 EXTRA_STEPS = 4
-"""Steps beyond the effort's own while nothing holds, or what does is far below the target."""
+"""Candidates beyond the effort's own, while none holds or the best is far below the target."""
 FAR = 0.25
-"""Excess below the target that counts as far: the file is much larger than it needs to be."""
+"""A candidate this far below the target (log of loss over limit) makes a file much larger than needed."""
 
 
 class MultiplierSearch(ABC, Generic[Product]):
-    """Searches the multiplier whose whole result meets a target with the fewest bytes.
+    """Searches the multiplier whose candidate meets a target with the fewest bytes.
 
     Parameters
     ----------
     rounds : PruneRounds
+        Snapshots to choose from. The search does more rounds if it needs them.
     measure : callable
-        Quality of planes without quantization, where the search starts.
+        Quality of planes without quantization, to find where the search starts.
     effort : Effort
+        How much work to spend.
     on_step : callable, optional
-        Called after each step.
+        Called with each candidate.
     """
 
     pruned_part = PRUNED_PART
-    """Part of the allowed loss that the path goes down to."""
+    """Share of the allowed loss at which the first rounds stop."""
     keeps_best = False
-    """An interrupted search answers with the best so far, where its results take long; otherwise it ends."""
+    """Whether an interrupted search answers with its best candidate so far; for searches whose candidates take long."""
 
     def __init__(
         self,
@@ -70,22 +78,40 @@ class MultiplierSearch(ABC, Generic[Product]):
 
     @abstractmethod
     def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, Product]:
-        """The whole result at a multiplier, measured."""
+        """Make and measure the candidate of a multiplier."""
 
     def _aim(self, multiplier: float, steps: Sequence[Candidate], target: Target) -> float:
-        """A better guess than `multiplier` of where the next whole result should be, for less than the time of one."""
+        """Improve the guess `multiplier` for the next candidate, in less time than a candidate takes."""
         return multiplier
 
     def discard(self, product: Product) -> None:
-        """Let go of what is not the best any more."""
+        """Free a product that is not the best any more."""
         return
 
     def choose(self, costs: RemovalCosts, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
-        """Which rows to keep ([n] bool), and their SH degrees."""
+        """Rows to keep ([n] bool), and their SH degrees ([n] u8)."""
         return choose(costs, self.bits, multiplier)
 
     def run(self, target: Target, best_effort: bool = False) -> RateResult[Product]:
-        """Search; raises `TargetError` with the closest point when nothing holds and `best_effort` is not set."""
+        """Search for the best candidate.
+
+        Parameters
+        ----------
+        target : Target
+            What must hold.
+        best_effort : bool
+            Answer with the closest candidate if none holds.
+
+        Returns
+        -------
+        RateResult
+            The product of the best candidate, and all candidates.
+
+        Raises
+        ------
+        TargetError
+            When no candidate holds and `best_effort` is not set; it names the closest one.
+        """
         steps: list[Candidate] = []
         best: tuple[Candidate, Product] | None = None
         multiplier = self._aim(self._start(target), steps, target)
@@ -122,7 +148,7 @@ class MultiplierSearch(ABC, Generic[Product]):
         return RateResult(product, chosen, chosen.holds, tuple(steps))
 
     def _start(self, target: Target) -> float:
-        """Walk down until pruning alone has used up its part of the target; the multiplier at that cut."""
+        """Prune until pruning alone has used up its share of the target; returns the multiplier of that cut."""
         for _ in range(MOST_ROUNDS):
             last = self.rounds.snapshots[-1]
             if target.limit_bytes is not None:
@@ -138,7 +164,7 @@ class MultiplierSearch(ABC, Generic[Product]):
         return self._cut(self.rounds.snapshots[-1])
 
     def _cut(self, snapshot: Snapshot) -> float:
-        """The multiplier at which a snapshot would lose half a round more."""
+        """The multiplier that would cut a snapshot by half a round more."""
         costs = snapshot.costs.removal[snapshot.costs.weight2 > 0]
         if not len(costs):
             return 1.0
@@ -146,7 +172,7 @@ class MultiplierSearch(ABC, Generic[Product]):
         return max(float(np.quantile(costs, share)) / self.bits.base, 1e-30)
 
     def _snapshot(self, multiplier: float) -> tuple[int, np.ndarray, np.ndarray]:
-        """The first snapshot that this multiplier would not cut by more than a round, and its choice; walks on if needed."""
+        """First snapshot that this multiplier cuts by at most a round: its number, and the choice. Does more rounds if needed."""
         for index in range(MOST_ROUNDS + 1):
             if index == len(self.rounds.snapshots):
                 self.rounds.descend(self.effort.keep)
@@ -157,7 +183,7 @@ class MultiplierSearch(ABC, Generic[Product]):
         return index, keep, degrees
 
     def kept(self, multiplier: float) -> Kept:
-        """What a multiplier keeps."""
+        """The rows that a multiplier keeps."""
         index, keep, degrees = self._snapshot(multiplier)
         snapshot = self.rounds.snapshots[index]
         rows, storage = np.flatnonzero(keep), self.rounds.storage

@@ -1,4 +1,4 @@
-"""The poses that costs are measured from."""
+"""Chooses the scored poses: the training poses that costs are measured from, and how many pixels of each we look at."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.source import SceneSource
 
 FINE_DROP, FINE_FIDELITY, FINE_RATIO = 0.3, 42.0, 30.0
-"""Targets beyond these (dB, dB, times) keep most SH of most Gaussians. These are as many values as a part of the pixels
-has, so colours refitted to a part would fit nothing else. Such targets get all pixels of as many poses as the effort
-takes: docs/results/tuning.md#fine_drop"""
+"""Targets stricter than these (dB, dB, compression ratio) keep most SH of most Gaussians. Colours then have as many values
+as a part of the pixels, and a refit to that part would overfit. So such targets get every pixel of as many poses as the
+effort allows: docs/results/tuning.md#fine_drop"""
 SAMPLE_ROWS = 4096
-"""Gaussians whose positions tell which poses see what."""
+"""Most Gaussians whose positions tell which poses see which part of the scene."""
 
 
 @dataclass(frozen=True)
 class ScoredPoses:
-    """Poses, the most important first.
+    """The scored poses, the most important first.
 
     Parameters
     ----------
     cameras : list of Camera
-        With no more pixels than the scene's Gaussians need.
+        At every pixel, or at as many as the scene's Gaussians need.
     made : int
-        How many of them nobody took (`--views-margin`).
+        How many of them were generated (`--views-margin`).
     """
 
     cameras: list[Camera]
@@ -43,10 +43,21 @@ class ScoredPoses:
 def scored_poses(
     cameras: Sequence[Camera], options: CompressOptions, renderer: Renderer, source: SceneSource
 ) -> ScoredPoses:
-    """As many poses as the effort scores, each next one with the most to add to what those before it see.
+    """Choose as many poses as the effort scores. Each next pose is the one that adds most to what those before it see.
 
-    With `views_margin` made ones come on top (see `with_margin`). A few such poses give costs that are about as good as
-    those from all poses: docs/results/speed.md#scoring-fewer-views
+    With `views_margin`, generated poses come on top (see `with_margin`). A few poses chosen like this give costs about as
+    good as all poses do: docs/results/speed.md#scoring-fewer-views
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        All training poses.
+    options : CompressOptions
+        Effort, target and `views_margin`.
+    renderer : Renderer
+        With nothing loaded.
+    source : SceneSource
+        The original.
     """
     plan = EFFORTS[options.effort]
     order = covering_order(cameras, some_positions(source), renderer.near, plan.views)
@@ -61,13 +72,14 @@ def scored_poses(
 
 
 def some_positions(source: SceneSource) -> np.ndarray:
-    """[3, n] f64, world: positions of `SAMPLE_ROWS` rows at most, evenly spread."""
+    """[3, n] f64, world coordinates of at most `SAMPLE_ROWS` rows, evenly spread over the scene's rows."""
     rows = np.arange(0, source.count, max(-(-source.count // SAMPLE_ROWS), 1))
-    return source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
+    positions: np.ndarray = source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
+    return positions
 
 
 def is_fine(options: CompressOptions, source: SceneSource) -> bool:
-    """Whether the target asks for so little loss that every pixel of the scored poses is needed."""
+    """Whether the target allows so little loss that we need every pixel of the scored poses."""
     ply_bytes = source.count * inria_dtype(source.sh_degree).itemsize
     if options.max_size is not None or options.min_ratio is not None:
         ratio = options.min_ratio if options.max_size is None else ply_bytes / options.max_size

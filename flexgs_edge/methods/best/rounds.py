@@ -1,4 +1,8 @@
-"""One descending path of prune and rescore: removed Gaussians interact, so costs are measured again after each part."""
+"""Pruning in rounds: remove the cheapest Gaussians, measure the costs of the rest again, repeat.
+
+Removed Gaussians interact, so costs that were measured once would mislead. Each round also moves colours a step towards
+the original's renders. Searches start from the snapshots that the rounds leave behind.
+"""
 
 from __future__ import annotations
 
@@ -37,16 +41,16 @@ is slower, four make files larger: docs/results/tuning.md#parts"""
 
 @dataclass
 class Snapshot:
-    """A set of kept Gaussians on the path, with colours refitted to it and costs measured on it.
+    """The Gaussians that are kept after a round, with refitted colours and measured costs.
 
     Attributes
     ----------
     rows : np.ndarray
-        [n] i64, places in the rows that the path began with (`PruneRounds.rows`), ascending.
+        [n] i64, places in the rows that the rounds began with (`PruneRounds.rows`), ascending.
     planes : dict
-        Stored planes of these rows.
+        Stored planes of these rows ([width, n] f32 by field).
     costs : RemovalCosts
-        Of these rows.
+        Costs of these rows.
     """
 
     rows: np.ndarray
@@ -59,13 +63,13 @@ class Snapshot:
         return len(self.rows)
 
     def cheapest(self, count: int) -> np.ndarray:
-        """[n] bool: all but the `count` cheapest to remove of those that some pose sees (ties by row)."""
+        """[n] bool: False for the `count` rows that are cheapest to remove. Rows that no pose sees stay; ties go by row."""
         seen = self.costs.weight2 > 0
         return ~lowest(np.where(seen, self.costs.removal, np.inf), min(count, int(np.count_nonzero(seen))))
 
 
 def lowest(values: np.ndarray, count: int) -> np.ndarray:
-    """[n] bool: the `count` smallest of `values` (all, where there are no more), of equal ones the first."""
+    """[n] bool: True for the `count` smallest of `values` (all, if there are no more). Of equal values the first ones count."""
     if count >= len(values):
         return np.ones(len(values), bool)
     if count <= 0:
@@ -77,30 +81,36 @@ def lowest(values: np.ndarray, count: int) -> np.ndarray:
 
 
 class PruneRounds:
-    """Walks down from the whole scene; `snapshots[-1]` is the smallest set so far, and `unseen` rows were in no scored pose.
+    """Prunes the whole scene round by round; `snapshots` keeps the result of each round, the smallest set last.
+
+    The attribute `unseen` counts the rows that no scored pose sees.
 
     Parameters
     ----------
     bench : Bench
+        Draws the views.
     planes : dict
         Stored planes of the whole scene ([width, N] f32 by field).
     rows : np.ndarray
-        [n] i64, rows of the scene to start from (dead splats left out), in the order that the path keeps.
+        [n] i64, rows of the scene to start from, without dead splats. The rounds keep their order.
     origin : np.ndarray
-        [3] f64.
+        [3] f64, as in `SceneSource`.
     cameras : sequence of Camera
         Scored poses.
     targets : References
-        Empty; the original from these poses is put into it if colours are to be mended.
+        Empty. If colours are refitted, the renders of the original from these poses are put into it.
     refit : bool
-        Mend colours on the way.
+        Refit colours in each round (default).
     unseen : float
-        Share of the Gaussians that no pose sees that stays, the most visible ones from elsewhere first.
+        Share of the Gaussians that no pose sees to keep, 0 to 1 (default: all). Those that are largest and most opaque
+        stay first.
+    progress : Progress
+        Told of each view.
     checkpoint : Checkpoint, optional
-        Keeps every round; rounds that are there are taken from it.
+        Keeps every round. Rounds that it holds already are read instead of computed.
     between : sequence of Camera
-        Further poses that the original is drawn from (targets from `len(cameras)` on): a descent that knew the scored ones alone
-        would fit them at the cost of what lies between.
+        Further poses to draw the original from (references from `len(cameras)` on). A descent that knew only the scored
+        poses would fit these, and get worse between them.
     """
 
     def __init__(
@@ -128,11 +138,11 @@ class PruneRounds:
         if not self._resumed():
             self._begin(planes, unseen)
         first = self.snapshots[0]
-        # What is gone from the first snapshot was seen by no pose.
+        # Rows that the first snapshot lacks were seen by no pose.
         self.unseen = len(rows) - int(np.count_nonzero(first.costs.weight2 > 0))
 
     def _begin(self, planes: dict[str, np.ndarray], unseen: float) -> None:
-        """Measure costs on the whole scene."""
+        """Measure costs on the whole scene, and draw the references."""
         storage, start = self.storage, take_rows(planes, self.rows, self.storage)
         source = MemorySource(start, origin=self.origin)
         sum_bytes_a_row = sum_bytes(2) + moment_bytes(source.sh_degree)
@@ -150,14 +160,14 @@ class PruneRounds:
         self._add(Snapshot(rows, start, costs), keep_views=True)
 
     def scene_rows(self, places: np.ndarray) -> np.ndarray:
-        """[n] i64, rows of the scene, ascending, of places on the path (`Snapshot.rows`)."""
+        """[n] i64, rows of the scene, ascending, from places in `rows` (`Snapshot.rows`)."""
         return np.sort(self.rows[places])
 
     def descend(self, share: float) -> Snapshot:
-        """Keep `share` of the last snapshot, measure costs again in the next part of the poses, and mend colours by one step.
+        """Do a round: keep `share` of the last snapshot, measure costs again, and refit colours by one step.
 
-        One pass gives both, so the costs are those before the step: it moves colours by little, the rest of the change is in the
-        rows that went.
+        The round looks at the next part of the poses. One pass gives both, so the costs are those before the step. This
+        is close enough: most of the change comes from the rows that were removed.
         """
         if self._resumed():
             return self.snapshots[-1]
@@ -176,7 +186,7 @@ class PruneRounds:
         return self._add(Snapshot(self.storage.take(last.rows, keep), planes, costs))
 
     def _add(self, snapshot: Snapshot, keep_views: bool = False) -> Snapshot:
-        """Append a snapshot, and keep it for a later run where that is asked for."""
+        """Append a snapshot, and save it if there is a checkpoint."""
         self.snapshots.append(snapshot)
         if self.checkpoint is not None:
             arrays = [("rows", snapshot.rows), *((f"plane-{name}", values) for name, values in snapshot.planes.items())]
@@ -190,7 +200,7 @@ class PruneRounds:
         return snapshot
 
     def _resumed(self) -> bool:
-        """Take the next snapshot from where an earlier run kept it; False where it did not."""
+        """Read the next snapshot from the checkpoint of an earlier run; False if it holds none."""
         number = len(self.snapshots)
         if self.checkpoint is None or not self.checkpoint.has(number):
             return False
@@ -223,7 +233,7 @@ class PruneRounds:
     def _measure_and_mend(self, scene: DeviceScene, planes: dict[str, np.ndarray], views: Sequence[int]) -> CostParts:
         makers = [cost_sums(self.renderer, scene.sh_degree, first=4), normal_sums(self.renderer)]
         both = ViewSums(self.bench, scene, makers)
-        # Nothing has lost its SH on the path yet.
+        # The rounds drop no SH: only a multiplier does, later.
         degrees = np.full(scene.count, 4, np.uint8)
         try:
             cameras = [self.cameras[view] for view in views]
@@ -240,12 +250,12 @@ class PruneRounds:
 
 
 def sum_row_bytes(sh_degree: int) -> int:
-    """Bytes a row that measuring costs and mending colours in one pass takes on the backend."""
+    """Bytes a row that one pass takes on the backend to measure costs and to refit colours."""
     return sum_bytes(6) + moment_bytes(sh_degree) + normal_bytes(sh_degree)
 
 
 def _hidden(planes: dict[str, np.ndarray], weight2: np.ndarray, share: float) -> np.ndarray:
-    """[n] bool: all but `share` of the rows that no pose sees, by opacity times the area of the two longest axes."""
+    """[n] bool: unseen rows to drop. `share` of them stays: those with the largest opacity times area of the two longest axes."""
     gone = np.zeros(len(weight2), bool)
     unseen = np.flatnonzero(weight2 <= 0)
     if round(share * len(unseen)) == len(unseen):
@@ -257,5 +267,5 @@ def _hidden(planes: dict[str, np.ndarray], weight2: np.ndarray, share: float) ->
 
 
 def take_rows(planes: dict[str, np.ndarray], rows: np.ndarray, storage: Storage = IN_MEMORY) -> dict[str, np.ndarray]:
-    """The planes' columns `rows`, C-contiguous."""
+    """The columns `rows` of the planes, C-contiguous."""
     return {name: storage.take(values, rows) for name, values in planes.items()}

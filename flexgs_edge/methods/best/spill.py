@@ -1,4 +1,8 @@
-"""Where a search by measured costs keeps its scene: in memory, or in scratch files."""
+"""Decides where the method `best` keeps its scene: in memory, or in scratch files.
+
+Before the search starts we estimate how many bytes it holds. If they do not fit into the budget, its large arrays go to
+scratch files. The output has the same bytes either way, but the search takes longer.
+"""
 
 from __future__ import annotations
 
@@ -36,24 +40,24 @@ from flexgs_edge.units import format_size
 LOG = logging.getLogger("flexgs_edge")
 
 COST_BYTES = 16
-"""Costs of a row and snapshot beside those of its SH: removal and weight, in double precision."""
+"""Bytes of a row's costs in a snapshot, without those of SH: removal and weight, in double precision."""
 BAND_BYTES = 20
-"""The same for each SH degree: a cost in double precision, a mean colour."""
+"""Bytes of a row's costs in a snapshot for each SH degree: a cost in double precision, and a mean colour."""
 WORK_PLANES = 11
-"""What a whole result holds for a moment, in planes of its rows (at degree 3, of 236 bytes): the rows without what was dropped,
-codes, values of codes twice, colours of the last refit and of this one, and sums of the refit twice. With fewer, a
-scene of which nearly all rows stay goes over its limit: docs/results/tuning.md#work_planes"""
+"""Copies of its rows' planes (236 bytes a row at degree 3) that making a candidate holds for a moment. These are rows, codes,
+twice the values of codes, colours of the last refit and of this one, and twice the sums of the refit. With a
+smaller number, a scene of which nearly all rows stay would exceed its limit: docs/results/tuning.md#work_planes"""
 DESCENTS = 3
-"""Times the scene's stored planes that the values of all descents take. A strict target keeps more rows and needs fewer
+"""Copies of the scene's stored planes that the values of all descents take. A strict target keeps more rows and needs fewer
 candidates: docs/results/tuning.md#descents"""
 SPILLED_ROW_BYTES = 24
-"""Bytes that each row of a scene in scratch files takes of memory for a moment: choosing the cheapest rows, and lists of rows."""
+"""Bytes of memory that each row of a scene in scratch files still takes for a moment: for choosing rows, and lists of rows."""
 SPOOL_ROW_BYTES = 52
-"""Bytes that each row that a view shows takes of the scratch file for its sums (`ViewSums`)."""
+"""Bytes of the scratch file of sums (`ViewSums`) for each row that a view shows."""
 
 
 def prepare_memory(run: Run[CompressOptions]) -> None:
-    """Have freed memory returned, where the path of a search is not going to fit: to be called before the device is opened."""
+    """Have freed memory returned if the search will not fit into memory. Call this before the device is opened."""
     source, options, budget = run.source, run.options, run.budget
     rows = source.count
     if options.method == "best" and rows * row_bytes(source.sh_degree, EFFORTS[options.effort].keep) > budget.free:
@@ -61,10 +65,16 @@ def prepare_memory(run: Run[CompressOptions]) -> None:
 
 
 def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera], folder: Path) -> Storage:
-    """Memory, where the scene and the path of its search fit, else scratch files; says which, and how much they may take.
+    """Memory if the scene and its search fit, else scratch files; logs where these go and how large they may get.
 
     Parameters
     ----------
+    run : Run
+        Planned, with a scene.
+    renderer : Renderer
+        With nothing loaded.
+    scored : sequence of Camera
+        The scored poses.
     folder : path
         For scratch files.
 
@@ -87,11 +97,11 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
         READING_BYTES + SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest),
     )
     storage = ScratchStorage(folder, budget.limit)
-    budget.take("reading scratch files", READING_BYTES)  # as long as the process lives
+    budget.take("reading scratch files", READING_BYTES)  # until the process ends
     renderer.largest = largest
     spooled = SPOOL_ROW_BYTES * rows * len(scored) + renderer.fit.ahead * AHEAD_ROW_BYTES * rows
     LOG.info(
-        "%d Gaussians and the path of their search need %s in memory, %s are free: they go to scratch files in %s "
+        "%d Gaussians and the rounds of their search need %s in memory, %s are free: they go to scratch files in %s "
         "(at most about %s; --scratch names another folder), %d rows at a time; %d bytes of each Gaussian and views of the "
         "Gaussians that they show stay in memory; %d passes over %d poses",
         rows, format_size(size + least), format_size(budget.free), storage.folder, format_size(whole + spooled),
@@ -103,20 +113,20 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
 def needed_bytes(
     renderer: Renderer, source: SceneSource, scored: Sequence[Camera], options: CompressOptions
 ) -> tuple[int, int]:
-    """Bytes that a search in memory holds, and that drawing needs beside them at the least."""
+    """Bytes that a search in memory holds, and the least bytes that drawing needs beside them."""
     size, sums = (
         source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep),
         sum_row_bytes(source.sh_degree),
     )
     if distil_steps(options, len(scored)):
-        # A descent holds what is kept, with all that it remembers, at once: as much as the whole scene at the most.
+        # A descent holds all kept rows at once, with their gradients. That is the whole scene at most.
         sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))
         size += source.count * DESCENTS * stored_bytes(source.sh_degree)
     return size, _least_bytes(renderer, source, largest_of(scored), sums)
 
 
 def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:
-    """Bytes that the first view of a search in scratch files needs; one that shows more rows than expected needs more."""
+    """Bytes that the first view of a search in scratch files needs. A view that shows more rows than expected needs more."""
     fit, size = renderer.fit, view_size(renderer.backend, largest)
     rows, shown = padded(min(fit.compact_rows, source.count)), -(-source.count // fit.first_share)
     chunk = rows * streamed_bytes(source.sh_degree) + shapes_bytes(chunk_shapes(rows))
@@ -124,7 +134,7 @@ def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> i
 
 
 def _least_bytes(renderer: Renderer, source: SceneSource, camera: Camera, sum_bytes: int) -> int:
-    """Bytes that a view of `source` with targets and sums of `sum_bytes` a row needs at the least, nothing being loaded."""
+    """Least bytes that a view of `source` needs, with its reference and sums of `sum_bytes` a row; nothing is loaded yet."""
     chunk = padded(min(renderer.fit.least_rows, source.count)) * streamed_bytes(source.sh_degree)
     size = view_size(renderer.backend, camera)
     return view_bytes(size, source.count) + target_bytes(size) + sum_bytes * source.count + chunk
@@ -136,10 +146,10 @@ def stored_bytes(sh_degree: int) -> int:
 
 
 def row_bytes(sh_degree: int, keep: float) -> int:
-    """Bytes that a search holds for each row of its scene, at most, beside what the renderer counts.
+    """Most bytes that a search holds for each row of its scene, beside those that the renderer counts.
 
-    Either snapshots down to nothing, each `keep` of the one before; or, when nearly all is kept, one of them and all that a
-    whole result of it needs. What lies between is between.
+    The larger of two extremes counts. Either the rounds go down to nothing, each keeping `keep` of the one before. Or
+    nearly all rows stay: then there is one snapshot, and a candidate made of it. All other searches need less.
     """
     planes = stored_bytes(sh_degree)
     snapshot = planes + COST_BYTES + BAND_BYTES * sh_degree

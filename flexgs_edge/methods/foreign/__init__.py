@@ -1,1 +1,1 @@
-"""Compression into other programs' formats."""
+"""Compression into formats of other programs: `.spz`, `.sog`, `.compressed.ply`."""

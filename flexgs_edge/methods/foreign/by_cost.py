@@ -1,4 +1,8 @@
-"""Files of other formats by measured costs: the rounds of `best`, colours refitted to what the format makes of geometry."""
+"""Files of other formats by measured costs, for `--method best`.
+
+Pruning goes in the rounds of `best`. Each candidate is a file that is written and read back. Colours are refitted to the
+geometry as the format decodes it.
+"""
 
 from __future__ import annotations
 
@@ -30,10 +34,19 @@ class FileSearch(MultiplierSearch[WrittenFile]):
 
     Parameters
     ----------
+    rounds : PruneRounds
+        Snapshots to choose from.
     files : FileMaker
-        Writes and measures.
+        Writes, reads back and measures.
+    measure : callable
+        Quality of planes without quantization.
+    effort : Effort
+        How much work to spend.
     refit : bool
-        Refit colours to the decoded geometry, and their constant to the decoded SH.
+        Refit colours to the decoded geometry, and their constant to the decoded SH (default). This writes two more files
+        for each candidate.
+    on_step : callable, optional
+        Called with each candidate.
     """
 
     def __init__(
@@ -50,7 +63,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         self.bits = bit_model(files.format, len(rounds.snapshots[0].costs.sh))
 
     def choose(self, costs: RemovalCosts, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
-        """See `MultiplierSearch`; one degree for all where the format has no other way."""
+        """See `MultiplierSearch`. If a format has only one SH degree for all Gaussians, so has the choice."""
         if self.files.format.one_degree:
             return choose_one_degree(costs, self.bits, multiplier)
         return super().choose(costs, multiplier)
@@ -72,7 +85,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         return Candidate(multiplier, file.count, file.sh_count, file.size, file.measurement, excess, seconds), file
 
     def _finish(self, planes: dict[str, np.ndarray], degrees: np.ndarray) -> WrittenFile:
-        """All colours refitted to the decoded geometry, then the constant to the decoded SH; geometry goes in as it was."""
+        """Refit all colours to the decoded geometry, then the constant to the decoded SH. Geometry is written as it was."""
         rounds = self.rounds
         if not self.refit:
             return self.files.make(MemorySource(planes, origin=rounds.origin))
@@ -114,13 +127,13 @@ def _put(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def bit_model(format: Format, sh_degree: int) -> BitModel:
-    """What a Gaussian costs in a format, SH's part shared among its coefficients."""
+    """Bits of a Gaussian in a format; those of SH are shared equally among their coefficients."""
     each = 8 * format.sh_bytes / sh_rest_count(3)
     bands = tuple((2 * level + 1) * each for level in range(1, sh_degree + 1))
     return BitModel(8 * (format.row_bytes - format.sh_bytes), bands)
 
 
 def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[WrittenFile]:
-    """Searches for a file of another program's format."""
+    """Make searches for a file of another program's format."""
     plan = EFFORTS[options.effort]
     return lambda rounds, measure, report: FileSearch(rounds, files, measure, plan, options.refit, report)

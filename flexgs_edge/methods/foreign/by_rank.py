@@ -1,4 +1,4 @@
-"""Files of other formats by rank order: a line of prune rates."""
+"""Files of other formats by rank order, for `--method paper`: a search along the prune rate."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import SceneSource
 
 SH_A_PRUNE = {".spz": 0.5, ".sog": 1.5}
-"""SH rate for each unit of the prune rate: larger where SH take more of the bytes, since pruning loses more than
-dropping SH. Formats in which only the scene's degree counts have none: docs/results/tuning.md#sh_a_prune"""
+"""SH rate divided by prune rate. It is larger where SH take more of the bytes, because pruning loses more quality than
+dropping SH. Formats with one SH degree for all Gaussians have none: docs/results/tuning.md#sh_a_prune"""
 
 
 def search_pruned_files(
@@ -33,16 +33,24 @@ def search_pruned_files(
     options: CompressOptions,
     on_step: Callable[[Step], None] | None = None,
 ) -> tuple[WrittenFile, SearchResult]:
-    """The file that meets a target by pruning in rank order, along one line (or one for each SH degree).
+    """Search for the file that meets a target by pruning in rank order.
+
+    The search goes along the prune rate: once, or once for each SH degree if the format has one degree for all Gaussians.
 
     Parameters
     ----------
+    files : FileMaker
+        Writes, reads back and measures.
     source : SceneSource
         The original.
     order : np.ndarray
         [N] i64, least important row first.
     target : Target or None
         `None` for fixed rates.
+    options : CompressOptions
+        Effort, fixed rates and `best_effort`.
+    on_step : callable, optional
+        Called with each step.
 
     Raises
     ------
@@ -64,7 +72,7 @@ def search_pruned_files(
 
 
 class _PrunedFiles:
-    """Files of a scene pruned by rank; the best so far stays, the others go."""
+    """Makes files of a scene pruned by rank. Keeps the best one so far and removes the others."""
 
     def __init__(
         self,
@@ -86,7 +94,7 @@ class _PrunedFiles:
         keeps_sh = np.zeros(self.source.count, bool)
         keeps_sh[with_sh] = True
         rows = np.sort(np.concatenate([with_sh, without]))
-        # Along a curve bytes repeat, so .spz files are smaller.
+        # Neighbours along the curve have similar bytes, so .spz files get smaller.
         rows = rows[near_order(self.source.select(rows))]
         file = self.files.make(TrimmedSource(self.source.select(rows), keeps_sh[rows], degree if with_sh.size else 0))
         excess = 0.0 if self.target is None else self.target.excess(file.size, file.measurement)
@@ -112,7 +120,7 @@ class _PrunedFiles:
         search_line(lambda prune: self.measure(self.choice(prune, degree), degree), self.target, start, steps, known)
 
     def by_degrees(self, steps: int) -> None:
-        """A line for each SH degree that may give the answer: few rows with many SH, or many rows with few."""
+        """Search once for each SH degree that may win: few rows with many SH, or many rows with few SH."""
         assert self.target is not None
         top = self.source.sh_degree
         if self.target.limit_bytes is not None:
@@ -126,7 +134,7 @@ class _PrunedFiles:
             if whole.holds:
                 self.line(degree, steps, [whole])
                 break
-        # A degree more takes more bytes a row: it can only win if it holds at the prune rate of equal bytes.
+        # A higher degree takes more bytes a row. It can only win if it holds at the prune rate of equal bytes.
         for more in range(degree + 1, top + 1):
             assert self.best is not None
             LOG.info("SH up to degree %d:", more)

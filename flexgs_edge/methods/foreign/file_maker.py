@@ -1,4 +1,7 @@
-"""Written files of other formats: made, read back, measured, and the best one kept."""
+"""Writes candidate files of other formats, reads them back and measures them.
+
+Other programs define these bytes, so only a written file tells its size and quality.
+"""
 
 from __future__ import annotations
 
@@ -33,16 +36,20 @@ LOG = logging.getLogger("flexgs_edge")
 
 @dataclass(frozen=True)
 class WrittenFile:
-    """A finished file and what it decodes to.
+    """A finished file, and the size and quality of the scene that it decodes to.
 
     Parameters
     ----------
     path : Path
+        Where it lies.
     size : int
         Bytes.
-    count, sh_count : int
-        Gaussians, and of these with SH as they went in (codebooks of `.sog` have no exact zero).
+    count : int
+        Gaussians.
+    sh_count : int
+        Gaussians that had SH when they were written. (After decoding nobody knows: codebooks of `.sog` have no exact zero.)
     sh_degree : int
+        SH degree of the decoded scene.
     measurement : Measurement or None
         Quality of the decoded file (`None` without views).
     """
@@ -63,7 +70,7 @@ def open_files(
     bench: Bench | None = None,
     judges: Judges | None = None,
 ) -> Iterator[FileMaker]:
-    """A folder for files beside `output` (in a dry run: where TMPDIR says), gone when the block ends."""
+    """A `FileMaker` with a folder beside `output` (in a dry run: in TMPDIR), which is removed when the block ends."""
     beside = None if output is None else check_writable(output, run.options.force).parent
     renderer, judge = None if bench is None else bench.renderer, None if judges is None else judges.decide
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=beside) as folder:
@@ -75,8 +82,12 @@ class FileMaker:
 
     Parameters
     ----------
+    format : Format
+        What to write.
     folder : Path
         For the files.
+    budget : MemoryBudget
+        The converter's memory is taken from it.
     renderer, judge : Renderer, Judge or None
         `None`: nothing is measured.
     """
@@ -89,7 +100,7 @@ class FileMaker:
         self._made = 0
 
     def make(self, source: SceneSource) -> WrittenFile:
-        """The file of `source`, measured on what it decodes to."""
+        """Write the file of `source` and measure the scene that it decodes to."""
         path, found = self.write(source)
         measurement = None
         if self._renderer is not None and self._judge is not None:
@@ -99,7 +110,7 @@ class FileMaker:
         return WrittenFile(path, path.stat().st_size, found.count, sh_count, found.sh_degree, measurement)
 
     def write(self, source: SceneSource) -> tuple[Path, SceneSource]:
-        """A new file of `source`, and what it decodes to."""
+        """Write a new file of `source`; returns its path and the decoded scene."""
         self._made += 1
         path = self.folder / f"{self._made}{self.format.suffix}"
         with self._converting(source.count):
@@ -113,7 +124,7 @@ class FileMaker:
 
     @contextmanager
     def _converting(self, count: int) -> Iterator[None]:
-        """The converter's memory, taken while the block lasts."""
+        """Take the converter's memory from the budget while the block lasts."""
         size = converter_bytes(self.format, count)
         self._budget.take("the converter", size)
         try:
@@ -123,5 +134,5 @@ class FileMaker:
 
 
 def publish(file: WrittenFile, output: Path, force: bool) -> None:
-    """Give a file its name."""
+    """Move a finished file to `output`."""
     os.replace(file.path, check_writable(output, force))

@@ -1,4 +1,4 @@
-"""Scenes with a lower SH degree than they came with."""
+"""Scenes with their SH cut to a lower degree."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class TrimmedSource(SceneSource):
 
 
 def lower_degree(sh_rest: np.ndarray, degree: int) -> np.ndarray:
-    """[3 K', n] SH up to `degree` from [3 K, n]: both channel by channel.
+    """[3 K', n] SH up to `degree` from [3 K, n] SH. Both lie channel by channel.
 
     >>> lower_degree(np.arange(24.0).reshape(24, 1), 1).ravel().tolist()
     [0.0, 1.0, 2.0, 8.0, 9.0, 10.0, 16.0, 17.0, 18.0]

@@ -1,4 +1,4 @@
-"""The method for other programs' formats: every step writes a file, reads it back and measures it."""
+"""Compression into formats of other programs: every step writes a file, reads it back and measures it."""
 
 from __future__ import annotations
 
@@ -41,11 +41,13 @@ def compress(
     Parameters
     ----------
     run : Run
-        Planned; its method says whether files are searched by measured costs (`best`) or in rank order (`paper`).
+        Planned. Its method decides: `best` searches by measured costs, `paper` prunes in rank order.
     bench : Bench or None
-        Draws; `None` for runs without views, whose rates are fixed.
+        Draws the views; `None` for runs without views, whose rates are fixed.
     output : Path or None
-        `None` in a dry run.
+        The file to write; `None` in a dry run.
+    format : Format
+        The format to write.
     scores : np.ndarray or None
         [N] f64 from a file, for `paper`.
     """
@@ -95,5 +97,5 @@ def compress(
 
 
 def _said(target: Target | None) -> Callable[[Step], None]:
-    """Says each step of a search."""
+    """A function that logs each step of a search."""
     return lambda step: LOG.info("%s", step_words(step, target))

@@ -1,1 +1,1 @@
-"""The method of FlexGaussian (ACM MM 2025): ADP, MPQ and FOA."""
+"""The method of FlexGaussian (ACM MM 2025): pruning by score (ADP), mixed-precision quantization (MPQ) and search (FOA)."""

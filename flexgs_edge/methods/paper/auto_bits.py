@@ -1,4 +1,4 @@
-"""`--bits auto`: the paper's sensitivity search on a real scene."""
+"""`--bits auto`: finds bits for each attribute by the paper's sensitivity search on the scene itself."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from flexgs_edge.views.bench import Bench
 LOG = logging.getLogger("flexgs_edge")
 
 SENSITIVITY_VIEWS = 8
-"""Training poses that it measures on, evenly spread."""
+"""Most training poses that sensitivity is measured on, evenly spread."""
 
 
 def bits_by_sensitivity(
     evaluator: SceneEvaluator, run: Run[CompressOptions], bench: Bench
 ) -> tuple[BitSpec, list[Sensitivity]]:
-    """The bits, and what was measured, with nothing pruned."""
+    """Search for the bits with nothing pruned; returns them and the measured sensitivities."""
     renderer, source, views, base_psnr = bench.renderer, evaluator.source, run.seen, run.options.base_psnr
     count = min(SENSITIVITY_VIEWS, len(views.train))
     indices = [views.train[i * len(views.train) // count] for i in range(count)]

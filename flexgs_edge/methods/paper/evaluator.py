@@ -1,9 +1,10 @@
-"""What the search asks of a real scene: exact bytes of a choice, and its measured quality."""
+"""Answers the questions of the search for a real scene: exact bytes of a choice, and its measured quality."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,16 +15,16 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows
 from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.packed.quantize import QuantizedScene, quantize_scene, quantized_bytes
-from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import SceneSource
 
 QUANTIZE_COPIES = 4
-"""Times a chunk's planes that quantizing holds at once: as read, gathered, and the codes in between."""
+"""Copies of a chunk's planes that quantizing holds at once: as read, gathered, and codes in between."""
 
 
-class SceneEvaluator:
-    """Prunes by rank, quantizes, and asks the judge; see `flexgs_edge.goals.Evaluator`.
+@dataclass(frozen=True)
+class Ranked:
+    """A scene and the order in which its rows are pruned.
 
     Parameters
     ----------
@@ -33,40 +34,45 @@ class SceneEvaluator:
         [N] i64, least important row first.
     has_sh : np.ndarray
         [N] bool, rows with SH that are not zero.
+    """
+
+    source: SceneSource
+    order: np.ndarray
+    has_sh: np.ndarray
+
+
+class SceneEvaluator:
+    """Prunes by rank, quantizes, and asks the judge; see `flexgs_edge.goals.Evaluator`.
+
+    Parameters
+    ----------
+    ranked : Ranked
+        The scene.
     bits : BitSpec
         Bits per code.
     groups : int or None
         As for `quantize_scene`.
-    renderer : Renderer
-        Draws the quantized scene.
     judge : Judge or None
-        `None`: `measure` cannot be asked.
+        Draws and compares. Without one, `measure` and `estimate` fail.
+    budget : MemoryBudget
+        The quantized scene is taken from it.
     """
 
     def __init__(
-        self,
-        source: SceneSource,
-        order: np.ndarray,
-        has_sh: np.ndarray,
-        bits: BitSpec,
-        groups: int | None,
-        renderer: Renderer | None,
-        judge: Judge | None,
-        budget: MemoryBudget,
+        self, ranked: Ranked, bits: BitSpec, groups: int | None, judge: Judge | None, budget: MemoryBudget
     ) -> None:
-        self.source = source
+        self.source = ranked.source
         self.bits = bits
         self.groups = groups
-        self.renderer = renderer
         self.judge = judge
         self.budget = budget
-        self._ranks = ranks_from_order(order)
-        self._has_sh = has_sh
-        # SH rows of rank r and above, so that sizes cost nothing: the search asks for hundreds.
-        self._sh_above = np.concatenate([np.cumsum(has_sh[order][::-1])[::-1], [0]])
+        self._ranks = ranks_from_order(ranked.order)
+        self._has_sh = ranked.has_sh
+        # Number of SH rows from each rank up. With it sizes cost nothing, and the search asks for hundreds of sizes.
+        self._sh_above = np.concatenate([np.cumsum(ranked.has_sh[ranked.order][::-1])[::-1], [0]])
 
     def counts(self, choice: Choice) -> tuple[int, int]:
-        """Rows that stay, and of these with SH."""
+        """Number of rows that stay, and number of these that keep SH."""
         kept = self.source.count - choice.pruned(self.source.count)
         return kept, int(self._sh_above[choice.boundary(self.source.count)])
 
@@ -77,14 +83,14 @@ class SceneEvaluator:
 
     def measure(self, choice: Choice) -> Measurement:
         """Prune, quantize, dequantize, render and compare."""
-        assert self.renderer is not None and self.judge is not None
-        with self.quantized(choice) as quantized, self.renderer.load_quantized(quantized) as scene:
+        assert self.judge is not None
+        with self.quantized(choice) as quantized, self.judge.renderer.load_quantized(quantized) as scene:
             return measurement_of(self.judge.compare(scene))
 
     def estimate(self, choice: Choice) -> Measurement:
-        """`measure` at a fourth of the pixels."""
-        assert self.renderer is not None and self.judge is not None
-        with self.quantized(choice) as quantized, self.renderer.load_quantized(quantized) as scene:
+        """As `measure`, from a fourth of the pixels."""
+        assert self.judge is not None
+        with self.quantized(choice) as quantized, self.judge.renderer.load_quantized(quantized) as scene:
             return measurement_of(self.judge.estimate(scene))
 
     @contextmanager

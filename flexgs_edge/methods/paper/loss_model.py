@@ -1,4 +1,7 @@
-"""A local model of the search's excess: linear in the two rates, fitted to the points measured so far."""
+"""A local model of the excess, linear in prune rate and SH rate.
+
+It is fitted to the points measured so far and tells the search which point is worth measuring next.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,17 @@ from dataclasses import dataclass
 from flexgs_edge.goals.choice import Choice
 
 PRIOR_SLOPES = (5.0, 2.0)
-"""Excess (log of the loss over its limit) per unit of p and of s before anything is measured:
+"""Excess (log of loss over limit) for each unit of prune rate and SH rate, before anything is measured:
 docs/results/tuning.md#prior_slopes"""
 PRIOR_WEIGHT = 1e-3
-"""Weight of the prior slopes against one measured point at the limit: decides only where points do not."""
+"""Weight of the prior slopes, in measured points at the limit. They decide only where points leave a slope open."""
 WIDTH = 0.5
-"""Excess at which a measured point weighs 1/e of one at the limit: the model need only be right near the limit."""
+"""Excess at which a measured point weighs 1/e of one at the limit, because the model need only be right near the limit."""
 
 
 @dataclass(frozen=True)
 class LossModel:
-    """excess = constant + prune * p + sh * s, with p and s in 0..1."""
+    """excess = constant + prune * p + sh * s, with prune rate p and SH rate s in 0..1."""
 
     constant: float
     prune: float
@@ -26,9 +29,9 @@ class LossModel:
 
     @classmethod
     def fit(cls, points: list[tuple[Choice, float]]) -> LossModel:
-        """Weighted least squares through `points`, held to the prior slopes where they leave a direction open.
+        """Fit `points` by weighted least squares; the prior slopes decide where points leave a direction open.
 
-        Slopes are kept at or above zero: more compression is never expected to gain quality.
+        Slopes stay at or above zero, because more compression never gains quality.
         """
         rows = [(c.prune / 1000.0, c.sh / 1000.0, e, math.exp(-min(abs(e) / WIDTH, 6.0))) for c, e in points]
         weight = math.fsum(w for *_, w in rows)

@@ -1,4 +1,7 @@
-"""The method of FlexGaussian: score, rank, search over prune and SH rates, write, and measure what was written."""
+"""`--method paper`, the method of FlexGaussian: score, rank, search over prune rate and SH rate, write, measure.
+
+It takes less time than `best` and makes larger files.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from flexgs_edge.codec.v1.packed_source import FgsSource
 from flexgs_edge.files import temporary_name
 from flexgs_edge.goals.steps import SearchResult, step_words
 from flexgs_edge.methods.paper.auto_bits import bits_by_sensitivity
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.methods.paper.score_cache import ScoreCache
 from flexgs_edge.methods.paper.score_files import load_scores, save_scores
@@ -38,7 +41,15 @@ LOG = logging.getLogger("flexgs_edge")
 
 @dataclass(frozen=True)
 class Ranking:
-    """The rows of a scene, least important first ([N] i64), and whether their scores came from the cache."""
+    """The order in which rows are pruned.
+
+    Parameters
+    ----------
+    order : np.ndarray
+        [N] i64, rows of the scene, least important first.
+    reused : bool
+        Whether their scores came from the cache.
+    """
 
     order: np.ndarray
     reused: bool = False
@@ -54,19 +65,19 @@ def compress(
     run : Run
         Planned.
     bench : Bench or None
-        Draws; `None` for runs without views, whose rates are fixed.
+        Draws the views; `None` for runs without views, whose rates are fixed.
     output : Path or None
-        `None` in a dry run.
+        The file to write; `None` in a dry run.
     scores : np.ndarray or None
-        [N] f64 from a file (see `given_scores`); otherwise they are computed where they are needed.
+        [N] f64 from a file (see `given_scores`). By default they are computed if the run needs them.
     """
     with nullcontext() if bench is None else Judges(run, bench) as judges:
         ranking = rank(run, judges, bench, scores)
         with run.clock.stage("open"):
             has_sh = nonzero_sh(run.source)
         bits, groups = run.options.bit_spec()
-        renderer, decide = (None, None) if bench is None or judges is None else (bench.renderer, judges.decide)
-        evaluator = SceneEvaluator(run.source, ranking.order, has_sh, PAPER, groups, renderer, decide, run.budget)
+        ranked = Ranked(run.source, ranking.order, has_sh)
+        evaluator = SceneEvaluator(ranked, PAPER, groups, None if judges is None else judges.decide, run.budget)
         sensitivity: list[Sensitivity] = []
         if bits is None:
             assert bench is not None
@@ -98,7 +109,7 @@ def compress(
 
 
 def given_scores(run: Run[CompressOptions]) -> np.ndarray | None:
-    """[N] f64 from the file that `--score` names, or `None`: read before any work, as it must fit the scene."""
+    """[N] f64 from the file that `--score` names, or `None`. It is read before any work, because it may not fit the scene."""
     assert run.plan is not None
     if run.plan.computes_scores or not run.plan.needs_scores:
         return None
@@ -108,7 +119,7 @@ def given_scores(run: Run[CompressOptions]) -> np.ndarray | None:
 def rank(
     run: Run[CompressOptions], judges: Judges | None, bench: Bench | None, scores: np.ndarray | None = None
 ) -> Ranking:
-    """Draw the references, score every Gaussian where nobody did, and keep the scores where that is asked for."""
+    """Draw the references, score every Gaussian unless scores are given, and save the scores if asked to."""
     assert run.plan is not None
     cache = _score_cache(run)
     reused = False
@@ -132,7 +143,7 @@ def rank(
 
 
 def _score_cache(run: Run[CompressOptions]) -> ScoreCache | None:
-    """The file of kept scores, for what is scored in this run."""
+    """The cache of `--score-cache`, with the fingerprint of this run; `None` if nothing is to be cached."""
     options = run.options
     assert run.plan is not None
     if options.score_cache is None or not run.plan.computes_scores:
@@ -163,7 +174,7 @@ def _write(
     search: SearchResult | None,
     judges: Judges | None,
 ) -> Quality | None:
-    """Write the file under another name, measure what it decodes to, and only then give it its name."""
+    """Write the file under a temporary name, measure the decoded scene, and only then give the file its name."""
     settings = make_settings(run, search, quantized.bits)
     if output is None:
         if run.reporter is not None:

@@ -1,7 +1,7 @@
-"""ADP, attribute-discriminative pruning: which rows go, and which rows keep everything but their SH.
+"""Attribute-discriminative pruning (ADP): some rows are removed, others lose only their SH.
 
-Source: FlexGaussian (ACM MM 2025), section on ADP. Rates are integers in thousandths of N, so that the same choice
-means the same rows everywhere.
+Source: FlexGaussian (ACM MM 2025), section on ADP. Rates are integers in thousandths of N, so that one choice means the
+same rows on every machine.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def order_from_scores(scores: np.ndarray) -> np.ndarray:
     Raises
     ------
     InputError
-        When a score is NaN: its place would depend on the sort.
+        When a score is NaN, because its place would depend on the sort.
     """
     scores = np.asarray(scores, np.float64)
     if scores.ndim != 1:
@@ -45,7 +45,7 @@ def order_from_scores(scores: np.ndarray) -> np.ndarray:
 
 
 def ranks_from_order(order: np.ndarray) -> np.ndarray:
-    """[N] i64 rank of every row (0 is the least important): the inverse of `order_from_scores`' permutation."""
+    """[N] i64, rank of every row (0 is the least important): the inverse of the permutation `order`."""
     ranks = np.empty(len(order), np.int64)
     ranks[order] = np.arange(len(order), dtype=np.int64)
     return ranks
@@ -54,8 +54,8 @@ def ranks_from_order(order: np.ndarray) -> np.ndarray:
 def select_rows(ranks: np.ndarray, choice: Choice, has_sh: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Rows that stay, in two blocks, each in input order.
 
-    The rates count over all N rows, as in the paper: the `choice.pruned(N)` lowest ranks go, ranks up to
-    `choice.boundary(N)` lose their SH. A kept row whose SH are all zero joins the SH-less block wherever its rank is;
+    Rates count over all N rows, as in the paper. The `choice.pruned(N)` lowest ranks are removed, and ranks up to
+    `choice.boundary(N)` lose their SH. A kept row whose SH are all zero joins the block without SH, whatever its rank;
     it takes no other row's place there.
 
     Parameters

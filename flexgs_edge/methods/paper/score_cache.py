@@ -1,4 +1,4 @@
-"""Scores kept between runs, and taken again only for the same scene, poses and kind of score."""
+"""`--score-cache`: keeps scores between runs and reuses them only for the same scene, poses and kind of score."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ class ScoreCache:
     Parameters
     ----------
     path : path
-        Made by `save`; need not exist.
+        Made by `save`. It need not exist.
     fingerprint : str
-        Of what is to be scored.
+        Of the scene, poses and kind of score.
     """
 
     def __init__(self, path: str | Path, fingerprint: str) -> None:
         self.path, self.fingerprint = Path(path), fingerprint
 
     def load(self, count: int) -> np.ndarray | None:
-        """[count] f64, or `None` where there is no file yet or it is of something else.
+        """[count] f64, or `None` if there is no file yet or its fingerprint differs.
 
         Raises
         ------
         InputError
-            When the file holds no scores that `save` wrote: it would be overwritten.
+            When `save` did not write the file, because the run would overwrite it.
         """
         try:
             with open(self.path, "rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -48,6 +48,6 @@ class ScoreCache:
         return scores if same else None
 
     def save(self, scores: np.ndarray) -> None:
-        """Write, in place of what was there."""
+        """Write the scores ([N] f64); an old file is replaced."""
         with atomic_write(self.path, force=True) as file:
             np.savez(file, fingerprint=np.array(self.fingerprint), scores=scores)

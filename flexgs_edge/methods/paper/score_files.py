@@ -1,4 +1,4 @@
-"""Scores kept in NumPy files, so that another target takes one search and no scoring."""
+"""Reads and writes scores in NumPy files, so that a run with another target need not score again."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def load_scores(path: str | Path, count: int) -> np.ndarray:
     Raises
     ------
     InputError
-        Naming what was found when it is not one array of `count` numbers without NaN (+inf is refused too; -inf, "never
-        seen", is allowed).
+        When the file is not one array of `count` numbers without NaN and +inf (-inf means "never seen" and is allowed).
+        The message names what was found.
     """
     path = Path(path)
     try:
-        # Opened here: np.load would leave a broken archive open.
+        # We open the file, because np.load would leave a broken archive open.
         with open(path, "rb") as file:
             loaded = np.load(file, allow_pickle=False)
             if isinstance(loaded, np.lib.npyio.NpzFile):
@@ -45,7 +45,7 @@ def load_scores(path: str | Path, count: int) -> np.ndarray:
         raise InputError(
             f"{path}: expected {count} numbers, one a Gaussian of the scene; found shape {loaded.shape}, dtype {loaded.dtype}"
         )
-    scores = loaded.astype(np.float64)
+    scores: np.ndarray = loaded.astype(np.float64)
     bad = np.flatnonzero(np.isnan(scores) | (scores == np.inf))
     if len(bad):
         raise InputError(
@@ -55,6 +55,6 @@ def load_scores(path: str | Path, count: int) -> np.ndarray:
 
 
 def save_scores(path: str | Path, scores: np.ndarray, force: bool = False) -> None:
-    """Write scores ([N] f64) as `.npy`, through a temporary file."""
+    """Write scores ([N] f64) as `.npy`; the file appears whole or not at all."""
     with atomic_write(Path(path), force) as file:
         np.save(file, scores)

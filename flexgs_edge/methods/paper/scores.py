@@ -1,4 +1,4 @@
-"""The scores of FlexGaussian (LightGaussian's global significance) and MesonGS, from statistics over the training poses."""
+"""Scores Gaussians from hits and weights over the training poses, as FlexGaussian (`gs`) or MesonGS (`meson`) does."""
 
 from __future__ import annotations
 
@@ -28,18 +28,23 @@ def score_scene(
     kind: str = "gs",
     progress: Progress = SILENT,
 ) -> np.ndarray:
-    """Importance of every Gaussian, as a logarithm: only the order matters, and tiny volumes cannot underflow.
+    """Log of the importance of every Gaussian. Only the order matters, and a log cannot underflow for tiny volumes.
 
     Parameters
     ----------
-    renderer, scene : Renderer, DeviceScene
-        `scene` holds `source`.
+    renderer : Renderer
+        Draws the views.
+    scene : DeviceScene
+        Loaded from `source`.
     source : SceneSource
         Read again for opacities and volumes, `ROWS` rows at a time.
     cameras : sequence of Camera
         The training poses.
     kind : {"gs", "meson"}
         `gs`: opacity * volume^0.1 * hits (LightGaussian, FlexGaussian). `meson`: volume^0.1 * sum(alpha T) (MesonGS).
+        Default: `gs`.
+    progress : Progress
+        Told of each view.
 
     Returns
     -------
@@ -60,16 +65,17 @@ def score_scene(
         part = source.read(rows, ["log_scales", "opacity_logits"])
         volume[rows] = part["log_scales"].sum(axis=0, dtype=np.float64)
         log_opacity[rows] = -np.logaddexp(0.0, -part["opacity_logits"][0].astype(np.float64))
-    with np.errstate(divide="ignore"):  # log(0) = -inf is what unseen Gaussians get
+    with np.errstate(divide="ignore"):  # unseen Gaussians get log(0) = -inf
         if kind == "gs":
             return log_opacity + VOLUME_POWER * volume + np.log(statistics.hits.astype(np.float64))
-        return VOLUME_POWER * volume + np.log(statistics.weight_sums)
+        scores: np.ndarray = VOLUME_POWER * volume + np.log(statistics.weight_sums)
+        return scores
 
 
 def gather_statistics(
     renderer: Renderer, scene: DeviceScene, cameras: Sequence[Camera], progress: Progress = SILENT
 ) -> Statistics:
-    """Hits and weights of every Gaussian over `cameras` (exact sums: any order of views gives the same bits)."""
+    """Hits and weights of every Gaussian over `cameras`. Sums are exact, so any order of views gives the same bits."""
     statistics = Statistics.zeros(scene.count)
     for camera in progress.track(cameras, "scoring views", len(cameras)):
         renderer.add_statistics(scene, camera, statistics)

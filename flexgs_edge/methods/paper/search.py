@@ -1,16 +1,19 @@
-"""FOA, fast online adaptation: the strongest compression that holds a target, found in a counted number of steps.
+"""Fast online adaptation (FOA): finds the strongest compression that meets a target, in a counted number of steps.
 
-1. *List.* The paper's candidates, sorted by exact predicted bytes, are walked from (.4, .4): to fewer bytes while the target
-   holds, else to more bytes up to the first that holds.
-2. *Refinement.* Around the answer p and s move on a grid of 0.02 within +-0.1. Bytes are exact and free, so only points
-   with fewer bytes than the best are of interest. Each step measures the smallest point that a local model of the loss
-   (log-linear in p and s, fitted to the points measured so far) expects to hold. A point that fails rules out all points
-   with both rates as high. The answer is always a point that was itself measured to hold.
+A point is a choice of prune rate p and SH rate s.
 
-Both look at estimates, from a part of the pixels, whose distance from a full measurement is taken at the first point. The
-answer is then measured in full; if it does not hold, the next one by what that showed is.
+1. *List.* We sort the paper's list of points by exact bytes and start at (.4, .4). While the target holds, we go on to
+   fewer bytes. Otherwise we go to more bytes, up to the first point that holds.
+2. *Refinement.* Around that point p and s move on a grid of 0.02 within +-0.1. Bytes are exact and free, so only points
+   with fewer bytes than the best are of interest. A local model of the loss (log-linear in p and s) is fitted to the
+   points measured so far. Each step measures the smallest point that the model expects to hold. A point that fails rules
+   out all points with both rates at least as high.
+3. *Confirmation.* Both stages look at estimates, from a part of the pixels. At the first point we also measure in full,
+   to learn how far estimates are off. The answer is measured in full too. If it does not hold, we try the next point that
+   should. So every answer was itself measured to hold.
 
-Steps are counted, never timed, and the model uses plain Python floats in a fixed order: same command, same bytes.
+Steps are counted and never timed, and the model adds plain Python floats in a fixed order. So the same command gives the
+same bytes.
 """
 
 from __future__ import annotations
@@ -29,8 +32,9 @@ CANDIDATES: tuple[tuple[int, int], ...] = (
     (2, 3), (1, 5), (2, 4), (3, 3), (1, 6), (2, 5), (3, 4), (4, 3), (2, 6), (3, 5),
     (4, 4), (3, 6), (4, 5), (5, 4), (6, 3), (5, 5), (6, 4), (7, 3), (8, 2), (9, 1),
 )  # fmt: skip
-"""The paper's list of (p, s), in tenths, as published (not monotone in bytes: it is sorted before use)."""
+"""The paper's list of (p, s), in tenths, as published. It is not sorted by bytes; the search sorts it."""
 START = (4, 4)
+"""Where the walk along the list begins, in tenths."""
 GRID = 20
 """Step of the refinement in p and s, in thousandths."""
 REACH = 100
@@ -38,16 +42,16 @@ REACH = 100
 
 
 class Evaluator(Protocol):
-    """What a search may ask of a scene."""
+    """The questions that a search may ask about a scene."""
 
     def size(self, choice: Choice) -> int:
-        """Exact bytes of the file at this choice; must be cheap."""
+        """Exact bytes of the file at this choice. This must be cheap."""
 
     def measure(self, choice: Choice) -> Measurement:
-        """Prune, quantize, dequantize, render and compare: the costly question."""
+        """Prune, quantize, dequantize, render and compare. This is the costly question."""
 
     def estimate(self, choice: Choice) -> Measurement:
-        """The same from a part of the pixels, in less time."""
+        """As `measure`, from a part of the pixels, in less time."""
 
 
 def adapt(
@@ -57,25 +61,25 @@ def adapt(
     best_effort: bool = False,
     on_step: Callable[[Step], None] | None = None,
 ) -> SearchResult:
-    """Find the choice that meets `target` with the fewest bytes (a size target: with the best quality).
+    """Find the choice that meets `target` with the fewest bytes (for a size target: with the best quality).
 
     Parameters
     ----------
     evaluator : Evaluator
-        Answers for sizes, estimates and measurements; no point is asked for either twice.
+        Answers for sizes, estimates and measurements. No question is asked twice.
     target : Target
         What must hold.
     effort : {"fast", "balanced", "thorough"}
-        Number of refinement steps (`REFINE_STEPS`).
+        Number of refinement steps (`REFINE_STEPS`). Default: `balanced`.
     best_effort : bool
-        Return the closest point when nothing holds, with `reached` False.
+        Return the closest point with `reached` False when nothing holds.
     on_step : callable, optional
         Called after each new step.
 
     Raises
     ------
     TargetError
-        When no point that was tried holds; the message names the closest.
+        When no point holds and `best_effort` is not set; the message names the closest point.
     """
     search = _Search(evaluator, target, on_step)
     refine_steps = REFINE_STEPS[effort]
@@ -90,7 +94,7 @@ def adapt(
 
 
 def measure_fixed(evaluator: Evaluator, choice: Choice, target: Target | None = None) -> SearchResult:
-    """The result of a run with fixed rates: one step, no search; `reached` compares it with `target` if there is one."""
+    """The result of a run with fixed rates: one step, no search. `reached` says whether `target` holds, if there is one."""
     started = time.perf_counter()
     size, measurement = evaluator.size(choice), evaluator.measure(choice)
     excess = 0.0 if target is None else target.excess(size, measurement)
@@ -120,7 +124,7 @@ class _Search:
         return choice in self._known
 
     def estimate(self, choice: Choice, phase: Phase) -> Step:
-        """The step of a choice; the first one is measured in full as well, to tell how far estimates are off."""
+        """Estimate a choice. The first one is also measured in full, to learn how far estimates are off."""
         if choice not in self._known:
             first = not self._known
             started = time.perf_counter()
@@ -136,7 +140,7 @@ class _Search:
         return self._known[choice]
 
     def confirm(self, choice: Choice) -> Step:
-        """The step of a choice measured in full."""
+        """Measure a choice in full."""
         if choice not in self._confirmed:
             started = time.perf_counter()
             measurement = self.evaluator.measure(choice)
@@ -157,25 +161,25 @@ class _Search:
         return list(self._known.values())
 
     def unconfirmed(self) -> list[Step]:
-        """Steps that were only estimated, the one that holds with the fewest bytes first, then those that miss by least."""
+        """Steps that were only estimated: first those that hold, by bytes, then the others, by how far they miss."""
         steps = [step for choice, step in self._known.items() if choice not in self._confirmed]
         return sorted(steps, key=lambda step: (max(step.excess, 0.0), step.size))
 
     def closest(self) -> Step:
-        """Of the steps measured in full, the one that misses by least."""
+        """The step that misses by least, among those measured in full."""
         return min(self._confirmed.values(), key=lambda step: (step.excess, step.size))
 
     def by_size(self, choices: list[Choice]) -> list[Choice]:
-        """Choices from most to fewest bytes; ties by rates, so that the order is one."""
+        """Choices from most to fewest bytes. Ties go by rates, so that the order is unique."""
         return sorted(choices, key=lambda choice: (-self.size(choice), choice.prune, choice.sh))
 
 
 def _confirmed(search: _Search, chosen: Step) -> Step:
-    """`chosen` measured in full; while that does not hold, the next of the steps that should by what it showed."""
+    """Measure `chosen` in full. While that does not hold, try the next step that should, given how far the estimate was off."""
     full = search.confirm(chosen.choice)
     while not full.holds:
         off = max(full.excess - chosen.excess, 0.0)
-        # Where the estimate already said that nothing holds, the rest is farther away.
+        # If the estimate already missed the target, all other steps miss by more.
         rest = [step for step in search.unconfirmed() if step.excess + off <= 0.0]
         if not rest:
             return search.closest()
@@ -229,7 +233,7 @@ def _refine(search: _Search, best: Step, box: list[Choice], steps: int) -> Step:
         expected = [choice for choice in open_points if model.predict(choice) <= 0.0]
         if expected:
             probe = search.by_size(expected)[-1]
-        else:  # none is expected to hold: the likeliest one, in case the model is wrong
+        else:  # none is expected to hold: try the likeliest one, because the model may be wrong
             probe = min(open_points, key=lambda choice: (model.predict(choice), search.size(choice), choice.prune))
         step = search.estimate(probe, "refine")
         if step.holds and step.size < best.size:
@@ -238,7 +242,7 @@ def _refine(search: _Search, best: Step, box: list[Choice], steps: int) -> Step:
 
 
 def _search_size(search: _Search, limit: int, refine_steps: int) -> Step:
-    """The least compression that fits: sizes are free, so measuring only compares points on the edge of the limit."""
+    """The best quality that fits. Sizes are free, so we measure only points just below the limit."""
     if search.size(Choice(0, 0)) <= limit:
         return search.estimate(Choice(0, 0), "list")
     candidates = _candidates(search)
@@ -257,7 +261,7 @@ def _search_size(search: _Search, limit: int, refine_steps: int) -> Step:
         assert step.measurement is not None
         return step.measurement.loss(judge), step.size
 
-    # One hill climb along the edge (one point for each p), from the p of the list's answer outwards.
+    # Hill climbing along the edge (one point for each p), from the list's answer outwards.
     at = min(range(len(edge)), key=lambda i: (abs(edge[i].prune - answer.prune), i))
     best = search.estimate(edge[at], "refine")
     left = refine_steps - 1
@@ -273,7 +277,7 @@ def _search_size(search: _Search, limit: int, refine_steps: int) -> Step:
 
 
 def _edge(search: _Search, fitting: list[Choice]) -> list[Choice]:
-    """For each prune rate the fitting choice with the most bytes, in order of prune rate."""
+    """The fitting choice with the most bytes for each prune rate, in order of prune rate."""
     largest: dict[int, Choice] = {}
     for choice in reversed(search.by_size(fitting)):
         largest[choice.prune] = choice
@@ -281,10 +285,10 @@ def _edge(search: _Search, fitting: list[Choice]) -> list[Choice]:
 
 
 def _box(centre: Choice, to_zero: bool) -> list[Choice]:
-    """Grid points within `REACH` of `centre`; from the gentlest candidate also everything gentler (`to_zero`)."""
+    """Grid points within `REACH` of `centre`. With `to_zero`, also all points with lower rates."""
 
     def line(value: int, top: int) -> range:
-        # Start on the grid line below zero's reach, so that `centre` itself is on the grid.
+        # The grid passes through `centre`, so it need not pass through zero.
         low = value % GRID if to_zero else max(value - REACH, value % GRID)
         return range(low, min(value + REACH, top) + 1, GRID)
 
@@ -292,5 +296,5 @@ def _box(centre: Choice, to_zero: bool) -> list[Choice]:
 
 
 def _ruled_out(choice: Choice, failed: list[Choice]) -> bool:
-    """A point with both rates at least as high as one that failed is taken to fail."""
+    """Whether both rates are at least as high as those of a point that failed: it would fail too."""
     return any(choice.prune >= other.prune and choice.sh >= other.sh for other in failed)

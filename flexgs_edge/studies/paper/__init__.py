@@ -1,1 +1,1 @@
-"""`study paper`: the tables and figures of FlexGaussian."""
+"""`study paper`: repeats the experiments of the FlexGaussian paper on a user's scenes."""

@@ -1,4 +1,4 @@
-"""Experiments on pruning: ADP against rows or SH alone, the plane of the two rates, and the two scores."""
+"""Experiments on pruning: ADP against pruning only rows or only SH, all pairs of the two rates, and the two scores."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
 from flexgs_edge.studies.study_scene import FIGURES, Point, Setting, StudyScene
 
 DIAGONAL = tuple(range(50, 501, 50))
-"""Rates p = s of the ADP curve, thousandths: a split that nothing was tuned for."""
+"""Rates p = s of the ADP curve, in thousandths. Nothing was tuned for this split."""
 GRID = 100
-"""Step of the plane, thousandths: the paper's candidates lie on it."""
+"""Step of the rates in `plane`, in thousandths. The paper's candidates lie on this grid."""
 MAX_ROWS = 980
-"""Largest rate of row pruning alone, thousandths."""
+"""Largest rate of pruning rows alone, in thousandths."""
 RATES = {"prune_rate": "p (removed)", "sh_rate": "s (SH removed)"}
 
 
@@ -29,9 +29,9 @@ def candidates(studied: StudyScene) -> list[Choice]:
 
 
 def nearest(sizes: Sequence[int], size: int) -> int | None:
-    """Where in `sizes` (falling) the one nearest to `size` stands; `None` when out of reach.
+    """Index of the size nearest to `size` in `sizes` (falling); `None` when out of reach.
 
-    Out of reach: beyond an end by more than half of the step there.
+    A size is out of reach if it lies beyond an end by more than half of the step there.
 
     >>> nearest([90, 50, 10], 40), nearest([90, 50, 10], 0), nearest([90, 50, 10], -20)
     (1, 2, None)
@@ -43,7 +43,7 @@ def nearest(sizes: Sequence[int], size: int) -> int | None:
 
 
 def splits(studied: StudyScene) -> Experiment:
-    """ADP against row pruning only (Row-P) and SH pruning only (SH-P) at equal bytes."""
+    """Compare ADP with row pruning only (Row-P) and SH pruning only (SH-P) at equal bytes."""
     families = {
         "Row-P": [Choice(rate, 0) for rate in range(MAX_ROWS + 1)],
         "SH-P": [Choice(0, rate) for rate in range(1001)],
@@ -75,8 +75,8 @@ def splits(studied: StudyScene) -> Experiment:
     return Experiment(
         "splits",
         "ADP against row pruning and SH pruning at equal bytes",
-        "The paper's bits throughout. ADP removes a share p of the Gaussians and the SH of a further share s; Row-P and SH-P "
-        "do one of the two, at the rate (in thousandths) whose file is nearest in bytes. SH-P ends where all SH are gone.",
+        "All files have the paper's bits. ADP removes a share p of the Gaussians and the SH of a further share s. Row-P and SH-P "
+        "do one of the two, at the rate (in thousandths) whose file is nearest in bytes. SH-P ends when all SH are removed.",
         table,
         LineChart(
             "Removing Gaussians and SH (ADP), Gaussians only, SH only",
@@ -97,7 +97,7 @@ def splits(studied: StudyScene) -> Experiment:
 
 
 def _wins(rows: Sequence[dict[str, Cell]], level: str, family: str, figure: str) -> str:
-    """At how many sizes ADP loses less than the family, and by how much in the mean."""
+    """At how many sizes ADP loses less than `family`, and by how much on average."""
     gaps: list[float] = []
     apart = 0.0
     own: dict[str, Cell] = {}
@@ -111,14 +111,14 @@ def _wins(rows: Sequence[dict[str, Cell]], level: str, family: str, figure: str)
         return f"{level}: {family} reaches none of these sizes."
     better = sum(gap > 0 for gap in gaps)
     return (
-        f"{level}: loses less than {family} at {better} of the {len(gaps)} sizes that both reach; the loss of {family} less "
-        f"ADP's is {mean(gaps):+.3f} dB in the mean ({min(gaps):+.3f} to {max(gaps):+.3f}); bytes differ by at most "
+        f"{level}: loses less than {family} at {better} of the {len(gaps)} sizes that both reach; {family} loses "
+        f"{mean(gaps):+.3f} dB more than ADP on average ({min(gaps):+.3f} to {max(gaps):+.3f}). Bytes differ by at most "
         f"{100 * apart:.2f} %."
     )
 
 
 def plane(studied: StudyScene) -> Experiment:
-    """The loss over (p, s), the line where the target lies, and the path of the search."""
+    """Measure the loss over all (p, s), and show where the target lies and how the search went."""
     search = studied.search
     line = range(0, 1000, GRID)
     cells = [Choice(p, s) for p in line for s in range(0, 1001 - p, GRID)]
@@ -130,7 +130,7 @@ def plane(studied: StudyScene) -> Experiment:
     ]
     for number, step in enumerate(search.steps, 1):
         assert step.measurement is not None
-        # Steps of the list and of the refinement are what the search saw: estimates.
+        # Steps of the list and of the refinement are estimates, because the search saw only these.
         kind = "answer" if step is search.chosen else step.phase
         rows.append(
             {
@@ -160,14 +160,14 @@ def plane(studied: StudyScene) -> Experiment:
     return Experiment(
         "plane",
         "The plane of the two rates, and the search on it",
-        f"Every cell is a measured file at the paper's bits. The line is where the {words}, interpolated between cells; dots "
-        f"are the paper's candidates; the path is the search for {studied.target.describe()} "
+        f"Every cell is a measured file at the paper's bits. The line is where the {words}, interpolated between cells. Dots "
+        f"are the paper's candidates. The path shows the search for {studied.target.describe()} "
         f"(effort {studied.run.options.effort}).",
         table,
         PlaneChart(
-            "Loss over the two rates, and the path of the search",
+            "Loss over the two rates, and the steps of the search",
             "p: share of the Gaussians removed",
-            "s: further share whose SH are removed",
+            "s: further share of Gaussians that lose their SH",
             FIGURES[figure],
             {(_number(row, "prune_rate"), _number(row, "sh_rate")): _number(row, figure) for row in grid},
             GRID / 1000,
@@ -197,7 +197,7 @@ def plane(studied: StudyScene) -> Experiment:
 
 
 def _frontier(losses: dict[Choice, float], limit: float) -> list[tuple[float, float]]:
-    """For each s of the grid the p at which the loss first passes `limit`, interpolated; nothing where it never does."""
+    """For each s of the grid, the interpolated p at which the loss first exceeds `limit`; no entry if it never does."""
     found = []
     for s in sorted({choice.sh for choice in losses}):
         line = sorted((choice.prune, loss) for choice, loss in losses.items() if choice.sh == s)
@@ -209,7 +209,7 @@ def _frontier(losses: dict[Choice, float], limit: float) -> list[tuple[float, fl
 
 
 def _monotone(found: dict[Choice, Point], studied: StudyScene) -> str:
-    """How often more pruning loses less, over neighbouring cells and over the sorted list."""
+    """How often more pruning loses less, among neighbouring cells and along the sorted list."""
     rises = []
     for choice, point in found.items():
         for more in ((choice.prune + GRID, choice.sh), (choice.prune, choice.sh + GRID)):
@@ -228,7 +228,7 @@ def _monotone(found: dict[Choice, Point], studied: StudyScene) -> str:
 
 
 def _slope(frontier: Sequence[tuple[float, float]], studied: StudyScene) -> str:
-    """How the frontier lies, against lines of equal bytes."""
+    """The slope of the frontier, compared with lines of equal bytes."""
     if len(frontier) < 2:
         return f"The target lies on fewer than two rows of the plane ({len(frontier)}): no frontier to speak of."
     (p, s), (q, t) = frontier[0], frontier[-1]
@@ -243,7 +243,7 @@ def _slope(frontier: Sequence[tuple[float, float]], studied: StudyScene) -> str:
 
 
 def scores(studied: StudyScene) -> Experiment:
-    """Ranking by gs (hits) against meson (weights), at the paper's candidates."""
+    """Compare the scores gs (hits) and meson (weights) at the paper's candidates."""
     kinds = ("gs", "meson")
     wanted = [Setting(choice, score=score) for choice in candidates(studied) for score in kinds]
     rows: list[dict[str, Cell]] = [
@@ -276,9 +276,9 @@ def scores(studied: StudyScene) -> Experiment:
             magnitudes=True,
         ),
         (
-            f"meson loses less at {sum(gap < 0 for gap in gaps)} of {len(gaps)} candidates; its loss less that of gs is "
-            f"{mean(gaps):+.3f} dB in the mean ({min(gaps):+.3f} to {max(gaps):+.3f}). Of the lower half of the ranks the two "
-            f"share {100 * same:.0f} %.",
+            f"meson loses less at {sum(gap < 0 for gap in gaps)} of {len(gaps)} candidates; it loses "
+            f"{mean(gaps):+.3f} dB more than gs on average ({min(gaps):+.3f} to {max(gaps):+.3f}). The two scores share "
+            f"{100 * same:.0f} % of the lower half of the ranks.",
         ),
     )
 

@@ -1,4 +1,4 @@
-"""Experiments on bits and groups: plain rounding, each attribute alone, sub-groups."""
+"""Experiments on quantization: equal bits for all channels, each attribute alone, and sub-groups."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 
 RTN_BITS = tuple(range(2, 9))
 FINE = BitSpec.rtn(16)
-"""Stands for "untouched": 16 bits in sub-groups lose less than renders show."""
+"""Stands for unquantized values: 16 bits in sub-groups lose less than renders show."""
 ALONE_BITS = (4, 8)
 PAPER_GROUPS = 1000
 NAMES = {"xyz": "position", "dc": "colour", "rest": "SH", "opacity": "opacity", "scale": "scale", "rot": "rotation"}
-"""What people call the attributes of `--bits`."""
+"""Plain names of the attributes of `--bits`."""
 
 
 def rtn(studied: StudyScene) -> Experiment:
-    """Round to nearest at one width for all channels, beside the paper's widths in sub-groups."""
+    """Compare rounding at one width for all channels with the paper's widths in sub-groups."""
     plain = studied.points([Setting(bits=BitSpec.rtn(bits), groups=1) for bits in RTN_BITS], "RTN")
     rows: list[dict[str, Cell]] = [
         {"coding": "RTN", "bits": bits, **studied.cells(point)} for bits, point in zip(RTN_BITS, plain)
@@ -60,7 +60,7 @@ def rtn(studied: StudyScene) -> Experiment:
 
 
 def attributes(studied: StudyScene) -> Experiment:
-    """Each attribute alone at 4 and at 8 bits, all others at 16."""
+    """Quantize each attribute alone to 4 and to 8 bits, with all others at 16."""
     names = [field.bits for field in FIELDS if field.width(studied.run.source.sh_degree)]
     alone = [(name, bits) for name in names for bits in ALONE_BITS]
     settings = [Setting(bits=replace(FINE, **{name: bits})) for name, bits in alone]
@@ -98,7 +98,7 @@ def attributes(studied: StudyScene) -> Experiment:
 
 
 def groups(studied: StudyScene) -> Experiment:
-    """One range a channel, sub-groups that follow N, and the paper's 1000, at the same bits."""
+    """Compare one range a channel, sub-groups that follow N, and the paper's 1000, at the same bits."""
     choices = {"nothing": EVERYTHING, "as the search chose": studied.search.chosen.choice}
     kinds: dict[str, int | None] = {"one": 1, "default": None, "paper": PAPER_GROUPS}
     wanted = [Setting(choice, PAPER, count) for choice in choices.values() for count in kinds.values()]
@@ -147,12 +147,12 @@ def groups(studied: StudyScene) -> Experiment:
 
 
 def _scientific(value: float) -> float:
-    """Four digits, however small."""
+    """The value rounded to four significant digits."""
     return float(f"{value:.4g}")
 
 
 def _short(loss: float) -> str:
-    """Two digits, three where there would be nothing to see, and no minus before zero."""
+    """The loss with two digits, or three if it would look like zero; never a negative zero."""
     return f"{round(loss, 3 if abs(loss) < 0.1 else 2) + 0.0:g}"
 
 

@@ -1,4 +1,4 @@
-"""`study paper`: the FlexGaussian paper's evaluation, made again on any scene."""
+"""`study paper`: repeats the evaluation of the FlexGaussian paper on any scene."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ EXPERIMENTS: tuple[Callable[[StudyScene], Experiment], ...] = (
 
 @dataclass(frozen=True)
 class PaperStudy:
-    """What `study paper` found and wrote."""
+    """The results of `study paper`, and their folder."""
 
     output: str
     scenes: tuple[SceneStudy, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """The record for programs."""
         return {
             "program": f"flexgs-edge {__version__}",
             "command": "study paper",
@@ -73,24 +73,24 @@ def study_paper(
     scenes : sequence of path
         `.ply`, `.fgs` or model folders, one or more.
     output : path
-        Folder of the results: index.html, and a folder a scene with <experiment>.csv, .json, .png and .svg. It appears when
-        everything is done; `force` lets it replace files of these names in a folder that is there.
+        Folder of the results: index.html, and a folder for each scene with <experiment>.csv, .json, .png and .svg. It
+        appears when everything is done. With `force` it may replace files of these names in an existing folder.
     options : CompressOptions, optional
-        Views, drawing, memory and device as for `compress`; `max_drop` and `effort` are the search's.
+        Views, drawing, memory and device as for `compress`. `max_drop` and `effort` are those of the search.
     progress : Progress, optional
-        Bars on long work.
+        Progress bars. Default: none.
     **words
-        Single options by the names of `CompressOptions`.
+        Single options, by their names in `CompressOptions`.
 
     Raises
     ------
     FlexGSError
-        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
+        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "paper"})
     if not scenes:
         raise InputError("no scene: give one or more .ply, .fgs or model folders")
-    # Loaded before the memory is planned, so that its bytes count as taken.
+    # Matplotlib is loaded before the memory is planned, so that its bytes count as taken.
     require_matplotlib()
     check_folder(output, options.force)
     with atomic_folder(output, options.force) as folder:
@@ -103,7 +103,7 @@ def study_paper(
 
 def _study_scene(path: str | Path, name: str, options: CompressOptions, progress: Progress) -> SceneStudy:
     with open_study_scene(path, name, options, progress, scores=("gs", "meson")) as studied:
-        # First: several experiments build on its answer, and its steps must be measured and not remembered.
+        # The search runs first: experiments build on its answer, and its steps must be measured, not remembered.
         LOG.info("%s: searching for %s", name, studied.target.describe())
         chosen = studied.search.chosen
         LOG.info("%s: prune %g, SH %g", name, chosen.choice.prune / 1000, chosen.choice.sh / 1000)
@@ -123,9 +123,9 @@ def _write(folder: Path, scenes: Sequence[SceneStudy]) -> None:
         place.mkdir()
         sections.append(write_scene(place, scene))
     intro = (
-        "The experiments of the FlexGaussian paper (Tian et al., ACM MM 2025), made again by flexgs-edge with its own programs, "
-        "containers and quality figures. Sizes are bytes of the finished file; ratios are to the PLY as INRIA writes it. The "
-        "paper's figures are means over its own scenes: beside one scene they give the order of magnitude."
+        "The experiments of the FlexGaussian paper (Tian et al., ACM MM 2025), repeated by flexgs-edge with its own programs, "
+        "containers and quality figures. Sizes are bytes of the finished file. Ratios are to the PLY as INRIA writes it. The "
+        "paper's figures are means over its own scenes, so beside one scene they only give the order of magnitude."
     )
     page = study_page("The paper's evaluation", intro, sections)
     (folder / "index.html").write_text(page, encoding="utf-8")

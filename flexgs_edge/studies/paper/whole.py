@@ -1,4 +1,4 @@
-"""Experiments on the whole method: its parts alone, rate and distortion, time and memory."""
+"""Experiments on the paper's whole method: its parts alone, rate-distortion, time and memory."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 
 RATIOS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 STRONGEST = Choice(MAX_PRUNE, 1000 - MAX_PRUNE)
-"""The end of what the search may choose."""
+"""The strongest compression that the search may choose."""
 PAPER_MEANS = ([100 / (100 - saved) for saved in (94.9, 96.1, 96.4)], [0.87, 0.86, 0.85])
-"""Ratio and drop on Mip-NeRF360, Tanks&Temples and Deep Blending."""
+"""The paper's mean ratios and drops on Mip-NeRF360, Tanks&Temples and Deep Blending."""
 REPEATS = 5
-"""Times that a step's parts are measured; the median is shown."""
+"""How often the parts of a step are timed. The median is shown."""
 PAPER_STEP = {"prune": 0.22, "quantize": 0.84, "dequantize": 0.32, "render and compare": 0.18}
-"""Seconds of the parts of a search step on the paper's RTX 3090; its rendering covers 32 views."""
+"""Published seconds of the parts of a search step on an RTX 3090, rendering 32 views."""
 PAPER_STEP_ALL = 1.56
-"""The same for the whole step."""
+"""Published seconds of a whole step there."""
 
 
 class Unquantized(SceneSource):
-    """What ADP leaves of a scene, as float32: some rows, of which the first `sh_count` keep their SH."""
+    """A scene after ADP, without quantization: rows with SH come first, then rows without."""
 
     def __init__(self, parent: SceneSource, with_sh: np.ndarray, without_sh: np.ndarray) -> None:
         self._rows = SelectSource(parent, np.concatenate([with_sh, without_sh]))
@@ -45,7 +45,7 @@ class Unquantized(SceneSource):
 
     @property
     def value_bytes(self) -> int:
-        """4 bytes for every value that is left: what a file of plain float32 arrays holds."""
+        """Bytes of a file of plain float32 arrays: 4 for every value that is left."""
         per_row = sum(self.width(name) for name in ("means", "sh_dc", "opacity_logits", "log_scales", "quats"))
         return 4 * (self.count * per_row + self.sh_count * self.width("sh_rest"))
 
@@ -60,7 +60,7 @@ class Unquantized(SceneSource):
 
 
 def parts(studied: StudyScene) -> Experiment:
-    """ADP only, MPQ only, and both, at the choice of the search."""
+    """Measure ADP only, MPQ only, and both, at the choice of the search."""
     choice = studied.search.chosen.choice
     pruned = _pruned(studied, choice)
     with studied.bench.renderer.load(pruned) as scene:
@@ -86,8 +86,8 @@ def parts(studied: StudyScene) -> Experiment:
     return Experiment(
         "parts",
         "Pruning only, quantization only, both",
-        f"p = {choice.prune / 1000:g}, s = {choice.sh / 1000:g} (the search's choice) and the paper's bits. Without MPQ the "
-        "bytes are 4 for every float32 value that is left, without normals and header; ratios are to the PLY with its normals.",
+        f"p = {choice.prune / 1000:g}, s = {choice.sh / 1000:g} (the search's choice) and the paper's bits. Without MPQ, "
+        "sizes count 4 bytes for every float32 value that is left, no normals, no header. Ratios are to the PLY with normals.",
         table,
         LineChart(
             "What pruning, quantization and both cost",
@@ -108,12 +108,12 @@ def _pruned(studied: StudyScene, choice: Choice) -> Unquantized:
 
 
 def rates(studied: StudyScene) -> Experiment:
-    """The best that the method finds at sizes from 8 to 256 times below the PLY's, and where it ends."""
+    """Find the best quality at sizes from 8 to 256 times below the PLY's, and the smallest size within reach."""
     rows: list[dict[str, Cell]] = [_rate_row(studied, "least", None, EVERYTHING)]
     ply = studied.run.scene.ply_bytes
     for ratio in studied.run.progress.track(RATIOS, "rates", len(RATIOS)):
         if studied.size(Setting(EVERYTHING)) <= ply / ratio:
-            continue  # the bits alone are past it: the row "least" says so
+            continue  # quantization alone makes the file smaller: see the row "least"
         found = studied.adapt(min_ratio(float(ratio), ply, studied.plan.figure))
         if found.reached:
             rows.append(_rate_row(studied, "search", ratio, found.chosen.choice))
@@ -128,8 +128,8 @@ def rates(studied: StudyScene) -> Experiment:
     return Experiment(
         "rates",
         "Rate and distortion from 8x to 256x",
-        "For each ratio the search for the best quality in that size, at the paper's bits and with the rates alone to choose. "
-        f"least: nothing pruned; most: the end of the search's range, p = {STRONGEST.prune / 1000:g} and no SH.",
+        "For each ratio we search for the best quality in that size, at the paper's bits; the search chooses only the rates. "
+        f"least: nothing pruned. most: the end of the search's range, p = {STRONGEST.prune / 1000:g} and no SH.",
         table,
         LineChart(
             "Rate and distortion",
@@ -166,10 +166,10 @@ def _rate_row(studied: StudyScene, kind: str, ratio: int | None, choice: Choice)
 
 
 def times(studied: StudyScene) -> Experiment:
-    """Seconds of every stage and of every part of a search step, and the memory of the run."""
+    """Time every stage and every part of a search step, and report the memory of the run."""
     steps = studied.search.steps
     stages = dict(studied.run.clock.stages)
-    # meson is this study's question, not the method's.
+    # Only this study scores by meson; the method does not.
     meson = stages.pop("score meson", 0.0)
     stages["search"] = sum(step.seconds for step in steps)
     whole = sum(stages.values())
@@ -190,8 +190,8 @@ def times(studied: StudyScene) -> Experiment:
         f"Wall seconds of this run: {source.count} Gaussians, {len(views.train)} training and "
         f"{len(studied.plan.decide)} deciding views. The parts of a step are medians of {REPEATS} at the search's answer; "
         "rendering includes comparing with the references. The paper's seconds are for its own, larger scenes and 32 views on "
-        "an RTX 3090: they compare shares, not machines. Memory is the largest that the process has held, "
-        "earlier scenes included.",
+        "an RTX 3090, so compare shares, not machines. Memory is the peak of the process, including "
+        "earlier scenes.",
         table,
         BarChart(
             "A step of the search",
@@ -246,7 +246,7 @@ def _step_parts(studied: StudyScene, choice: Choice) -> dict[str, float]:
                 studied.judge.compare(scene)
                 marks.append(time.perf_counter())
         prune, quantize, cold, warm, render = (b - a for a, b in zip(marks, marks[1:]))
-        # Quantizing selects its rows itself; a scene is dequantized when the first view asks for it.
+        # Quantizing includes selecting rows, and the first view includes dequantizing, so both are subtracted.
         found.append([prune, max(quantize - prune, 0.0), max(cold - warm, 0.0), render])
     medians = np.median(np.array(found), axis=0)
     return {name: float(value) for name, value in zip(PAPER_STEP, medians)}

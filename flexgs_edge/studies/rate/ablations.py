@@ -1,4 +1,4 @@
-"""The measured method with one part taken away: paths and searches that replace that part and leave the rest as it is."""
+"""Ablations of the method `best`: rounds and searches that replace one part and leave the rest as it is."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from flexgs_edge.methods.paper.prune import ranks_from_order
 
 
 class RankedPath(PruneRounds):
-    """Rows go in the order of a score; how many go, and all else, is as measured.
+    """Rounds that remove rows in the order of a score instead of by measured costs.
 
-    The measured costs are handed out again by rank: the row of the lowest score gets the lowest of them. So a multiplier
-    removes about as many rows as it would by the costs themselves.
+    Measured costs are handed out again by rank: the row with the lowest score gets the lowest cost. So a multiplier
+    removes about as many rows as it would by measured costs.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class RankedPath(PruneRounds):
 
     def _hand_out(self, snapshot: Snapshot) -> None:
         costs = snapshot.costs
-        # Rows that no pose sees have no cost to give away, and stay.
+        # Rows that no pose sees have no cost, so they stay out of this.
         seen = np.flatnonzero(costs.weight2 > 0)
         removal = costs.removal.copy()
         removal[seen[np.argsort(self._ranks[self.rows[snapshot.rows[seen]]])]] = np.sort(removal[seen])
@@ -48,20 +48,20 @@ class RankedPath(PruneRounds):
 
 
 class OnePassPath(PruneRounds):
-    """Costs as the first pass over the whole scene measured them; colours are mended on the way all the same."""
+    """Rounds that keep the costs of the first pass over the whole scene. Colours are refitted in each round as usual."""
 
     def descend(self, share: float) -> Snapshot:
         """See `PruneRounds.descend`."""
         last = self.snapshots[-1]
         snapshot = super().descend(share)
         kept = np.searchsorted(last.rows, snapshot.rows)
-        # Weights and mean colours belong to the colours as they are now.
+        # Weights and mean colours must fit the refitted colours, so these stay as measured now.
         snapshot.costs = replace(snapshot.costs, removal=last.costs.removal[kept], sh=last.costs.sh[:, kept])
         return snapshot
 
 
 class SomeDegrees(GridSearch):
-    """Gaussians that stay keep SH up to one of a few degrees; a subclass says which."""
+    """A search with fewer SH degrees to choose from; a subclass says which."""
 
     with_none: ClassVar[bool]
 
@@ -72,13 +72,13 @@ class SomeDegrees(GridSearch):
 
 
 class AllOrNone(SomeDegrees):
-    """All SH or none, for each Gaussian."""
+    """A search that gives each Gaussian all SH or none."""
 
     with_none = True
 
 
 class FullSh(SomeDegrees):
-    """All SH for every Gaussian that some pose sees."""
+    """A search that gives all SH to every Gaussian that some pose sees."""
 
     with_none = False
 
@@ -86,7 +86,7 @@ class FullSh(SomeDegrees):
 def choose_among(
     costs: RemovalCosts, bits: BitModel, multiplier: float, degrees: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `flexgs_edge.methods.best.allocation.choose`, with these SH degrees to choose from."""
+    """As `flexgs_edge.methods.best.allocation.choose`, but with only `degrees` to choose from."""
     top = len(costs.sh)
     lagrangian = np.array(
         [
@@ -105,18 +105,18 @@ def choose_among(
 
 @dataclass(frozen=True)
 class Variant:
-    """The method, or the method with one part taken away.
+    """The method `best`, or the same without one part.
 
     Parameters
     ----------
     name : str
-        In tables.
+        Name in tables.
     words : str
-        What stands in the part's place.
+        What replaces the part, for tables.
     search : type
-        Of `GridSearch`.
+        The search, a `GridSearch`.
     path : callable
-        Builds the path from the arguments of `PruneRounds`.
+        Makes the rounds from the arguments of `PruneRounds`.
     refit : bool
         As for `compress`.
     """
@@ -132,23 +132,25 @@ WHOLE = Variant("whole", "nothing is taken away")
 
 
 def parts_of(order: np.ndarray, sh_degree: int) -> tuple[Variant, ...]:
-    """Every part, taken away alone; those of the SH only where there are some.
+    """Variants that each lack one part. Those about SH are left out if the scene has none.
 
     Parameters
     ----------
     order : np.ndarray
         [N] i64, rows by the paper's score, least important first.
+    sh_degree : int
+        SH degree of the scene.
     """
     parts = [
         Variant(
             "gs ranks",
-            "Gaussians go in the order of the paper's score gs, ranked once, in place of measured costs",
+            "Gaussians are removed in the order of the paper's score gs, ranked once, instead of by measured costs",
             path=partial(RankedPath, order=order),
         ),
         Variant(
-            "one pass", "costs of one pass over the whole scene, never measured again as others go", path=OnePassPath
+            "one pass", "costs of one pass over the whole scene, not measured again after removals", path=OnePassPath
         ),
-        Variant("no refit", "colours stay as they are (--no-refit)", refit=False),
+        Variant("no refit", "colours are not refitted (--no-refit)", refit=False),
     ]
     if sh_degree:
         parts += [

@@ -1,4 +1,4 @@
-"""What a grid scene would take in other coders: sizes only, since the same integers decode to the same scene."""
+"""Sizes of a grid scene in other coders. Quality need not be measured: the same integers decode to the same scene."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.grid.grid_scene import GridScene
 
 LENGTH_BYTES = 4
-"""A coded plane says how long it is. Its first and its least number count nothing: a few bytes in favour of other coders."""
+"""Bytes for the length of a coded plane. Its first and least numbers are not counted, in favour of the other coders."""
 
 
 def coder_sizes(grid: GridScene, size: int) -> dict[str, int]:
-    """Bytes of the file by coder, the header as it is.
+    """Bytes of the file by name of the coder; the header stays the same.
 
     Parameters
     ----------
+    grid : GridScene
+        The scene.
     size : int
         Bytes of the finished file.
     """
@@ -30,12 +32,11 @@ def coder_sizes(grid: GridScene, size: int) -> dict[str, int]:
 
 
 def plane_sizes(grid: GridScene) -> dict[str, int]:
-    """Bytes of all integers by coder.
+    """Bytes of all integers by name of the coder.
 
-    Every plane of integers is coded alone, as it is or as differences from row to row along the grid's curve, whichever is
-    smaller; `fixed bits` has no differences. For zlib and lzma integers are split into planes of bytes, as many as the
-    largest needs. `order-0 entropy` is no coder but a bound: none that takes each integer by itself does better, and its
-    tables are free.
+    Every plane of integers is coded alone, either as it is or as differences from row to row; the smaller one counts.
+    `fixed bits` has no differences. For zlib and lzma, integers are split into planes of bytes, as many as the largest
+    integer needs. `order-0 entropy` is a bound for all coders that code each integer by itself, without their tables.
     """
     sizes = dict.fromkeys(("order-0 entropy", *_COMPRESS, "fixed bits"), 0.0)
     for plane in _planes(grid):
@@ -65,11 +66,12 @@ def _byte_planes(values: np.ndarray) -> bytes:
         return b""
     shifted = (values - values.min()).astype("<u8")
     width = max(-(-int(shifted.max()).bit_length() // 8), 1)
-    return shifted.view(np.uint8).reshape(-1, 8)[:, :width].T.tobytes()
+    shuffled: bytes = shifted.view(np.uint8).reshape(-1, 8)[:, :width].T.tobytes()
+    return shuffled
 
 
 def _lzma(data: bytes) -> bytes:
-    # The preset's own window of 64 MiB takes 700 MB and a quarter of a second, however little there is to code.
+    # The preset's own window of 64 MiB would take much memory and time even for a few bytes.
     window = {"id": lzma.FILTER_LZMA2, "preset": 9, "dict_size": max(len(data), 4096)}
     return lzma.compress(data, lzma.FORMAT_RAW, filters=[window])
 

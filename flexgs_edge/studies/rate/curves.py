@@ -1,4 +1,4 @@
-"""A measured curve of bytes and loss, read between its points: what other points cost against it."""
+"""A rate-distortion curve through measured points, so that other points can be compared at equal bytes or equal loss."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 
 LEAST_LOSS = 0.001
-"""Losses are read on a log scale, like bytes (a straight line is then a power law, which such curves nearly are); points below
-this many dB are left out."""
+"""Points with less loss than this, in dB, are left out. Loss and bytes are interpolated on log scales, because such curves are
+nearly power laws."""
 SLACK = 1e-9
-"""The curve's own points lie on it, however their logarithms are rounded."""
+"""Tolerance, so that the curve's own points lie on it in spite of rounding."""
 
 
 class Curve:
@@ -19,24 +19,24 @@ class Curve:
     Parameters
     ----------
     points : iterable of (size, loss)
-        In bytes and dB.
+        Bytes and dB.
     """
 
     def __init__(self, points: Iterable[tuple[int, float]]) -> None:
         known = sorted((size, loss) for size, loss in points if loss >= LEAST_LOSS)
         self._sizes = np.log([size for size, _ in known])
-        # Noise may leave a smaller file the better one: what a loss costs is then the smaller file.
+        # With noise a smaller file may be the better one. The smaller file then counts.
         self._losses = np.minimum.accumulate(np.log([loss for _, loss in known]))
 
     def loss(self, size: int) -> float | None:
-        """Loss of a file of so many bytes, dB; None beyond the curve's ends."""
+        """Loss in dB of a file of `size` bytes; None beyond the curve's ends."""
         place = float(np.log(size))
         if not len(self._sizes) or not self._sizes[0] - SLACK <= place <= self._sizes[-1] + SLACK:
             return None
         return float(np.exp(np.interp(place, self._sizes, self._losses)))
 
     def size(self, loss: float) -> float | None:
-        """Bytes at a loss, the fewest there; None beyond the curve's ends."""
+        """Fewest bytes at `loss` dB; None beyond the curve's ends."""
         place = float(np.log(max(loss, 1e-12)))
         if not len(self._sizes) or not self._losses[-1] - SLACK <= place <= self._losses[0] + SLACK:
             return None

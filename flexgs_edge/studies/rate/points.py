@@ -1,4 +1,4 @@
-"""Files of a scene, made by each method at the sizes asked for and judged alike."""
+"""Makes files of a scene by each method at the wanted sizes, and measures all of them alike."""
 
 from __future__ import annotations
 
@@ -36,31 +36,31 @@ from flexgs_edge.units import format_size
 LOG = logging.getLogger("flexgs_edge")
 
 MAX = "max"
-"""The effort that distils: a curve of its own."""
+"""The effort that distils. It gets a curve of its own."""
 
 
 @dataclass(frozen=True)
 class RatePoint:
-    """A file and what it is worth.
+    """A file and its quality.
 
     Parameters
     ----------
     method : str
         `best`, `paper`, or the format of another program.
     variant : str
-        What was taken away, or `whole`.
+        The part that was taken away, or `whole`.
     effort : str or None
-        Of the search, where there was one.
+        Effort of the search, if there was one.
     wanted : float or None
-        Ratio that was asked for.
+        The ratio that was asked for.
     size : int
-        Bytes.
+        Bytes of the file.
     kept : int
-        Gaussians.
+        Gaussians in the file.
     quality : Quality
         Over the views that decide, with SSIM.
     seconds : float or None
-        Of search or conversion, without the last look at the quality.
+        Time of the search or conversion, without measuring the final quality.
     """
 
     method: str
@@ -74,13 +74,13 @@ class RatePoint:
 
     @property
     def ssim(self) -> float | None:
-        """Against the photos, where there are some, else against the original's renders."""
+        """SSIM against the photos if there are any, else against the original's renders."""
         return self.quality.ssim_original if self.quality.ssim_photo is None else self.quality.ssim_photo
 
 
 @dataclass(frozen=True)
 class Found:
-    """Points, and what could not be had, in words."""
+    """Points, and sentences about those that could not be made."""
 
     points: tuple[RatePoint, ...]
     missing: tuple[str, ...] = ()
@@ -126,19 +126,19 @@ def point_row(studied: StudyScene, point: RatePoint) -> dict[str, Cell]:
 
 
 def loss_of(studied: StudyScene, point: RatePoint) -> float:
-    """The figure that decides."""
+    """The loss of a point in the figure that decides, dB."""
     return measurement_of(point.quality).loss(studied.plan.figure)
 
 
 def paper_points(studied: StudyScene, ratios: Sequence[float]) -> Found:
-    """`--method paper`: nothing pruned, and the least loss that its search finds in every size asked for."""
+    """Points of `--method paper`: one with nothing pruned, and the best quality that its search finds in each size."""
     found = Found((_paper_point(studied, None, EVERYTHING, 0.0),))
     least = studied.size(Setting(EVERYTHING))
     for ratio in ratios:
         started = time.perf_counter()
         target = _target(studied, ratio)
         if least <= target.limit_bytes:
-            continue  # nothing has to be pruned for it: the first point is all that there is to say
+            continue  # nothing has to be pruned for this size: the first point covers it
         search = studied.adapt(target)
         if search.reached:
             point = _paper_point(studied, ratio, search.chosen.choice, time.perf_counter() - started)
@@ -161,16 +161,24 @@ def _paper_point(studied: StudyScene, ratio: float | None, choice: Choice, secon
 def best_points(
     studied: StudyScene, variant: Variant, effort: str, ratios: Sequence[float], recode: Sequence[float] = ()
 ) -> Found:
-    """`--method best`, whole or without a part, at every ratio: one path for all of them, the weakest compression first.
+    """Points of `--method best`, whole or without a part. All ratios share their rounds, the weakest compression first.
 
     Parameters
     ----------
+    studied : StudyScene
+        The scene.
+    variant : Variant
+        The method, or the method without a part.
+    effort : str
+        Effort of the searches.
+    ratios : sequence of float
+        PLY bytes over file bytes, one search for each.
     recode : sequence of float
         Ratios whose grids are also sized in other coders.
     """
     run, source = studied.run, studied.run.source
     options = replace(studied.run.options, effort=effort, refit=variant.refit, best_effort=True)
-    # All sizes share one path, and so its poses: those of the largest.
+    # All sizes share their rounds, and so their poses: those of the largest size.
     largest = replace(
         options, max_drop=None, min_fidelity=None, max_size=None, min_ratio=min(ratios), max_worst_drop=None
     )
@@ -200,18 +208,20 @@ def best_points(
 
 
 def _recoded(grid: GridScene, point: RatePoint) -> tuple[RatePoint, ...]:
-    """The same grid in other coders: other sizes, same quality."""
+    """Points of the same grid in other coders, with other sizes and the same quality."""
     sizes = coder_sizes(grid, point.size)
     return tuple(replace(point, variant=name, size=size, seconds=None) for name, size in sizes.items())
 
 
 def peer_points(studied: StudyScene, folder: Path) -> Found:
-    """The whole scene, unpruned, in the formats of other programs.
+    """Points of the whole scene, unpruned, in the formats of other programs.
 
     Parameters
     ----------
+    studied : StudyScene
+        The scene.
     folder : Path
-        For the files, which are gone afterwards.
+        For the files, which are removed afterwards.
     """
     found = NOTHING
     for suffix, format in FORMATS.items():
@@ -219,7 +229,7 @@ def peer_points(studied: StudyScene, folder: Path) -> Found:
         try:
             check_converter(f"a {suffix} to compare with")
             found += Found((_said(_peer_point(studied, name, format, folder / f"scene{suffix}")),))
-        except InputError as error:  # no converter, or a scene that this format cannot hold
+        except InputError as error:  # the converter is missing, or the format cannot hold this scene
             LOG.warning("%s left out: %s", name, error)
             found += Found((), (f"{name} ({error})",))
     return found
@@ -230,7 +240,7 @@ def _peer_point(studied: StudyScene, name: str, format: Format, place: Path) -> 
     with ExitStack() as stack:
         files = stack.enter_context(open_files(format, studied.run, place))
         started = time.perf_counter()
-        # In the order that `compress` writes rows in: bytes repeat along a curve.
+        # Rows in the order that `compress` writes: neighbours along the curve have similar bytes.
         path, decoded = files.write(source.select(near_order(source)))
         seconds = time.perf_counter() - started
         with studied.bench.renderer.load(decoded) as scene:

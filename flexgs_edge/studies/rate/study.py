@@ -1,4 +1,4 @@
-"""`study rate`: bytes against quality of every method and format, and of the measured method without each of its parts."""
+"""`study rate`: bytes against quality of every method and format, and of `best` without each of its parts."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ RATIOS = (8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 ABLATED = (16.0, 64.0)
 ABLATION_EFFORT = "fast"
 DISTILLED = (32.0, 64.0, 128.0)
-"""Below 30x every pixel is looked at, and each point takes twice as long."""
+"""Ratios of the points at the effort `max`. Below 30 every pixel is looked at, and each point takes longer."""
 
 
 class RateStudy(WrittenStudy):
-    """What `study rate` found and wrote."""
+    """The results of `study rate`, and their folder."""
 
     command = "study rate"
 
@@ -56,33 +56,33 @@ def study_rate(
     Parameters
     ----------
     scene : path
-        What `compress` takes.
+        Any scene that `compress` takes.
     output : path
         Folder of the results: index.html, and rate, fidelity and parts as .csv, .json, .png and .svg. It appears when
-        everything is done; `force` lets it replace files of these names in a folder that is there.
+        everything is done. With `force` it may replace files of these names in an existing folder.
     options : CompressOptions, optional
-        Views, drawing, memory and device as for `compress`; `effort` is that of the curves.
+        Views, drawing, memory and device as for `compress`. `effort` is that of the curves.
     progress : Progress, optional
-        Bars on long work.
+        Progress bars. Default: none.
     ratios : sequence of float
-        PLY bytes to file bytes, for the curves.
+        PLY bytes over file bytes, for the curves.
     ablations : sequence of float
-        The same for the points without a part; none leaves them out.
+        PLY bytes over file bytes, for the points without a part. If empty, these are left out.
     ablation_effort : str
-        Of these points, and of the curve that they are held against.
+        Effort of these points, and of the curve that they are compared with.
     distilled : sequence of float
-        PLY bytes to file bytes of the points at the effort `max`; none leaves them out.
+        PLY bytes over file bytes, for the points at the effort `max`. If empty, these are left out.
     **words
-        Single options by the names of `CompressOptions`.
+        Single options, by their names in `CompressOptions`.
 
     Raises
     ------
     FlexGSError
-        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
+        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "best"})
     _check(ratios, ablations, ablation_effort, distilled)
-    # Loaded before the memory is planned, so that its bytes count as taken.
+    # Matplotlib is loaded before the memory is planned, so that its bytes count as taken.
     require_matplotlib()
     check_folder(output, options.force)
     with atomic_folder(output, options.force) as folder:
@@ -98,9 +98,9 @@ def study_rate(
 
 
 _INTRO = (
-    "What flexgs-edge makes of a scene at many sizes, beside the paper's method and the formats of other programs. Sizes are "
-    "bytes of the finished file; ratios are to the PLY as INRIA writes it. All methods are judged by the same renderer over "
-    "the same views."
+    "Bytes and quality of a scene compressed by flexgs-edge to many sizes, beside the paper's method and the formats of other "
+    "programs. Sizes are bytes of the finished file. Ratios are to the PLY as INRIA writes it. All methods are judged by the "
+    "same renderer over the same views."
 )
 
 
@@ -129,7 +129,7 @@ def _experiments(
     if distilled:
         try:
             found += best_points(studied, WHOLE, MAX, distilled)
-        except BudgetError as error:  # a descent stays in memory as a whole
+        except BudgetError as error:  # a descent does not stream
             found += Found((), (f"best ({MAX}: {error})",))
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder) as place:
         found += peer_points(studied, Path(place))

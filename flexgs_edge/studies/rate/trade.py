@@ -1,4 +1,4 @@
-"""Experiments on points of bytes and quality: all methods side by side, and what each part of the measured one is worth."""
+"""Experiments on bytes and quality: all methods side by side, and the bytes that each part of `best` saves."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
 from flexgs_edge.studies.study_scene import FIGURES, StudyScene
 
 CODERS = {
-    "order-0 entropy": "a bound for coders that take each integer by itself, their tables free",
+    "order-0 entropy": "a bound for coders that code each integer by itself, without their tables",
     "lzma": "lzma (Python's, preset 9) on each plane, instead of the context coder",
     "zlib": "zlib (level 9) on each plane, instead of the context coder",
     "fixed bits": "as many bits a value as each plane's range needs, instead of the context coder",
@@ -22,7 +22,7 @@ FIDELITY_WORDS = "fidelity: PSNR against the original's renders"
 
 
 def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str], effort: str) -> Experiment:
-    """Bytes and the deciding figure of every method; the table holds all points of the study."""
+    """Compare all methods by bytes and the deciding figure. The table holds all points of the study."""
     table = Table(point_columns(), tuple(point_row(studied, point) for point in points))
     with_photos = studied.plan.figure == "drop"
     figure = studied.figure if with_photos else "fidelity"
@@ -35,8 +35,8 @@ def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str
         f"Every method at the sizes asked for: best at the effort {effort} and distilled (the effort {MAX}), paper with "
         "its rates to choose, and the whole scene in the formats of other programs as this one writes them. "
         f"{'PSNR and SSIM are against the photos' if with_photos else 'SSIM is against the original: there are no photos'}; "
-        f"{FIDELITY_WORDS}. The rows hold all points of this study, those without a part of the method among them. The first "
-        "seconds of a curve include most of the path of prune and rescore, which its other points go on from.",
+        f"{FIDELITY_WORDS}. The rows hold all points of this study, also those without a part of the method. The first seconds "
+        "of a curve include most of the rounds of pruning, which its other points share.",
         table,
         _chart(table, "Bytes and quality", figure, effort),
         tuple(findings),
@@ -45,7 +45,7 @@ def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str
 
 
 def fidelity(studied: StudyScene, points: Sequence[RatePoint], effort: str) -> Experiment:
-    """The same against the original's renders, where the photos decide: how far the picture moved at all."""
+    """Compare all methods by bytes and fidelity to the original's renders, for scenes that photos decide."""
     names = ("method", "wanted_ratio", "variant", "effort", "size", "ratio", "fidelity")
     rows = [
         point_row(studied, point) for point in points if _on_curve(point.method, point.variant, point.effort, effort)
@@ -55,7 +55,7 @@ def fidelity(studied: StudyScene, points: Sequence[RatePoint], effort: str) -> E
     return Experiment(
         "fidelity",
         "Bytes and fidelity",
-        f"The same files; {FIDELITY_WORDS}, which a drop against photos does not show: an error may come nearer to a photo.",
+        f"The same files; {FIDELITY_WORDS}, which shows all errors. A drop against photos hides those that come nearer to one.",
         table,
         _chart(table, "Bytes and fidelity", "fidelity", effort),
         (
@@ -105,7 +105,7 @@ def _note(row: dict[str, Cell]) -> str:
 
 
 def _comparisons(studied: StudyScene, points: Sequence[RatePoint], effort: str) -> Iterable[str]:
-    """Sentences on best against each other method and effort, at equal loss."""
+    """Sentences that compare best with each other method and effort, at equal loss."""
     figure = FIGURES[studied.figure].removesuffix(" (dB)")
     best = _points(points, "best", WHOLE.name, effort)
     paper = {point.wanted: point for point in _points(points, "paper", WHOLE.name, effort)}
@@ -130,7 +130,7 @@ def _comparisons(studied: StudyScene, points: Sequence[RatePoint], effort: str) 
     others = sorted({p.effort for p in points if p.effort not in (None, effort) and p.variant == WHOLE.name} - {None})
     whole = _modelled(best)
     for other in others:
-        # Few bytes apart: a drop against photos would say chance.
+        # Efforts differ by few bytes. The drop against photos is too noisy to tell.
         known = [_more(p.size, whole.size(p.quality.modelled_drop)) for p in _points(points, "best", WHOLE.name, other)]
         costs = [cost for cost in known if cost is not None]
         if costs:
@@ -153,7 +153,7 @@ def _modelled(points: Iterable[RatePoint]) -> Curve:
 
 
 def _share(studied: StudyScene, curve: Curve, point: RatePoint) -> float | None:
-    """Bytes on the curve over the point's, at its loss."""
+    """Bytes on the curve at the point's loss, divided by the point's bytes."""
     size = curve.size(loss_of(studied, point))
     return None if size is None else size / point.size
 
@@ -161,7 +161,7 @@ def _share(studied: StudyScene, curve: Curve, point: RatePoint) -> float | None:
 def parts(
     studied: StudyScene, points: Sequence[RatePoint], variants: Sequence[Variant], effort: str, ratios: Sequence[float]
 ) -> Experiment:
-    """What every part is worth: bytes at equal loss and loss at equal bytes, against the whole method at the same effort."""
+    """Compare the method without each part with the whole method, at equal loss and at equal bytes."""
     figure = FIGURES[studied.figure].removesuffix(" (dB)")
     whole = _points(points, "best", WHOLE.name, effort)
     curve = _curve(studied, whole)
@@ -186,10 +186,10 @@ def parts(
     return Experiment(
         "parts",
         "Each part earns its place",
-        f"best with one part taken away at a time, at the effort {effort}, against the whole method at that effort, whose points "
-        "are joined by power laws. Other coders hold the same integers: quality is the whole method's, and each plane is coded "
-        "alone, as it is or as differences along the curve. A dash: beyond the whole method's points. Drops of a few hundredths "
-        "of a dB are mostly chance, which way errors fall against the photos: the modelled drop is then the steadier figure.",
+        f"best with one part taken away at a time, at the effort {effort}, compared with the whole method at that effort. "
+        "Power laws join the whole method's points. Other coders code the same integers, so quality is equal; each plane is "
+        "coded alone, as it is or as differences along the curve. A dash means beyond the whole method's points. Drops of a few "
+        "hundredths of a dB are mostly chance; the modelled drop is then the steadier figure.",
         table,
         BarChart(
             "What it costs to leave a part out",
@@ -222,7 +222,7 @@ def _part_row(studied: StudyScene, curve: Curve, modelled: Curve, point: RatePoi
 
 
 def _more(size: int, whole: float | None) -> float | None:
-    """By how much `size` is larger, in per cent."""
+    """By how many per cent `size` is larger than `whole`."""
     return None if whole is None else round(100 * size / whole - 100, 2) + 0.0  # no -0.0
 
 
@@ -241,6 +241,6 @@ def _part_words(table: Table, name: str, figure: str) -> str:
 
 
 def _broken(name: str) -> str:
-    """Two lines, for the foot of a bar."""
+    """The name in two lines, for the foot of a bar."""
     first, _, rest = name.partition(" ")
     return f"{first}\n{rest}" if rest else first

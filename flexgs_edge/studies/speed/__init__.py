@@ -1,1 +1,1 @@
-"""`study speed`: time against quality, and where the time goes."""
+"""`study speed`: how much quality less work costs, and where time is spent."""

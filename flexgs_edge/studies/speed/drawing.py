@@ -1,4 +1,4 @@
-"""Drawing faster and worse: fewer SH, fewer splats, other extents, half precision and small pictures, against the exact view."""
+"""Times faster but less exact ways to draw: fewer SH, fewer splats, other extents, half precision, small pictures."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from flexgs_edge.studies.study_scene import StudyScene
 from flexgs_edge.views.references import to_half
 
 REPEATS = 5
-"""Rounds over all settings; the least of each one's passes counts, since whatever else runs on a machine only adds."""
+"""Rounds over all settings. The shortest time of each counts, because other work on the machine only adds time."""
 THRESHOLDS = (1, 4, 8, 16)
-"""Opacities, in 255ths, below which splats are left out."""
+"""Least opacities, in 255ths; splats below them are left out."""
 SHRINKS = (2, 4)
-"""Sides of the small pictures, as parts of the whole."""
+"""Divisors of both sides of the picture."""
 CHUNK = 1 << 16
 EXACT = "exact"
 
 
 class LowerDegree(SceneSource):
-    """A scene with SH up to a lower degree only."""
+    """A scene with SH only up to a lower degree."""
 
     def __init__(self, parent: SceneSource, degree: int) -> None:
         self.parent, self.sh_degree = parent, degree
@@ -62,7 +62,7 @@ class HalfPrecision(SceneSource):
         rows, planes = self.begin_read(rows, fields, out)
         self.parent.read(rows, fields, planes)
         for plane in planes.values():
-            # Infinite values could not be drawn at all; saturated ones are merely wrong.
+            # Infinite values could not be drawn, but saturated ones can.
             plane[...] = to_half(plane)
         return planes
 
@@ -74,13 +74,13 @@ class Way:
     Parameters
     ----------
     kind, name : str
-        What is made less of, and how far.
+        What is reduced, and to what.
     source : SceneSource
-        What is drawn.
+        The scene to draw.
     extent : str
-        Of the renderer.
+        Extent of splats, as for the renderer.
     shrink : int
-        Sides of the picture, divided by this.
+        Divisor of both sides of the picture.
     """
 
     kind: str
@@ -90,13 +90,13 @@ class Way:
     shrink: int = 1
 
     def cameras(self, views: Sequence[Camera]) -> list[Camera]:
-        """The views at the size they are drawn."""
+        """The views at the size at which they are drawn."""
         shrink = self.shrink
         return [view.scaled(max(view.width // shrink, 1), max(view.height // shrink, 1)) for view in views]
 
 
 def ways(source: SceneSource, extent: str) -> Iterator[Way]:
-    """The exact way, then all others that there are for this scene."""
+    """The exact way first, then all others that make sense for this scene."""
     yield Way(EXACT, EXACT, source, extent)
     for degree in range(source.sh_degree):
         yield Way("SH degree", str(degree), LowerDegree(source, degree), extent)
@@ -114,7 +114,7 @@ def ways(source: SceneSource, extent: str) -> Iterator[Way]:
 
 
 def drawing(studied: StudyScene, repeats: int = REPEATS) -> Experiment:
-    """Time of a view against its PSNR to the exact one."""
+    """Measure the time of a view, and its PSNR against the exact view."""
     options, judge = studied.run.options, studied.judge
     assert options.near is not None and options.background is not None and options.extent is not None
     backend = studied.bench.renderer.backend
@@ -141,7 +141,7 @@ def drawing(studied: StudyScene, repeats: int = REPEATS) -> Experiment:
                     errors[place] = [
                         _error(renderer.render(scene, c), judge.original(i)) for i, c in enumerate(cameras)
                     ]
-            renderer.release()  # two renderers share one budget
+            renderer.release()  # the next renderer needs this memory: both share one budget
     rows = _rows(every, seconds, errors, len(judge.cameras))
     return _experiment(studied, every, rows, repeats)
 
@@ -192,10 +192,10 @@ def _experiment(studied: StudyScene, every: Sequence[Way], rows: list[dict[str, 
         "drawing",
         "Time of a view and what it is worth",
         f"The {len(studied.judge.cameras)} deciding views ({studied.judge.cameras[0].width}x{studied.judge.cameras[0].height}), "
-        "drawn whole and read back, in less exact ways; PSNR is against the exact views, mean over the views that differ. "
-        f"Times are the least of {repeats} rounds over all settings, with the scene loaded. Splats below an opacity of 1/255 "
-        "never show. Half precision is that of the stored values: they are drawn in single precision, so its time is that "
-        "of the exact view. Small pictures are enlarged bilinearly for the comparison, which is not timed.",
+        "drawn whole and read back, in less exact ways. PSNR is against the exact views, mean over the views that differ. "
+        f"Times are the shortest of {repeats} rounds over all settings, with the scene loaded. Splats below an opacity of 1/255 "
+        "never show. Half precision is about stored values; they are drawn in single precision, in the time of the exact "
+        "view. Small pictures are enlarged bilinearly for the comparison, which is not timed.",
         table,
         LineChart(
             "Time of a view against its PSNR",
@@ -241,7 +241,7 @@ def _experiment(studied: StudyScene, every: Sequence[Way], rows: list[dict[str, 
 
 
 def _opacity(source: SceneSource) -> np.ndarray:
-    """[N] f64 in (0, 1)."""
+    """[N] f64, opacities in (0, 1)."""
     opacity = np.empty(source.count)
     for rows in source.chunks(CHUNK):
         logits = source.read(rows, ["opacity_logits"])["opacity_logits"][0].astype(np.float64)
@@ -254,7 +254,7 @@ def _error(image: np.ndarray, exact: np.ndarray) -> float:
 
 
 def _enlarged(image: np.ndarray, like: np.ndarray) -> np.ndarray:
-    """The image at the size of another; bilinear between pixel centres."""
+    """The image, enlarged to the size of `like`, bilinear between pixel centres."""
     if image.shape == like.shape:
         return image
     for axis in (0, 1):

@@ -1,4 +1,4 @@
-"""The Pareto front: what no other point beats in both respects."""
+"""The Pareto front of points with a cost and a worth."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 
 def front(costs: Sequence[float], worths: Sequence[float]) -> list[bool]:
-    """For each point whether no other costs as little and is worth as much, and differs from it.
+    """For each point, whether it is on the front: no other, different point costs at most as much and is worth at least as much.
 
     >>> front([1.0, 2.0, 3.0, 3.0], [5.0, 4.0, 6.0, 6.0])
     [True, False, True, True]

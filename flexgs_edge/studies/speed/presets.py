@@ -1,4 +1,4 @@
-"""Whole runs of `compress`: time against the ratio at one drop, by method and effort."""
+"""Times whole runs of `compress` for each method and effort, all at one target."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from flexgs_edge.studies.speed.front import front
 LOG = logging.getLogger("flexgs_edge")
 
 PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"), ("best", "thorough"), ("best", "max"))
-"""Method and effort."""
+"""Method and effort of each run."""
 
 
 def presets(path: str | Path, options: CompressOptions, progress: Progress) -> Experiment:
@@ -55,8 +55,8 @@ def presets(path: str | Path, options: CompressOptions, progress: Progress) -> E
     return Experiment(
         "presets",
         "Time of a whole run and the ratio that it finds",
-        f"compress by each method and effort, asked for {target}: opening, scoring, searching, coding and the last look at "
-        "the quality, in one process whose device is started and whose kernels are built before. Nothing is written.",
+        f"compress by each method and effort, asked for {target}: opening, scoring, searching, coding and measuring the final "
+        "quality. All run in one process, whose device is started and whose kernels are built before. Nothing is written.",
         table,
         LineChart(
             "Time of a run against the ratio that it finds",

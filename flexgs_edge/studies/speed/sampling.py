@@ -1,4 +1,4 @@
-"""Quality from a part of the tiles: how wide its interval is, how often it holds, and what is saved."""
+"""Tests estimates of quality from a part of the tiles: width of the interval, how often it holds, and time saved."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from flexgs_edge.studies.study_scene import Setting, StudyScene
 SHARES = (0.05, 0.1, 0.2, 0.5, 1.0)
 TRIALS = 200
 ROUNDS = 3
-"""Of timing a whole measurement; the least counts."""
+"""Rounds of timing a whole measurement. The shortest time counts."""
 BY_PLACE = "nothing"
 FIRST, NEAREST = "first step", "nearest step"
 
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds of a whole measurement, a view.
+    """Seconds that measuring one whole view takes.
 
     Parameters
     ----------
     fixed : float
-        Whatever is done for the whole view: projection, order, tile lists.
+        Work for the whole view: projection, sorting, tile lists.
     by_pixels : float
-        Blending and comparing: what follows the share of the tiles.
+        Work that grows with the share of tiles: blending and comparing.
     compare : float
-        Of these, comparing.
+        The part of `by_pixels` for comparing.
     """
 
     fixed: float
@@ -45,12 +45,12 @@ class Costs:
     compare: float
 
     def at(self, share: float) -> float:
-        """A view of which so large a part is blended and compared."""
+        """Seconds of a view if a share of its tiles is blended and compared."""
         return self.fixed + share * self.by_pixels
 
 
 def sampling(studied: StudyScene, trials: int = TRIALS) -> Experiment:
-    """Intervals from samples of every size, by what is known before."""
+    """Measure intervals from samples of every size, with and without an expected error map."""
     chosen = studied.search.chosen.choice
     maps, costs = _maps(studied, chosen, timed=True)
     assert costs is not None
@@ -77,7 +77,7 @@ def trial_estimates(
     share: float,
     trials: int,
 ) -> list[Estimate]:
-    """Estimates from so many samples (seeds 0, 1, ...) of error maps that are known whole."""
+    """Estimates from `trials` samples (seeds 0, 1, ...) of error maps that are known as a whole."""
     sampler = TileSampler(values, share, expected)
     errors = np.concatenate(maps)
     drawn = (sampler.draw(seed) for seed in range(trials))
@@ -85,7 +85,7 @@ def trial_estimates(
 
 
 def _earlier(studied: StudyScene, chosen: Choice) -> dict[str, Choice]:
-    """Steps of the search whose pictures may tell where errors of its answer are."""
+    """Steps of the search whose error maps may predict where the errors of its answer are."""
     steps = studied.search.steps
     place = next(i for i, step in enumerate(steps) if step.choice == chosen)
     before = [step for step in steps[:place] if step.measurement is not None]
@@ -100,7 +100,7 @@ def _earlier(studied: StudyScene, chosen: Choice) -> dict[str, Choice]:
 
 
 def _maps(studied: StudyScene, choice: Choice, timed: bool = False) -> tuple[list[np.ndarray], Costs | None]:
-    """Squared errors by tile of each deciding view; with `timed` also what measuring takes."""
+    """Squared errors by tile of each deciding view; with `timed` also the seconds of measuring."""
     judge, renderer = studied.judge, studied.bench.renderer
     evaluator = studied.evaluator(Setting(choice))
     with evaluator.quantized(choice) as quantized, renderer.load_quantized(quantized) as scene:
@@ -172,12 +172,12 @@ def _experiment(
         "sampling",
         "Fidelity from a part of the tiles",
         f"The answer of the paper's search (p = {chosen.prune / 1000:g}, s = {chosen.sh / 1000:g}; fidelity {full} when "
-        f"measured whole) over the {len(studied.judge.cameras)} deciding views, estimated {trials} times from tiles of error "
-        "maps that are known whole. Tiles of a view are cut into strata of equal expected error, and two are drawn from "
-        f"each: expected from the map of another step of the search ({'; '.join(words) or 'it had none before its answer'}), "
-        "or with nothing known, strata being runs of neighbours. The interval is one of 95 %, by the delta method. The "
-        "renderer draws whole views: the time is computed, as the measured time of a view without its blending, and the "
-        "share of blending and comparing.",
+        f"measured whole) over the {len(studied.judge.cameras)} deciding views, estimated {trials} times from some tiles of "
+        "complete error maps. Tiles of a view are cut into strata of equal expected error, and two are drawn from each. "
+        f"Errors are expected from another step of the search ({'; '.join(words) or 'it had none before its answer'}); "
+        "with nothing known, strata are runs of neighbours. The 95 % interval is by the delta method. The renderer "
+        "draws whole views, so the time is computed: the measured time of a view without blending, and the share of "
+        "blending and comparing.",
         table,
         LineChart(
             "Time of a measurement against the width of its interval",

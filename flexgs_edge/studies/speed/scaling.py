@@ -1,4 +1,4 @@
-"""How the cost of a view grows with Gaussians and pixels, and that of scoring with views: exponents of measured times."""
+"""Measures how times grow: of a view with Gaussians and pixels, of scoring with views."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from flexgs_edge.studies.study_scene import StudyScene
 
 REPEATS = 5
 PARTS = (0.125, 0.25, 0.5, 1.0)
-"""Of the Gaussians, by chance."""
+"""Shares of the Gaussians, drawn at random."""
 SIDES = (0.25, 0.5, 1.0, 2.0)
-"""Factors of both sides of a picture."""
+"""Factors on both sides of a picture."""
 SEED = 0
 
 
 @dataclass(frozen=True)
 class Load:
-    """A scene and views to draw: `amount` of what grows."""
+    """A scene and views to draw, with the amount of whatever grows."""
 
     kind: str
     amount: int
@@ -37,7 +37,7 @@ class Load:
 
 
 def scaling(studied: StudyScene, repeats: int = REPEATS) -> Experiment:
-    """Times of loads that grow in one respect at a time."""
+    """Time loads that grow in one respect at a time."""
     source, cameras = studied.run.source, studied.judge.cameras
     loads = [Load("Gaussians", len(rows), source.select(rows), cameras) for rows in _subsets(source.count)]
     for side in SIDES:
@@ -59,7 +59,7 @@ def scaling(studied: StudyScene, repeats: int = REPEATS) -> Experiment:
 
 
 def _subsets(count: int) -> list[np.ndarray]:
-    """Rows by chance, ascending; each set holds the one before it."""
+    """Random rows, ascending; each set contains the one before it."""
     order = np.random.default_rng(SEED).permutation(count)
     return [np.sort(order[: max(round(part * count), 1)]) for part in PARTS]
 
@@ -75,7 +75,7 @@ def _columns(by_stage: dict[str, float]) -> dict[str, Cell]:
 
 
 def _by_views(studied: StudyScene, repeats: int) -> list[dict[str, Cell]]:
-    """Hits and weights of every Gaussian over ever more training poses."""
+    """Time scoring (hits and weights) over more and more training poses."""
     renderer, cameras = studied.bench.renderer, studied.views.of(studied.views.train)
     counts = view_counts(len(cameras))
     spread = {count: [cameras[i * len(cameras) // count] for i in range(count)] for count in counts}
@@ -116,12 +116,12 @@ def _experiment(studied: StudyScene, rows: list[dict[str, Cell]], repeats: int) 
     return Experiment(
         "scaling",
         "How times grow",
-        f"Gaussians and pixels: ms of a view, mean of the {len(studied.judge.cameras)} deciding ones, drawn and read back; and "
-        "the stages of it with a wait after every kernel, which is why they may sum to more. Gaussians are left out by "
-        "chance, so fewer of them cover less of the picture. Pixels: both sides times "
+        f"Gaussians and pixels: ms of a view, mean of the {len(studied.judge.cameras)} deciding ones, drawn and read back. "
+        "Stages are timed with a wait after every kernel, so their sum may be larger. Gaussians are left out at "
+        "random, so fewer of them cover less of the picture. Pixels: both sides times "
         f"{', '.join(f'{side:g}' for side in SIDES)} from {camera.width}x{camera.height}. Views: ms of counting hits and "
-        f"weights over so many training poses. Times are the least of {repeats} rounds. An exponent is the slope of the "
-        "logarithms over all amounts, not a law.",
+        f"weights over so many training poses. Times are the shortest of {repeats} rounds. An exponent is the slope of the "
+        "logarithms over all amounts.",
         table,
         LineChart(
             "Times of parts and multiples of the scene's own amounts",
@@ -137,7 +137,7 @@ def _experiment(studied: StudyScene, rows: list[dict[str, Cell]], repeats: int) 
 
 
 def _whole(studied: StudyScene, kind: str, amounts: list[int]) -> int:
-    """The amount that the scene has by itself."""
+    """The amount of the whole scene."""
     cameras = studied.judge.cameras
     pixels = sum(camera.width * camera.height for camera in cameras) // len(cameras)
     return pixels if kind == "pixels" else max(amounts)

@@ -1,4 +1,4 @@
-"""How many views a score needs: the time of scoring against what is left of the quality at one size."""
+"""Measures how many views a score needs: time of scoring, and quality at one size."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from flexgs_edge.studies.study_scene import FIGURES, RANK_BYTES, StudyScene
 FEWEST = 4
 SCORES = {"gs": "the paper's score gs", "removal": "measured costs of removal"}
 ORDERS = {
-    "covering": "each next pose the one that adds most to what those before it see, as compress takes them",
-    "farthest": "each next pose farthest from those before it",
+    "covering": "each next pose adds most to what those before it see, as in compress",
+    "farthest": "each next pose is farthest from those before it",
     "even": "poses spread evenly by name",
     "first": "the first poses by name",
 }
 COMPARED = ("covering", "farthest", "even")
-"""Of `ORDERS`, those of `study speed`."""
+"""The orders among `ORDERS` that `study speed` compares."""
 ALL = "all"
 HEADS = {"score": "score", "poses": "poses", "views": "views scored"}
 
 
 def view_counts(count: int, fewest: int = FEWEST) -> list[int]:
-    """4, 8, 16, ... (or from another number on) below the number of views, and all of them.
+    """Numbers of views: `fewest`, then always twice as many below `count`, and `count` itself.
 
     >>> view_counts(20), view_counts(3), view_counts(3, 1)
     ([4, 8, 16, 20], [3], [1, 2, 3])
@@ -49,7 +49,7 @@ def view_counts(count: int, fewest: int = FEWEST) -> list[int]:
 
 
 def spearman(a: np.ndarray, b: np.ndarray) -> float:
-    """Correlation of the ranks of two [N] scores; equal values share the mean of their ranks, infinities are allowed.
+    """Rank correlation of two [N] scores. Equal values share the mean of their ranks, and infinities are allowed.
 
     >>> spearman(np.array([1.0, 2.0, 3.0]), np.array([-np.inf, 5.0, 9.0])), spearman(np.arange(3), -np.arange(3))
     (1.0, -1.0)
@@ -67,7 +67,7 @@ def _ranks(values: np.ndarray) -> np.ndarray:
 
 
 def scoring(studied: StudyScene) -> list[Experiment]:
-    """Scores from ever more views: their time, their ranks and the quality that they leave."""
+    """Score from more and more views; compare times, ranks and quality."""
     rows = score_rows(studied)
     best = front([float(row["seconds"] or 0) for row in rows], [-float(row[studied.figure] or 0) for row in rows])
     for row, on in zip(rows, best):
@@ -77,14 +77,16 @@ def scoring(studied: StudyScene) -> list[Experiment]:
 
 
 def score_rows(studied: StudyScene, fewest: int = FEWEST, orders: Sequence[str] = COMPARED) -> list[dict[str, Cell]]:
-    """Rows of each score from ever more views, and from all of them: seconds, ranks, and what the answer of the search is worth.
+    """Rows for each score from more and more views: seconds, ranks, and quality of the search's choice.
 
     Parameters
     ----------
+    studied : StudyScene
+        The scene.
     fewest : int
-        Views of the smallest set.
+        Views in the smallest set.
     orders : sequence of str
-        Of `ORDERS`: which views make a set.
+        Names in `ORDERS`, which decide the views of a set.
     """
     cameras = studied.views.of(studied.views.train)
     counts = view_counts(len(cameras), fewest)
@@ -99,7 +101,7 @@ def score_rows(studied: StudyScene, fewest: int = FEWEST, orders: Sequence[str] 
     }
     sets: list[tuple[str, int, list[Camera]]] = [(ALL, len(cameras), cameras)]
     sets += [(name, n, [cameras[i] for i in places[name](n)]) for n in counts[:-1] for name in orders]
-    choice = studied.search.chosen.choice  # before the scene is loaded below: it draws others
+    choice = studied.search.chosen.choice  # before the scene is loaded below, because the search draws other scenes
     rows: list[dict[str, Cell]] = []
     budget = studied.run.budget
     size = (8 * len(sets) + RANK_BYTES) * studied.run.source.count
@@ -136,7 +138,7 @@ def _scores(
     with renderer.load(source, storage) as scene:
         make: dict[str, Callable[[list[Camera]], np.ndarray]] = {
             "gs": lambda poses: score_scene(renderer, scene, source, poses, "gs", studied.run.progress),
-            # With the costs of SH, as a search by measured costs asks for them: they come from the same pass.
+            # Costs of SH come from the same pass, so they are measured too, as the method `best` does.
             "removal": lambda poses: measure_costs(studied.bench, scene, poses, progress=studied.run.progress).removal,
         }
         make[score](sets[0][2][:1])
@@ -149,19 +151,10 @@ def _scores(
 
 
 def _evaluator(studied: StudyScene, order: np.ndarray) -> SceneEvaluator:
-    """As `studied.evaluator`, with rows in another order."""
+    """An evaluator like `studied.evaluator`, with rows in another order."""
     bits, groups = studied.run.options.bit_spec()
     assert bits is not None
-    return SceneEvaluator(
-        studied.run.source,
-        order,
-        studied.has_sh,
-        bits,
-        groups,
-        studied.bench.renderer,
-        studied.judge,
-        studied.run.budget,
-    )
+    return SceneEvaluator(studied.ranked(order), bits, groups, studied.judge, studied.run.budget)
 
 
 def _quality(studied: StudyScene, rows: list[dict[str, Cell]], count: int) -> Experiment:
@@ -180,15 +173,15 @@ def _quality(studied: StudyScene, rows: list[dict[str, Cell]], count: int) -> Ex
     whole = {row["score"]: row for row in rows if row["poses"] == ALL}
     return Experiment(
         "scoring",
-        "Scored views and what they are worth",
+        "Quality by the number of scored views",
         f"The Gaussians are ranked from some of the {count} training poses; then the paper's method removes p = "
         f"{choice.prune / 1000:g} of them and the SH of s = {choice.sh / 1000:g} at its own bits, so all files have one "
-        f"size. gs: {SCORES['gs']}; removal: {SCORES['removal']}, from the pass that measures those of SH as well. covering: "
+        f"size. gs: {SCORES['gs']}; removal: {SCORES['removal']}, from the pass that also measures costs of SH. covering: "
         f"{ORDERS['covering']}; farthest: {ORDERS['farthest']}; even: {ORDERS['even']}. Gaussians that no scored pose sees "
-        "have no score and go first. Seconds are of scoring alone.",
+        "have no score and are removed first. Seconds are of scoring alone.",
         table,
         LineChart(
-            "Time of scoring against what it is worth at one size",
+            "Time of scoring against quality at one size",
             "seconds of scoring (log)",
             FIGURES[figure],
             tuple(_series(rows, score, poses, "seconds", figure) for score in SCORES for poses in COMPARED),
@@ -245,7 +238,7 @@ def _stability(rows: list[dict[str, Cell]], count: int) -> Experiment:
 
 def _series(rows: Sequence[dict[str, Cell]], score: str, poses: str, x: str, y: str) -> Series:
     shown = [row for row in rows if row["score"] == score and row["poses"] in (poses, ALL)]
-    # All orders have the same numbers of views: said once.
+    # All orders have the same numbers of views, so only one series names them.
     notes = [str(row["views"]) if x != "views" and poses == COMPARED[0] else "" for row in shown]
     return Series(
         f"{score}, {poses}", [float(row[x] or 0) for row in shown], [float(row[y] or 0) for row in shown], notes=notes

@@ -1,4 +1,4 @@
-"""`study speed`: what speed costs in accuracy, part by part: drawing, scoring, measuring, whole runs; and how times grow."""
+"""`study speed`: how much accuracy speed costs in drawing, scoring, measuring and whole runs, and how times grow."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TRIALS = 200
 
 
 class SpeedStudy(WrittenStudy):
-    """What `study speed` found and wrote."""
+    """The results of `study speed`, and their folder."""
 
     command = "study speed"
 
@@ -52,32 +52,32 @@ def study_speed(
     Parameters
     ----------
     scene : path
-        What `compress` takes.
+        Any scene that `compress` takes.
     output : path
         Folder of the results: index.html, and every experiment's rows and chart as .csv, .json, .png and .svg. It appears when
-        everything is done; `force` lets it replace files of these names in a folder that is there.
+        everything is done. With `force` it may replace files of these names in an existing folder.
     options : CompressOptions, optional
-        Views, drawing, memory and device as for `compress`; the target is that of the whole runs, and of the paper's search whose
-        answer other parts build on.
+        Views, drawing, memory and device as for `compress`. The target is that of the whole runs, and of the paper's search
+        that other parts build on.
     progress : Progress, optional
-        Bars on long work.
+        Progress bars. Default: none.
     parts : sequence of str
-        Some of `PARTS`.
+        Names in `PARTS`. Default: all.
     repeats : int
-        Rounds of timing; the least counts.
+        Rounds of timing. The shortest time counts.
     trials : int
-        Samples of tiles of every size.
+        How many samples of tiles to draw for each share.
     **words
-        Single options by the names of `CompressOptions`.
+        Single options, by their names in `CompressOptions`.
 
     Raises
     ------
     FlexGSError
-        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
+        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
     """
     options = replace(options or CompressOptions(), **words)
     _check(parts, repeats, trials)
-    # Loaded before the memory is planned, so that its bytes count as taken.
+    # Matplotlib is loaded before the memory is planned, so that its bytes count as taken.
     require_matplotlib()
     check_folder(output, options.force)
     with atomic_folder(output, options.force) as folder:
@@ -85,7 +85,7 @@ def study_speed(
         with open_study_scene(scene, name, replace(options, method="paper"), progress) as studied:
             found = SceneStudy.of(studied, _on_bench(studied, parts, repeats, trials))
         if "presets" in parts:
-            # With the bench's memory given back: these are runs of their own.
+            # These runs need the memory of the scene above, which is free by now.
             found = replace(found, experiments=(*found.experiments, presets(scene, options, progress)))
         page = study_page("Speed and accuracy", _INTRO, [write_scene(folder, found)])
         (folder / "index.html").write_text(page, encoding="utf-8")
@@ -94,9 +94,9 @@ def study_speed(
 
 
 _INTRO = (
-    "What less work costs: drawing views less exactly, scoring Gaussians from fewer of them, measuring a part of the pixels, and "
-    "searching less. Points that no other beats in time and accuracy are joined as the Pareto front. Times are wall times of "
-    "this run on the device named below; all but the times, and the fronts that they decide, is the same in every run."
+    "The cost of less work: drawing views less exactly, scoring Gaussians from fewer views, measuring a part of the pixels, "
+    "and searching less. The Pareto front joins points that no other point beats in time and accuracy. Times are wall times "
+    "of this run on the device named below. Everything but times, and the fronts that they decide, is equal in every run."
 )
 
 

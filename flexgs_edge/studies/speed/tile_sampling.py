@@ -1,9 +1,9 @@
-"""Quality from a sample of tiles, with an interval: the squared error of the pictures without looking at all of them.
+"""Estimates the squared error of pictures from a sample of their tiles, with a confidence interval.
 
-The tiles of each view, most expected first, are cut into strata that are expected to hold equal sums of squared error, and two
-are drawn from each. So a tile is the likelier to be drawn the more is expected of it, and the two of a stratum tell its variance
-without a model. What is expected may come from any earlier picture of the same views, such as a step of a search: wrong
-expectations make the interval wide, not wrong.
+The tiles of each view are sorted by expected error and cut into strata with equal sums of it. Two tiles are drawn from
+each stratum. So tiles with much expected error are drawn more often, and the two tiles of a stratum tell its variance
+without a model. Expected errors may come from any earlier picture of the same views, such as a step of a search. If they
+are wrong, the interval gets wider but stays valid.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.quality.psnr import mean_psnr, psnr
 
 NORMAL_95 = 1.959964
-"""Standard errors that a two-sided interval of 95 % reaches to either side."""
+"""Half-width of a two-sided 95 % interval, in standard errors."""
 FLOOR = 0.2
-"""Share of a view's mean that is expected of every tile besides: one that was exact before need not be so now.
+"""Share of a view's mean error that we also expect of every tile, because an exact tile need not stay exact.
 docs/results/tuning.md#floor"""
 DECIBEL = 10.0 / math.log(10.0)
-"""dB of a factor e of the error."""
+"""dB for a factor e in the error."""
 
 
 def tile_errors(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Sums of squared error by tile of two [H, W, 3] images clamped to [0, 1].
+    """Sums of squared error by tile, between two [H, W, 3] images clamped to [0, 1].
 
     Returns
     -------
@@ -50,7 +50,7 @@ def tile_errors(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def tile_values(height: int, width: int) -> np.ndarray:
-    """[tiles] i64, values (pixels times channels) of each tile: those at the right and lower edge may be cut."""
+    """[tiles] i64, values (pixels times channels) of each tile. Tiles at the right and lower edge may be smaller."""
     down = np.minimum(TILE, height - np.arange(0, height, TILE))
     across = np.minimum(TILE, width - np.arange(0, width, TILE))
     return (3 * down[:, None] * across).reshape(-1)
@@ -58,20 +58,20 @@ def tile_values(height: int, width: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a sample of tiles says.
+    """An estimate from a sample of tiles.
 
     Parameters
     ----------
     error : float
-        Mean squared error, mean over the views.
+        Mean squared error, averaged over the views.
     error_deviation : float
         Its standard error.
     fidelity : float or None
-        Mean over the views of their PSNRs, dB; views in whose tiles no error was found are left out.
+        Mean PSNR over the views, dB. Views without any error in the drawn tiles are left out.
     half_width : float
-        The 95 % interval of the fidelity reaches so many dB to either side.
+        Half-width of the 95 % interval of the fidelity, dB.
     share : float
-        Pixels that were looked at, of all.
+        Share of the pixels that were looked at.
     """
 
     error: float
@@ -81,23 +81,23 @@ class Estimate:
     share: float
 
     def covers(self, fidelity: float | None) -> bool:
-        """Whether the interval holds a fidelity (with the slack that the rounding of sums takes)."""
+        """Whether the interval contains a fidelity, with some slack for rounding of sums."""
         if fidelity is None or self.fidelity is None:
             return fidelity is self.fidelity
         return abs(fidelity - self.fidelity) <= self.half_width + 1e-9
 
 
 class TileSampler:
-    """Draws tiles of some views and estimates from them.
+    """Draws tiles of some views and makes estimates from them.
 
     Parameters
     ----------
     values : sequence of np.ndarray
         `tile_values` of each view.
     share : float
-        Of the pixels of each view to look at, at most (above 0, at most 1); but four tiles a view at the least.
+        Most pixels of each view to look at, as a share (above 0, at most 1). At least four tiles a view are drawn.
     expected : sequence of np.ndarray, optional
-        Squared errors by tile of an earlier picture of each view, in any unit. Without them strata are runs of neighbours.
+        Squared errors by tile of an earlier picture of each view, in any unit. By default strata are runs of neighbours.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class TileSampler:
         first = 0
         for view, of_view in enumerate(values):
             weights = np.ones(len(of_view)) if expected is None else _floored(expected[view])
-            # By whole tiles, however many of those drawn are cut at an edge: never more than the share.
+            # Edge tiles count as whole ones, so that we never look at more than the share.
             pairs = int(share * self._view_values[view] / (2 * of_view.max()))
             for stratum in _strata(weights, pairs):
                 strata.append(first + stratum)
@@ -126,14 +126,15 @@ class TileSampler:
         self._drawn = np.minimum(self._sizes, 2) if share < 1.0 else self._sizes
 
     def draw(self, seed: int) -> np.ndarray:
-        """[n] i64, tiles counted through all views (the first view's first); the same for the same seed."""
+        """[n] i64, drawn tiles, numbered through all views. The same seed gives the same tiles."""
         keys = np.random.default_rng(seed).random(len(self._tiles))
         order = np.lexsort((keys, self._stratum))
         place = np.arange(len(order)) - self._starts[self._stratum]
-        return self._tiles[order[place < self._drawn[self._stratum]]]
+        tiles: np.ndarray = self._tiles[order[place < self._drawn[self._stratum]]]
+        return tiles
 
     def estimate(self, drawn: np.ndarray, errors: np.ndarray) -> Estimate:
-        """The figures of all tiles.
+        """Estimate the figures of all tiles.
 
         Parameters
         ----------
@@ -153,7 +154,7 @@ class TileSampler:
         variance = np.bincount(self._views, variances, views) / np.square(self._view_values)
         known = means > 0
         relative = variance[known] / np.square(means[known])
-        # The logarithm of an estimate with a variance is too small in the mean: the delta method's second term.
+        # The log of a noisy estimate is too small on average: this is the second term of the delta method.
         plain = mean_psnr([psnr(float(value)) for value in means])
         fidelity = None if plain is None else plain - DECIBEL / 2 * float(relative.mean())
         return Estimate(
@@ -171,15 +172,15 @@ def _floored(expected: np.ndarray) -> np.ndarray:
 
 
 def _strata(weights: np.ndarray, pairs: int) -> list[np.ndarray]:
-    """Tiles in strata for `pairs` draws of two, of equal sums of weight: the heaviest first, ties in order of place."""
+    """Cut tiles into strata of equal weight for `pairs` draws of two. Heavy tiles come first, and ties go by place."""
     count, pairs = len(weights), max(pairs, 2)
     order = np.argsort(-weights, kind="stable")
-    below = np.concatenate([np.cumsum(weights[order][::-1])[::-1], [0.0]])  # weight from each place on
+    below = np.concatenate([np.cumsum(weights[order][::-1])[::-1], [0.0]])  # weight of all tiles from each place on
     strata, start = [], 0
     while start < count:
         stop = count
         if pairs > 1:
-            # What is left is shared anew each time: a heavy stratum of two tiles leaves the others less.
+            # The rest is shared anew each time, because a stratum of two heavy tiles leaves less for the others.
             goal = below[start] * (1 - 1 / pairs)
             stop = max(int(np.searchsorted(-below, -goal * (1 + 1e-12))), start + 2)
             stop = count if count - stop < 2 else stop

@@ -1,4 +1,4 @@
-"""Times of views: whole passes, and the stages that a view consists of."""
+"""Times views: whole passes, and the stages of a view."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ STAGES = {
     "tile lists": ("tile_room", "tile_count", "tile_scatter"),
     "blend": ("blend",),
 }
-"""Kernels of each stage of a view (the scans of the tile lists, 0.1 ms, count as sorting)."""
+"""Kernels of each stage of a view. The short scans of the tile lists count as sorting."""
 
 
 def draw_seconds(renderer: Renderer, scene: DeviceScene, cameras: Sequence[Camera]) -> float:
-    """Seconds to draw all views once, the scene and the first view's buffers being there."""
+    """Seconds to draw all views once. The scene is loaded and buffers are made before."""
     renderer.render(scene, cameras[0])
     started = time.perf_counter()
     for camera in cameras:
@@ -31,7 +31,7 @@ def draw_seconds(renderer: Renderer, scene: DeviceScene, cameras: Sequence[Camer
 
 
 def stage_seconds(renderer: Renderer, scene: DeviceScene, cameras: Sequence[Camera]) -> dict[str, float]:
-    """Seconds of each of `STAGES` over all views; every kernel is waited for, so the sum is above `draw_seconds`."""
+    """Seconds of each of `STAGES` over all views. Every kernel is waited for, so the sum exceeds `draw_seconds`."""
     renderer.render(scene, cameras[0])
     backend = renderer.backend
     backend.profile = defaultdict(float)
@@ -44,7 +44,7 @@ def stage_seconds(renderer: Renderer, scene: DeviceScene, cameras: Sequence[Came
 
 
 def slope(x: Sequence[float], y: Sequence[float]) -> float:
-    """The exponent of y as a power of x: the least-squares slope of their logarithms.
+    """The exponent of y as a power of x, from the least-squares slope of their logarithms.
 
     >>> round(slope([1, 2, 4, 8], [3, 6, 12, 24]), 6)
     1.0
@@ -53,5 +53,5 @@ def slope(x: Sequence[float], y: Sequence[float]) -> float:
 
 
 def median(values: Sequence[float]) -> float:
-    """Of at least one number."""
+    """The median of at least one number."""
     return float(np.median(np.asarray(values)))

@@ -1,1 +1,1 @@
-"""`study stability`: where methods break, and where ours stops standing."""
+"""`study stability`: under which conditions methods break."""

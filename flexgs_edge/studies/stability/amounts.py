@@ -1,4 +1,4 @@
-"""How much of every experiment of `study stability` is measured: whole, or quickly."""
+"""The points of every experiment of `study stability`: all of them, or a few for a quick look."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ class Amounts:
     Parameters
     ----------
     width : int or None
-        Views are at most so wide; None leaves that to `--resolution`.
+        Most pixels that views are wide. None (default): as `--resolution` says.
     bits : tuple of int
-        Bits a value of plain rounding.
+        Bits a value for plain rounding.
     coarser : tuple of float
-        Factors of the grid steps that best chose.
+        Factors on the step sizes that best chose.
     group_rows : tuple of int
-        Rows that share a range; 0 is all of them.
+        Rows that share a range; 0 means all rows.
     outliers : tuple of float
-        Stray values, in spreads of their channel.
+        Stray values, in standard deviations of their channel.
     pruned : tuple of int
-        Gaussians removed, or their SH, in thousandths.
+        Shares of Gaussians that are removed, or that lose their SH, in thousandths.
     distances : tuple of float
-        Of a camera to what it looks at, as factors.
+        Factors on the distance from a camera to the scene.
     poses : int
-        Held-out views that other poses are made of.
+        How many held-out views other poses are made from.
     moves : tuple of str
         Names of `moves.MOVES`.
     few : int
-        Poses that runs of the measured method on moved scenes score: with 8, refits of the sample scene differed by up to 0.7 dB.
+        Poses that runs of best on moved scenes score. With very few, refits differ from run to run.
     few_width : int
-        Pixels that their views are wide, at most.
+        Most pixels that the views of these poses are wide.
     generations : int
-        Rounds of compressing, decompressing and compressing again.
+        How often the scene is compressed, each time from the file before.
     fewest : int
-        Views that scores are first taken from; each next number is twice that.
+        Least views to score from. Each next number is twice as large.
     halves : bool
-        Score one half of the poses, judge on the other.
+        Also score from one half of the poses and judge on the other.
     even : bool
-        Stop by the even held-out views, judge on the odd ones.
+        Also let the even held-out views decide, and judge on the odd ones.
     """
 
     width: int | None = None
@@ -81,4 +81,4 @@ QUICK = Amounts(
     halves=False,
     even=False,
 )
-"""A look at every experiment, for tests: 90 seconds for a scene of 33 000 Gaussians on two cores."""
+"""A quick look at every experiment, for tests."""

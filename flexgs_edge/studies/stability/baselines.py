@@ -1,4 +1,4 @@
-"""Baselines that are no setting of a bench: one range for a whole attribute, half precision in the world, plain scores."""
+"""Baselines: one range for a whole attribute, positions in half precision, and plain scores."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from flexgs_edge.studies.study_scene import RANK_BYTES, StudyScene
 
 HALF_LARGEST = float(np.finfo(np.float16).max)
 RANGE_BYTES = 8
-"""Of a range: its low end and its step."""
+"""Bytes of a range: its low end and its step."""
 
 
 def tensor_rounded(source: SceneSource, bits: int) -> tuple[int, MemorySource]:
-    """Round to nearest with one range for all channels of an attribute: bytes (codes and ranges), and what they decode to."""
+    """Round to nearest with one range for all channels of an attribute; returns bytes (codes, ranges) and the decoded scene."""
     planes = source.read(slice(0, source.count), list(FIELD))
     size, spec = 0, BitSpec.rtn(bits)
     for field in FIELDS:
@@ -29,23 +29,23 @@ def tensor_rounded(source: SceneSource, bits: int) -> tuple[int, MemorySource]:
         planes[field.name] = (low + np.rint((values.astype(np.float64) - low) / step) * step).astype(np.float32)
         channels = len(values)
         size += array_bytes(source.count, channels, spec.of(field.name), 1) - RANGE_BYTES * (channels - 1)
-    # Four equal codes of zero are a quaternion without a direction: it is drawn as none.
+    # Four zero codes are a quaternion of length zero. The identity takes its place.
     planes["quats"][0, ~planes["quats"].any(axis=0)] = 1.0
     return size, MemorySource(planes, source.sh_degree, source.origin)
 
 
 def half_positions(source: SceneSource) -> MemorySource:
-    """The scene with its positions in the world rounded to half precision, as published programs store them."""
+    """The scene with world positions rounded to half precision, as published programs store them."""
     planes = source.read(slice(0, source.count), list(FIELD))
     world = planes["means"].astype(np.float64) + source.origin[:, None]
-    # Infinite values could not be drawn at all; saturated ones are merely wrong.
+    # Infinite values could not be drawn, but saturated ones can.
     half = np.clip(world, -HALF_LARGEST, HALF_LARGEST).astype(np.float16)
     planes["means"] = (half.astype(np.float64) - source.origin[:, None]).astype(np.float32)
     return MemorySource(planes, source.sh_degree, source.origin)
 
 
 def add_plain_orders(studied: StudyScene, removal: np.ndarray) -> None:
-    """Put the orders by chance, opacity, volume and measured costs of removal ([N] f64) beside those that the bench has."""
+    """Add orders to `studied`: random, by opacity, by volume, and by measured costs of removal ([N] f64)."""
     source = studied.run.source
     studied.run.budget.take("ranks by four more scores", 4 * RANK_BYTES * source.count)
     planes = source.read(slice(0, source.count), ["opacity_logits", "log_scales"])

@@ -1,4 +1,4 @@
-"""Experiments on rounding: fewer bits, other groups and other orders of the rows, and stray values."""
+"""Experiments on rounding: fewer bits, other groups, and other orders of the rows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.io.exchange import near_order
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.report.plots import LineChart
 from flexgs_edge.scene.source import MemorySource, SceneSource
@@ -39,7 +39,7 @@ ORDERS = ("file", "shuffled", "curve")
 
 
 def rounding(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
-    """Plain rounding from 8 bits down, in ever finer ranges, and ever coarser grids of best."""
+    """Compare plain rounding with 8 bits and fewer, in ranges of three kinds, and ever coarser grids of best."""
     rows: list[dict[str, Cell]] = []
 
     def add(method: str, bits: int | None, coarser: float | None, found: Outcome) -> None:
@@ -60,9 +60,9 @@ def rounding(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
     return Experiment(
         "bits",
         "Fewer bits",
-        f"RTN rounds every value to the same number of bits, nothing removed: with one range for an attribute, for each of its "
-        f"channels, or for each sub-group of about 512 rows. {MPQ}: 16, 8 and 4 bits in sub-groups. {BEST}: the result at the "
-        "study's target, its rows on grids of ever larger steps, colours not refitted again.",
+        f"RTN rounds every value to the same number of bits and removes nothing. It has one range for an attribute, for each "
+        f"of its channels, or for each sub-group of about 512 rows. {MPQ}: 16, 8 and 4 bits in sub-groups. {BEST}: the result at "
+        "the study's target, put on grids of larger and larger steps without another refit.",
         table,
         LineChart(
             "Fewer bits: where each way of rounding breaks",
@@ -103,7 +103,7 @@ def _of_grid(grid: GridScene) -> tuple[int, MemorySource]:
 
 
 def groups(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
-    """Rows that share a range, from few to all, in three orders of the rows."""
+    """Compare numbers of rows that share a range, from few to all, in three orders of the rows."""
     source = studied.run.source
     count = source.count
     orders = {
@@ -127,8 +127,8 @@ def groups(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
     return Experiment(
         "groups",
         "Group sizes and the order of the rows",
-        "The paper's bits, nothing removed, with a range for every so many consecutive rows (8 bytes a channel each): rows as "
-        "they are in the file, shuffled, or along a space-filling curve. best puts rows in an order of its own.",
+        "The paper's bits, nothing removed, with a range (8 bytes a channel) for each group of consecutive rows. Rows are in the "
+        "order of the file, shuffled, or along a space-filling curve. best puts rows in an order of its own.",
         table,
         LineChart(
             "Rows that share a range",
@@ -154,11 +154,11 @@ def _losses(rows: Sequence[Row]) -> list[float]:
 
 
 def _reordered(grid: GridScene, order: np.ndarray) -> GridScene:
-    """The grid of the same rows, handed over in another order."""
+    """The grid of the same rows, made from another order."""
     planes = {name: values[:, order] for name, values in from_grid(grid).items()}
     return to_grid(planes, grid.sh_degrees[order], grid.steps, grid.origin, rename=False)[0]
 
 
 def _evaluator(studied: StudyScene, source: SceneSource, has_sh: np.ndarray, bits: BitSpec = PAPER) -> SceneEvaluator:
     order = np.arange(source.count)
-    return SceneEvaluator(source, order, has_sh, bits, None, studied.bench.renderer, studied.judge, studied.run.budget)
+    return SceneEvaluator(Ranked(source, order, has_sh), bits, None, studied.judge, studied.run.budget)

@@ -1,4 +1,4 @@
-"""What a compressed scene lost, and whether that counts as broken."""
+"""The loss of a compressed scene, and whether it counts as broken."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flexgs_edge.studies.result_tables import Cell, Row
 from flexgs_edge.studies.study_scene import Setting, StudyScene
 
 BREAK = 3.0
-"""dB lost from which a method is said to have broken: twice the squared error."""
+"""A method has broken if it loses more than this, in dB: twice the squared error."""
 LOST = f"lost {BREAK:g} dB"
 
 LOSSES = {
@@ -31,19 +31,19 @@ LOSSES = {
     "fidelity": "fidelity (dB)",
     "broke": "broken by",
 }
-"""Columns that rows of outcomes end with, and their heads."""
+"""Columns at the end of rows of outcomes, and their heads."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A compressed scene and its quality, or the error that there was instead."""
+    """Size and quality of a compressed scene, or the error that compressing or drawing raised."""
 
     size: int | None
     quality: Quality | None
     error: str | None = None
 
     def cells(self, studied: StudyScene) -> dict[str, Cell]:
-        """Cells of `LOSSES`."""
+        """Cells of the columns `LOSSES`."""
         quality = self.quality
         if quality is None or self.size is None:
             return {**dict.fromkeys(LOSSES), "broke": f"error: {self.error}"}
@@ -60,21 +60,21 @@ class Outcome:
 
 
 def view_loss(studied: StudyScene, view: ViewQuality) -> float:
-    """What decides, for one view: its drop against the photo, else its modelled drop; dB."""
+    """Loss of one view in dB: its drop against the photo if there is one, else its modelled drop."""
     if studied.plan.figure == "drop" and view.drop is not None:
         return view.drop
     return modelled_drop(view.error, studied.run.options.base_psnr)
 
 
 def mean_loss(studied: StudyScene, views: Sequence[ViewQuality]) -> float:
-    """The figure that decides, over some views, dB."""
+    """Mean loss of some views in the figure that decides, dB."""
     if studied.plan.figure == "drop":
         return math.fsum(view_loss(studied, view) for view in views) / len(views)
     return Quality(tuple(views), studied.run.options.base_psnr).modelled_drop
 
 
 def outcome(studied: StudyScene, make: Callable[[], tuple[int, AbstractContextManager[DeviceScene]]]) -> Outcome:
-    """The quality of what `make` gives (bytes, and the scene to draw), or its error."""
+    """Measure the scene that `make` returns (bytes, and the scene to draw), or keep its error."""
     try:
         size, loaded = make()
         with loaded as scene:
@@ -84,7 +84,7 @@ def outcome(studied: StudyScene, make: Callable[[], tuple[int, AbstractContextMa
 
 
 def of_source(studied: StudyScene, make: Callable[[], tuple[int, SceneSource]]) -> Outcome:
-    """The same for a source."""
+    """As `outcome`, for a source."""
 
     def load() -> tuple[int, AbstractContextManager[DeviceScene]]:
         size, source = make()
@@ -94,12 +94,12 @@ def of_source(studied: StudyScene, make: Callable[[], tuple[int, SceneSource]]) 
 
 
 def of_setting(studied: StudyScene, setting: Setting) -> Outcome:
-    """The same for a setting of the bench."""
+    """As `outcome`, for a setting."""
     return of_choice(studied, lambda: studied.evaluator(setting), setting.choice)
 
 
 def of_choice(studied: StudyScene, make: Callable[[], SceneEvaluator], choice: Choice = EVERYTHING) -> Outcome:
-    """The same for a choice of an evaluator."""
+    """As `outcome`, for a choice of an evaluator."""
 
     def load() -> tuple[int, AbstractContextManager[DeviceScene]]:
         evaluator = make()
@@ -110,20 +110,20 @@ def of_choice(studied: StudyScene, make: Callable[[], SceneEvaluator], choice: C
 
 @contextmanager
 def drawn(studied: StudyScene, evaluator: SceneEvaluator, choice: Choice) -> Iterator[DeviceScene]:
-    """A choice of an evaluator, quantized and loaded."""
+    """The scene of a choice, quantized and loaded."""
     with evaluator.quantized(choice) as quantized, studied.bench.renderer.load_quantized(quantized) as scene:
         yield scene
 
 
 def number(row: Row, column: str) -> float:
-    """A cell that holds a number."""
+    """The number in a cell."""
     value = row[column]
     assert isinstance(value, (int, float)), f"{column}: {value!r}"
     return float(value)
 
 
 def curve(rows: Sequence[Row], label: str, x: str, y: str = "loss", line: bool = True, every: bool = False) -> Series:
-    """Rows as a series that is marked where it breaks first, or everywhere; points that ended in an error have no y."""
+    """Rows as a series of a chart. Its first break is marked, or with `every` all breaks. Points with an error have no y."""
     shown = [row for row in rows if row[x] is not None]
     broken = [number(row, x) for row in shown if row["broke"] is not None]
     return Series(
@@ -136,7 +136,7 @@ def curve(rows: Sequence[Row], label: str, x: str, y: str = "loss", line: bool =
 
 
 def where_it_breaks(rows: Sequence[Row], name: str, words: Callable[[Row], str], y: str = "loss") -> str:
-    """One sentence: up to where `name` stands, and where it breaks first; rows go from mild to harsh."""
+    """A sentence: up to which row `name` stands, and where it breaks first. Rows go from mild to harsh."""
     first = next((place for place, row in enumerate(rows) if row["broke"] is not None), None)
     if first is None:
         worst = max(rows, key=lambda row: number(row, y))

@@ -1,4 +1,4 @@
-"""Compressed forms of a scene that are judged from many poses: best, paper, and baselines near paper's size."""
+"""Compressed scenes that are compared from many poses: best, paper, and baselines near paper's size."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from flexgs_edge.studies.study_scene import Setting, StudyScene
 BEST, PAPER, RTN, ROWS, SH = "best", "paper", "RTN, 8 bits", "rows only", "SH only"
 MARGIN = "best, --views-margin"
 WORDS = (
-    f"best and paper: the results at the study's target; {MARGIN}: with poses that nobody took among those scored. {RTN}: one "
-    f"range a channel, nothing removed. {ROWS}, {SH}: the paper's bits, and Gaussians or SH alone removed by gs, to "
-    "paper's bytes or as near as they come."
+    f"best and paper: the results at the study's target. {MARGIN}: generated poses are scored too. {RTN}: one "
+    f"range a channel, nothing removed. {ROWS}, {SH}: the paper's bits, with only Gaussians or only SH removed by gs, to "
+    "paper's bytes or as near as possible."
 )
 
 
@@ -28,8 +28,11 @@ class Contenders:
     Parameters
     ----------
     studied : StudyScene
-    ours, guarded : Whole
-        The results of best, of given poses and of made ones as well.
+        The scene.
+    ours : Whole
+        The result of best.
+    guarded : Whole
+        The result of best with generated poses (`--views-margin`).
     """
 
     def __init__(self, studied: StudyScene, ours: Whole, guarded: Whole) -> None:
@@ -50,7 +53,7 @@ class Contenders:
 
     @contextmanager
     def loaded(self, name: str) -> Iterator[DeviceScene]:
-        """What its file decodes to, to draw."""
+        """The decoded scene of its file, loaded to draw."""
         if name in self.wholes:
             with self.studied.bench.renderer.load(self.wholes[name].source) as scene:
                 yield scene
@@ -64,5 +67,5 @@ def _of_size(studied: StudyScene, size: int, choice: Callable[[int], Choice]) ->
     ladder = [choice(rate) for rate in range(1001)]
     sizes = [studied.size(Setting(one)) for one in ladder]
     place = nearest(sizes, size)
-    # Out of reach: the end that is nearer.
+    # If a size is out of reach, the nearer end counts.
     return ladder[place] if place is not None else ladder[-1 if size < sizes[-1] else 0]

@@ -1,4 +1,4 @@
-"""Compressing what was compressed: several generations at one size, and two targets in a row against one."""
+"""Experiments on repeated compression: several generations at one size, and two targets in a row."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flexgs_edge.io.ply import write_ply
 from flexgs_edge.methods.best.grid_coder import SETTINGS_MOST, GridCoder
 from flexgs_edge.methods.best.keep import kept_as_it_is
 from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.methods.paper.search import adapt
@@ -34,30 +34,30 @@ from flexgs_edge.studies.study_scene import Setting, StudyScene
 BEST, PAPER, RTN = "best", "paper", "RTN, 8 bits"
 IN_A_ROW, DIRECT = "two targets", "one target"
 FIRST_TIMES = 2.0
-"""Bytes of the first of two targets in a row, times those of the second."""
+"""Size of the first of two targets in a row, as a multiple of the second."""
 MOST_LOSS = 0.1
-"""dB that all generations together may lose beyond the first."""
+"""Most dB that all later generations together may lose beyond the first."""
 
 
 class Copies:
-    """Files in a folder: what a scene is after it was compressed and decompressed.
+    """Makes decompressed copies of a scene, as files in a folder.
 
     Parameters
     ----------
     folder : Path
-        For the files; one of each kind is there at a time.
+        For the files. There is one of each kind at a time.
     """
 
     def __init__(self, folder: Path) -> None:
         self.file, self.ply = folder / "copy.fgs", folder / "copy.ply"
 
     def of_grid(self, whole: Whole) -> SceneSource:
-        """The PLY that a result of the measured method decompresses to."""
+        """The PLY that a result of best decompresses to."""
         write_grid(self.file, whole.grid, {})
         return self._decompressed()
 
     def of_choice(self, evaluator: SceneEvaluator, choice: Choice) -> SceneSource:
-        """The same for the paper's method."""
+        """The PLY that a file of the paper's method decompresses to."""
         with evaluator.quantized(choice) as quantized:
             write_container(self.file, quantized, {})
         return self._decompressed()
@@ -68,12 +68,12 @@ class Copies:
         return load_scene(self.ply).source
 
     def remove(self) -> None:
-        """Take the last copy away."""
+        """Remove the last copy."""
         self.ply.unlink(missing_ok=True)
 
 
 def generations(studied: StudyScene, path: PruneRounds, ours: Whole, amounts: Amounts, folder: Path) -> Experiment:
-    """Every generation of three methods, against the first original; and two targets in a row."""
+    """Compare all generations of three methods with the first original, and two targets in a row with one."""
     copies = Copies(folder)
     rows: list[dict[str, Cell]] = []
 
@@ -107,9 +107,9 @@ def generations(studied: StudyScene, path: PruneRounds, ours: Whole, amounts: Am
     return Experiment(
         "generations",
         "Generation after generation",
-        "Compressed, decompressed to a PLY and compressed again, each time to the bytes of the first file, judged "
-        f"against the first original. {RTN}: one range a channel. {IN_A_ROW}: first to {FIRST_TIMES:g} times the "
-        "bytes, then what that decompresses to, to the bytes of the first generation.",
+        "The scene is compressed, decompressed to a PLY and compressed again, each time to the bytes of the first file, and "
+        f"judged against the first original. {RTN}: one range a channel. {IN_A_ROW}: first to {FIRST_TIMES:g} times the "
+        "bytes, then from its PLY to the bytes of the first generation.",
         table,
         LineChart(
             "Loss of every generation",
@@ -130,10 +130,10 @@ def generations(studied: StudyScene, path: PruneRounds, ours: Whole, amounts: Am
 
 
 def _again(studied: StudyScene, source: SceneSource, size: int) -> Whole:
-    """The measured method on a scene, to so many bytes, as `compress` does it."""
+    """Compress a scene to `size` bytes by best, as `compress` does."""
     target = MaxSize(size + SETTINGS_MOST, studied.plan.figure)
     run, coder = studied.run.of_source(source).aimed_at(target), GridCoder(studied.bench.renderer)
-    # The limit has room for settings, as every search counts them.
+    # The limit leaves room for settings, because every search counts them.
     found = kept_as_it_is(run, studied.bench, coder, studied.judge, settings_known=False)
     if found is not None:
         grid, _ = found
@@ -144,14 +144,7 @@ def _again(studied: StudyScene, source: SceneSource, size: int) -> Whole:
 
 def _evaluator(studied: StudyScene, source: SceneSource, order: np.ndarray, setting: Setting) -> SceneEvaluator:
     return SceneEvaluator(
-        source,
-        order,
-        nonzero_sh(source),
-        setting.bits,
-        setting.groups,
-        studied.bench.renderer,
-        studied.judge,
-        studied.run.budget,
+        Ranked(source, order, nonzero_sh(source)), setting.bits, setting.groups, studied.judge, studied.run.budget
     )
 
 

@@ -1,4 +1,4 @@
-"""Held-out views one by one: the worst of them, and the gap between those that decide and those that do not."""
+"""Experiments on single held-out views: the worst one, and the gap between views that decide and views that do not."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flexgs_edge.studies.stability.unseen_poses import TILE_SIDE, evenly, worst_
 from flexgs_edge.studies.study_scene import StudyScene
 
 WORST_TIMES, WORST_MORE = 1.5, 0.2
-"""The worst view may lose this many times the mean, and so many dB more."""
+"""The worst view may lose `WORST_TIMES` times the mean and `WORST_MORE` dB."""
 EVEN, HELD = "best, decided on even views", "best, --max-worst-drop"
 HEADS = {
     "method": "method",
@@ -43,7 +43,7 @@ HEADS = {
 
 
 def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amounts: Amounts) -> Experiment:
-    """Every contender, best when only the even held-out views decide, and with its worst view held, view by view."""
+    """Compare all contenders view by view; also best with only even views deciding, and best with a bound on the worst view."""
     cameras = studied.judge.cameras
     whole: dict[str, Whole] = {}
     if amounts.even and len(cameras) > 1:
@@ -71,9 +71,8 @@ def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amo
         "heldout",
         "The worst view, and views that decided nothing",
         f"The {len(cameras)} held-out views one by one, against {views}. A worst view within {WORST_TIMES:g} times "
-        f"the mean and {WORST_MORE:g} dB more counts as within. {EVEN}: the search stops by the first, third, ... of "
-        "them; the "
-        f"others decided nothing. {HELD}: no view loses more than {WORST_TIMES:g} times the target. " + WORDS,
+        f"the mean plus {WORST_MORE:g} dB counts as within. {EVEN}: only the first, third, ... view decides. "
+        f"{HELD}: no view loses more than {WORST_TIMES:g} times the target. " + WORDS,
         table,
         BarChart(
             "Mean and worst held-out view",

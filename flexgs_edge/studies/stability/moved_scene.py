@@ -1,4 +1,4 @@
-"""A scene in another place, of another size, turned: the same scene to whoever looks at it."""
+"""Moves, scales and turns a scene together with its cameras, so that the pictures stay the same."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ class Similarity:
     Parameters
     ----------
     factor : float
+        Scale.
     turn : np.ndarray
-        [4] f64, unit quaternion w x y z.
+        [4] f64, rotation as a unit quaternion w x y z.
     shift : np.ndarray
-        [3] f64.
+        [3] f64, translation in units of the new scene.
     """
 
     factor: float
@@ -33,14 +34,14 @@ class Similarity:
 
     @classmethod
     def drawn(cls, factor: float, seed: int = 0) -> Similarity:
-        """With a turn and a shift (of about 3 units of the new scene) drawn at random."""
+        """A random turn and a random shift, of about 3 units of the new scene."""
         rng = np.random.default_rng(seed)
         turn = rng.normal(size=4)
         return cls(factor, turn / np.linalg.norm(turn), 3 * factor * rng.normal(size=3))
 
     @property
     def matrix(self) -> np.ndarray:
-        """[3, 3] f64: the rotation."""
+        """[3, 3] f64, the rotation as a matrix."""
         w, x, y, z = self.turn
         rows = [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -50,7 +51,7 @@ class Similarity:
         return np.array(rows)
 
     def scene(self, source: SceneSource) -> MemorySource:
-        """The scene moved: positions, sizes, rotations and the SH, which turn degree by degree."""
+        """The moved scene. Positions, sizes and rotations change, and SH turn degree by degree."""
         planes = source.read(slice(0, source.count), list(FIELD))
         means = planes["means"].astype(np.float64) + source.origin[:, None]
         moved = {
@@ -58,7 +59,7 @@ class Similarity:
             "means": self.factor * (self.matrix @ means),
             "log_scales": planes["log_scales"] + np.log(self.factor),
         }
-        # A scene that is not turned keeps its very bits.
+        # Without a turn, rotations and SH keep their bits.
         if not np.array_equal(self.turn, NO_TURN):
             moved["quats"] = _product(self.turn, planes["quats"].astype(np.float64))
             rest = planes["sh_rest"].reshape(3, sh_rest_count(source.sh_degree), source.count)
@@ -86,10 +87,10 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def turn_of_band(matrix: np.ndarray, degree: int) -> np.ndarray:
-    """[2l + 1, 2l + 1] f64: SH coefficients of one degree after the world was turned by `matrix`.
+    """[2l + 1, 2l + 1] f64, matrix that turns SH coefficients of degree l when the world is turned by `matrix`.
 
-    Fitted by least squares: a colour seen along d before is seen along `matrix @ d` after, and functions of one degree stay
-    functions of that degree, so nothing is left over.
+    It is fitted by least squares: a colour seen along d before is seen along `matrix @ d` after. Functions of one degree
+    stay functions of that degree, so the fit is exact.
     """
     directions = np.random.default_rng(degree).normal(size=(3, 200))
     directions /= np.linalg.norm(directions, axis=0)

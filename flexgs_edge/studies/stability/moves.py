@@ -1,4 +1,4 @@
-"""The same scene far from the origin, in another unit, turned: what changes, and by how much."""
+"""Experiments on moved scenes: far from the origin, in another unit, turned. Results should hardly change."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flexgs_edge.cameras.order import farthest_order
 from flexgs_edge.errors import FlexGSError
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.io.ply import write_ply
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores, ranks_from_order, select_rows
 from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
@@ -37,7 +37,7 @@ from flexgs_edge.studies.study_scene import StudyScene
 from flexgs_edge.views.bench import Bench
 
 AWAY = np.array([0.6, -0.64, 0.48])
-"""Direction of the moves: along no axis."""
+"""Direction of the moves, along no axis."""
 STILL = np.zeros(3)
 AS_IT_IS = "as it is"
 MOVES: dict[str, tuple[Similarity, bool]] = {
@@ -52,15 +52,15 @@ MOVES: dict[str, tuple[Similarity, bool]] = {
     "scaled 1e4": (Similarity(1e4, NO_TURN, STILL), False),
     "turned": (Similarity(1.0, Similarity.drawn(1.0, 5).turn, STILL), False),
 }
-"""What is done to the scene, and whether its PLY has float64 positions."""
+"""Each move by name, and whether the moved PLY has float64 positions."""
 BEST, PAPER, HALF = "best", "paper", "float16 positions"
 SAME_KEPT, MORE_BYTES, OTHER_FIDELITY = 0.995, 0.01, 0.1
-"""Bounds: share of the kept Gaussians that are the same, part of the bytes, dB."""
+"""Bounds: least share of equal kept Gaussians, largest relative change of bytes, largest change of fidelity in dB."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a method made of the scene: rows kept (ascending; None: all), bytes and fidelity (dB)."""
+    """Result of a method on a scene: rows kept (ascending; None: all), bytes, and fidelity in dB."""
 
     rows: np.ndarray | None
     size: int | None
@@ -68,7 +68,7 @@ class Found:
 
 
 def moved_file(source: SceneSource, move: Similarity, wide: bool, path: Path) -> SceneSource:
-    """The moved scene as its PLY says: float32 positions of the world, or float64 (`wide`)."""
+    """The moved scene, written to a PLY and read back, with positions in float32 or, if `wide`, float64."""
     scene = move.scene(source)
     if not wide:
         planes = scene.read(slice(0, scene.count), list(FIELD))
@@ -84,8 +84,9 @@ class Place:
     Parameters
     ----------
     studied : StudyScene
-        Of the scene as it is.
+        The scene before the move.
     move : Similarity
+        The move.
     source : SceneSource
         The moved scene.
     amounts : Amounts
@@ -112,7 +113,7 @@ class Place:
 
     @contextmanager
     def judge(self) -> Iterator[Judge]:
-        """The judge of this place, with the renders of the moved original."""
+        """A judge with renders of the moved original."""
         judge = Judge(self.bench, self.source, self.views, self.views.held_out)
         try:
             with self.renderer.load(self.source) as original:
@@ -123,28 +124,26 @@ class Place:
             self.renderer.release()
 
     def best(self, judge: Judge, price: float) -> Found:
-        """The measured method where a bit is worth so much squared error of each pixel that is scored."""
+        """Compress by best, at a multiplier of `price` times the number of scored pixels."""
         train = self.views.of(self.views.train)
         with walked(self.studied, self.source, train, self.bench) as path:
             whole = whole_at(self.studied, path, judge, price * scored_pixels(path))
         return Found(whole.rows, whole.size, self._fidelity(judge, whole.source))
 
     def paper(self, judge: Judge, choice: Choice) -> Found:
-        """The paper's method at its rates, scored here."""
+        """Compress by the paper's method at fixed rates, with scores of the moved scene."""
         train = self.views.of(self.views.train)
         with self.renderer.load(self.source) as scene:
             order = order_from_scores(score_scene(self.renderer, scene, self.source, train))
         has_sh = nonzero_sh(self.source)
         bits, groups = self.studied.run.options.bit_spec()
         assert bits is not None
-        evaluator = SceneEvaluator(
-            self.source, order, has_sh, bits, groups, self.renderer, judge, self.studied.run.budget
-        )
+        evaluator = SceneEvaluator(Ranked(self.source, order, has_sh), bits, groups, judge, self.studied.run.budget)
         rows = np.sort(np.concatenate(select_rows(ranks_from_order(order), choice, has_sh)))
         return Found(rows, evaluator.size(choice), evaluator.measure(choice).fidelity)
 
     def half(self, judge: Judge) -> Found:
-        """Nothing but positions in half precision."""
+        """Only round positions to half precision."""
         return Found(None, None, self._fidelity(judge, half_positions(self.source)))
 
     def _fidelity(self, judge: Judge, source: SceneSource) -> float | None:
@@ -153,14 +152,14 @@ class Place:
 
 
 def few_views(studied: StudyScene, amounts: Amounts) -> tuple[list[Camera], list[Camera]]:
-    """Poses that score and poses that judge, few and small."""
+    """A few small poses that score, and a few that judge."""
     train, _ = limit_width(studied.views.of(studied.views.train), amounts.few_width)
     judges, _ = limit_width(studied.judge.cameras, amounts.few_width)
     return [train[i] for i in farthest_order(train)[: amounts.few]], evenly(judges, max(amounts.few // 2, 1))
 
 
 def moves(studied: StudyScene, ours: Whole, amounts: Amounts, folder: Path) -> Experiment:
-    """Every move by every method, against the scene as it is."""
+    """Compare every method on every move with the same method on the scene as it is."""
     train, _ = few_views(studied, amounts)
     price = ours.multiplier / ours.pixels
     rows: list[dict[str, Cell]] = []
@@ -174,7 +173,7 @@ def moves(studied: StudyScene, ours: Whole, amounts: Amounts, folder: Path) -> E
         with place.judge() as judge:
             seen = [judge.original(i).copy() for i in range(len(judge.cameras))]
             pictures = pictures or seen
-            # What the file itself has lost, before any method sees it.
+            # The moved file has lost precision before any method sees it.
             input_fidelity = mean_psnr([psnr(mse(a, b)) for a, b in zip(seen, pictures)])
             runs: dict[str, Callable[[], Found]] = {
                 BEST: lambda: place.best(judge, price),  # noqa: B023
@@ -225,7 +224,7 @@ def _failed(name: str, method: str, given: float | None, error: FlexGSError) -> 
 
 
 def _same(first: np.ndarray, second: np.ndarray) -> float:
-    """Rows in both, as a share of the longer list."""
+    """Share of rows that are in both lists, of the longer list."""
     return len(np.intersect1d(first, second)) / max(len(first), len(second), 1)
 
 
@@ -255,10 +254,10 @@ def _experiment(rows: list[dict[str, Cell]], names: Sequence[str], train: Sequen
         "Far from the origin, in other units, turned",
         "The scene is written to a PLY again, moved so many units from the origin (with float32 or float64 "
         "positions), scaled (the near plane alike) or turned (SH too), and compressed: best at one multiplier "
-        f"(where a search stops is partly chance), paper at its rates, both scored by {len(train)} poses "
-        f"{train[0].width} pixels wide and judged by {judges} against the moved scene itself. {HALF}: nothing but "
-        "the positions, relative to the world's origin, is rounded, as published programs do. Fidelity of the moved "
-        "file: its renders against those of the scene as it is, before any method. Within bounds: "
+        f"(because where a search stops is partly chance), paper at its rates. Both score {len(train)} poses that are "
+        f"{train[0].width} pixels wide, and {judges} judge against the moved scene itself. {HALF}: only positions are "
+        "rounded, relative to the world's origin, as published programs do. Fidelity of the moved file compares its "
+        "renders with those of the scene as it is, before any method. Within bounds: "
         f"{100 * SAME_KEPT:g} % of the kept Gaussians the same, {100 * MORE_BYTES:g} % of the bytes, "
         f"{OTHER_FIDELITY:g} dB.",
         table,

@@ -1,4 +1,4 @@
-"""The measured method on a bench: whole results at a target, or at a multiplier that is known."""
+"""Runs the method best for experiments: at a target, or at a known multiplier."""
 
 from __future__ import annotations
 
@@ -27,21 +27,22 @@ from flexgs_edge.views.bench import Bench
 
 @dataclass(frozen=True, eq=False)
 class Whole:
-    """A whole result of the measured method.
+    """A candidate of the method best.
 
     Parameters
     ----------
     grid : GridScene
+        The integers of its file.
     size : int
-        Bytes of its file, without what the header says about its making.
+        Bytes of its file, without settings in the header.
     multiplier : float
-        Squared error that a bit was worth.
+        Squared error that a bit is worth.
     rows : np.ndarray
         [n] i64, rows of the scene that were kept, ascending.
     pixels : int
-        Pixels that were scored, of all poses: squared errors, and the multiplier with them, are sums over these.
+        Scored pixels of all poses. Squared errors are sums over them, so the multiplier grows with their number.
     reached : bool
-        The target holds.
+        Whether the target holds.
     """
 
     grid: GridScene
@@ -53,15 +54,15 @@ class Whole:
 
     @property
     def source(self) -> MemorySource:
-        """What its file decodes to."""
+        """The decoded scene of its file."""
         return MemorySource(from_grid(self.grid), origin=self.grid.origin)
 
 
 class FixedSearch(GridSearch):
-    """The search that can also be told the multiplier: where it stops is partly chance, what it does there is not."""
+    """A search that can also use a given multiplier. Where a search stops is partly chance, but a candidate is not."""
 
     def at(self, multiplier: float) -> GridScene:
-        """The first whole result at a multiplier."""
+        """The first candidate at a multiplier."""
         return self._whole(multiplier, MaxDrop(1.0, "modelled drop"))[1]
 
 
@@ -73,7 +74,7 @@ def walked(
     bench: Bench | None = None,
     margin: bool = False,
 ) -> Iterator[PruneRounds]:
-    """The path of prune and rescore over some poses (`margin`: and made ones), for as many searches as wanted."""
+    """Open rounds of pruning over some poses (with `margin`, also generated ones), for any number of searches."""
     options, bench = replace(studied.run.options, views_margin=margin), bench or studied.bench
     run = replace(studied.run.of_source(source), options=options)
     with open_rounds(run, bench, scored_poses(cameras, options, bench.renderer, source).cameras) as rounds:
@@ -81,12 +82,12 @@ def walked(
 
 
 def scored_pixels(rounds: PruneRounds) -> int:
-    """Pixels that a path looks at in all its poses."""
+    """Number of scored pixels in all poses of the rounds."""
     return sum(camera.width * camera.height for camera in rounds.cameras)
 
 
 def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: Judge | None = None) -> Whole:
-    """The search for a target along a path; the closest result where it cannot be met."""
+    """Search for a target; the closest candidate if none meets it."""
     judge = judge or studied.judge
     made = _search(studied, rounds, judge, rounds.renderer)
     with studied.run.clock.stage("search"):
@@ -96,7 +97,7 @@ def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: Judg
 
 
 def whole_at(studied: StudyScene, rounds: PruneRounds, judge: Judge, multiplier: float) -> Whole:
-    """The whole result at a multiplier, without a search."""
+    """The candidate at a multiplier, without a search."""
     made = _search(studied, rounds, judge, rounds.renderer)
     with studied.run.clock.stage("search"):
         grid = made.at(multiplier)

@@ -1,4 +1,4 @@
-"""Experiments on removal: more and more of the scene, and scores from too few views or from one side only."""
+"""Experiments on pruning: larger and larger shares, and scores from few views or from one side only."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ HEADS = {"scores": "scored", "same": "loss on the same half (dB)", "other": "los
 
 
 def pruning(studied: StudyScene, path: PruneRounds, amounts: Amounts) -> Experiment:
-    """Shares of the Gaussians removed by each score, and shares that lose their SH; 16 bits stand for untouched values."""
+    """Remove shares of the Gaussians, or their SH, by each score. Values have 16 bits, so only removal loses quality."""
     costs = path.snapshots[0]
     removal = np.full(studied.run.source.count, -np.inf)
     removal[path.rows[costs.rows]] = costs.costs.removal
@@ -68,11 +68,10 @@ def pruning(studied: StudyScene, path: PruneRounds, amounts: Amounts) -> Experim
     return Experiment(
         "pruning",
         "More and more removed",
-        "Gaussians go in the order of a score, all values in 16 bits in sub-groups, so that only removal loses "
-        "anything. gs: the paper's score; meson: MesonGS's; dSE: the measured squared error of removing each alone. "
-        "SH only: every Gaussian stays and the SH of a share go, by gs. best's path: removed in rounds, costs "
-        "measured again and colours refitted after each; its bytes are those of 16 bits a value, for the share that "
-        "stays.",
+        "Gaussians are removed in the order of a score. All values have 16 bits in sub-groups, so only removal loses "
+        "quality. gs: the paper's score. meson: MesonGS's score. dSE: the measured squared error of removing each alone. "
+        "SH only: every Gaussian stays, and a share loses its SH, by gs. best's path: removal in rounds, with costs "
+        "measured again and colours refitted after each; its bytes count 16 bits a value for the share that stays.",
         table,
         LineChart(
             "Removing more and more: where each score breaks",
@@ -90,7 +89,7 @@ def pruning(studied: StudyScene, path: PruneRounds, amounts: Amounts) -> Experim
 
 
 def _path_rows(studied: StudyScene, path: PruneRounds, most: int) -> list[dict[str, Cell]]:
-    """The snapshots of the path, until so many thousandths are gone."""
+    """Rows for the snapshots of the rounds, until `most` thousandths are removed."""
     keep = EFFORTS[studied.run.options.effort].keep
     count = studied.run.source.count
     while path.snapshots[-1].count > (1 - most / 1000) * count and path.snapshots[-1].count > 16:
@@ -106,7 +105,7 @@ def _path_rows(studied: StudyScene, path: PruneRounds, most: int) -> list[dict[s
 
 
 def views(studied: StudyScene, amounts: Amounts) -> Experiment:
-    """Scores from ever more views: ranks against those from all, and what removing by them costs."""
+    """Score from more and more views; compare ranks with those from all views, and losses of removing by them."""
     count = len(studied.views.train)
     choice = studied.search.chosen.choice
     rows = [
@@ -138,12 +137,12 @@ def views(studied: StudyScene, amounts: Amounts) -> Experiment:
         "views",
         "Too few views",
         f"Scores from some of the {count} training poses, each next one farthest from those before it, or the first "
-        f"ones by name; then the paper's method removes p = {choice.prune / 1000:g} and the SH of s = "
-        f"{choice.sh / 1000:g}, so all files have one size. removal: measured costs. What no scored pose sees has no "
-        "score, and goes first.",
+        f"ones by name. Then the paper's method removes p = {choice.prune / 1000:g} and the SH of s = "
+        f"{choice.sh / 1000:g}, so all files have one size. removal: measured costs. Gaussians that no scored pose sees "
+        "have no score and are removed first.",
         table,
         LineChart(
-            "Views scored, and what they are worth at one size",
+            "Quality at one size, by the number of scored views",
             "views scored (log)",
             f"loss: {studied.plan.figure} (dB)",
             tuple(curve(part, f"{score}, {poses}", "views", studied.figure) for (score, poses), part in series.items()),
@@ -156,7 +155,7 @@ def views(studied: StudyScene, amounts: Amounts) -> Experiment:
 
 
 def _settled(rows: Sequence[Row], name: str, figure: str) -> str:
-    """From how many views on ranks and quality are those of all views."""
+    """A sentence: from how many views on ranks and quality are about those of all views."""
     whole = number(rows[-1], figure)
     close = next(row for row in rows if number(row, figure) <= whole + 0.1)
     alike = next(row for row in rows if number(row, "spearman") >= 0.95)
@@ -174,7 +173,7 @@ def half_of(cameras: Sequence[Camera], axis: np.ndarray, middle: float) -> np.nd
 
 
 def longest_axis(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
-    """The direction ([3]) that the cameras are spread most along, and the median along it."""
+    """The direction ([3]) along which the cameras spread most, and their median along it."""
     places = np.array([camera.center for camera in cameras])
     _, _, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
     axis: np.ndarray = axes[0]
@@ -182,7 +181,7 @@ def longest_axis(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
 
 
 def halves(studied: StudyScene, ours: Whole) -> Experiment | None:
-    """Scores from one half of the training poses, judged on held-out views of that half and of the other."""
+    """Score from one half of the training poses; judge on held-out views of this half and of the other."""
     cameras = studied.views.of(studied.views.train)
     axis, middle = longest_axis(cameras)
     near = half_of(cameras, axis, middle)
@@ -218,8 +217,8 @@ def halves(studied: StudyScene, ours: Whole) -> Experiment | None:
     return Experiment(
         "halves",
         "Scored from one side",
-        f"{len(some)} of the {len(cameras)} training poses, those on one side of the middle of the path, score (for "
-        "best also refit the colours), at one size for each method; held-out views of that side and of the other "
+        f"{len(some)} of the {len(cameras)} training poses, those on one side of the middle, are scored (best also "
+        "refits colours to them), at one size for each method. Held-out views of that side and of the other "
         "judge.",
         table,
         BarChart(
@@ -262,13 +261,4 @@ def _score(studied: StudyScene, score: str, cameras: Sequence[Camera]) -> np.nda
 def _ranked(studied: StudyScene, order: np.ndarray) -> SceneEvaluator:
     bits, groups = studied.run.options.bit_spec()
     assert isinstance(bits, BitSpec)
-    return SceneEvaluator(
-        studied.run.source,
-        order,
-        studied.has_sh,
-        bits,
-        groups,
-        studied.bench.renderer,
-        studied.judge,
-        studied.run.budget,
-    )
+    return SceneEvaluator(studied.ranked(order), bits, groups, studied.judge, studied.run.budget)

@@ -1,4 +1,4 @@
-"""The searches themselves, on curves that no scene need have: rough, flat, noisy, and targets at the edge of reach."""
+"""Experiments on the searches alone, with artificial loss curves: rough, flat, noisy, and targets at the edge of reach."""
 
 from __future__ import annotations
 
@@ -24,34 +24,35 @@ from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
 from flexgs_edge.studies.stability.breaks import number
 
 COUNT = 100_000
-"""Gaussians of the pretended scene."""
+"""Gaussians of the artificial scene."""
 GENTLEST = math.log(0.08)
-"""Log of the loss where nothing is removed."""
+"""Log of the loss if nothing is removed."""
 BY_PRUNE, BY_SH = 5.0, 2.0
-"""Its slopes by the two rates, as fox and the sample scene have them (`adapt.model`)."""
+"""Slopes of the log of the loss over the two rates, as the loss model of the paper's search expects them."""
 BY_MULTIPLIER, SIZE_BY_MULTIPLIER = 0.6, -0.45
 MIDDLE, BYTES = 1e-4, 500_000
-"""Multiplier that loses 1 dB, and the bytes that it takes."""
+"""The multiplier that loses 1 dB, and the bytes of its file."""
 FARTHEST = 1e5
-"""Beyond so many times the middle nothing is left to remove."""
+"""At this many times `MIDDLE` nothing is left to remove."""
 SEEDS = 5
 TOLERATED = 1.01
-"""A loss so many times the limit still holds: more than rounding, less than anybody sees."""
+"""A loss of this many times the limit still counts as met. This covers rounding and is invisible."""
 FAR = 0.25
-"""More bytes than the best possible, as a share, from which a search is said to have failed."""
+"""A search has failed if it takes this share more bytes than the best possible."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A loss in dB by the log of what a smooth scene would lose.
+    """An artificial curve: loss in dB as a function of the log of a smooth scene's loss.
 
     Parameters
     ----------
     name : str
+        Name in tables.
     loss : callable
-        Of the log of the smooth loss.
+        Loss in dB at the log of the smooth loss.
     noise : float
-        Standard deviation of the log of what is measured about it.
+        Standard deviation of the log of a measured loss.
     """
 
     name: str
@@ -59,7 +60,7 @@ class Curve:
     noise: float = 0.0
 
     def measured(self, place: float, seed: int, key: Sequence[int]) -> float:
-        """What a search is told: the same for the same point."""
+        """The loss that a search is told, in dB. The same point gives the same loss."""
         if not self.noise:
             return self.loss(place)
         chance = np.random.default_rng([seed, *(k & 0xFFFFFFFF for k in key)]).normal()
@@ -82,7 +83,7 @@ LIST, LINE, MULTIPLIER = "paper's list", "line of rates", "best's multiplier"
 
 @dataclass(frozen=True)
 class World:
-    """A pretended scene: a curve and a seed."""
+    """An artificial scene: a curve and a seed of its noise."""
 
     curve: Curve
     seed: int = 0
@@ -97,23 +98,23 @@ class World:
         return GENTLEST + (BY_PRUNE * choice.prune + BY_SH * choice.sh) / 1000
 
     def measure(self, choice: Choice) -> Measurement:
-        """What a search is told of a choice."""
+        """The measurement that a search gets for a choice."""
         return _measurement(self.curve.measured(self.place(choice), self.seed, (choice.prune, choice.sh)))
 
     def estimate(self, choice: Choice) -> Measurement:
-        """The same: these worlds have no pixels to leave out."""
+        """As `measure`, because these scenes have no pixels to leave out."""
         return self.measure(choice)
 
     def size_at(self, multiplier: float) -> int:
-        """Bytes at a multiplier: no fewer than at the farthest."""
-        return round(BYTES * min(multiplier / MIDDLE, FARTHEST) ** SIZE_BY_MULTIPLIER)
+        """Bytes at a multiplier, at least those at `FARTHEST`."""
+        return round(BYTES * float(min(multiplier / MIDDLE, FARTHEST) ** SIZE_BY_MULTIPLIER))
 
     def place_at(self, multiplier: float) -> float:
-        """Log of the smooth loss at a multiplier: never less than that of the whole scene."""
+        """Log of the smooth loss at a multiplier, at least that of the whole scene."""
         return max(BY_MULTIPLIER * math.log(min(multiplier / MIDDLE, FARTHEST)), GENTLEST)
 
     def measure_at(self, multiplier: float) -> Measurement:
-        """What a search is told of a multiplier."""
+        """The measurement that a search gets for a multiplier."""
         key = (round(1e6 * math.log(multiplier)),)
         return _measurement(self.curve.measured(self.place_at(multiplier), self.seed, key))
 
@@ -123,7 +124,7 @@ def _measurement(drop: float) -> Measurement:
 
 
 class _Pretended(GridSearch):
-    """The search over a multiplier, of a world in place of a path."""
+    """The search over a multiplier, with an artificial scene in place of rounds of pruning."""
 
     def __init__(self, world: World, effort: str) -> None:
         nothing: Any = None
@@ -144,7 +145,7 @@ class _Pretended(GridSearch):
 
 @dataclass(frozen=True)
 class Answer:
-    """What a search came to: bytes, true loss, whether it says that the target holds, and points measured."""
+    """Answer of a search: bytes, true loss, whether it says that the target holds, and number of points measured."""
 
     size: int
     loss: float
@@ -153,14 +154,14 @@ class Answer:
 
 
 def by_list(world: World, target: Target, effort: str) -> Answer:
-    """The paper's list and its refinement."""
+    """Search by the paper's list and refinement."""
     found = adapt(world, target, effort, best_effort=True)
     chosen = found.chosen
     return Answer(chosen.size, world.curve.loss(world.place(chosen.choice)), found.reached, len(found.steps))
 
 
 def by_line(world: World, target: Target, effort: str) -> Answer:
-    """One line of prune rates, as for other programs' formats."""
+    """Search along the prune rate, as for formats of other programs."""
 
     def measure(prune: int) -> Step:
         choice = Choice(prune, 0)
@@ -175,7 +176,7 @@ def by_line(world: World, target: Target, effort: str) -> Answer:
 
 
 def by_multiplier(world: World, target: Target, effort: str) -> Answer:
-    """The search of the measured method."""
+    """Search over the multiplier, as best does."""
     found = _Pretended(world, effort).run(target, best_effort=True)
     multiplier = found.chosen.multiplier
     return Answer(found.chosen.size, world.curve.loss(world.place_at(multiplier)), found.reached, len(found.steps))
@@ -189,7 +190,7 @@ SEARCHES: dict[str, Callable[[World, Target, str], Answer]] = {
 
 
 def possible(name: str, world: World) -> list[tuple[int, float]]:
-    """Bytes and true losses of everything that a search could answer."""
+    """Bytes and true losses of all points that a search could answer."""
     if name == MULTIPLIER:
         places = [MIDDLE * FARTHEST ** (i / 1000) for i in range(-1000, 1001)]
         return [(world.size_at(m), world.curve.loss(world.place_at(m))) for m in places]
@@ -199,7 +200,7 @@ def possible(name: str, world: World) -> list[tuple[int, float]]:
 
 
 def targets(name: str) -> dict[str, Target]:
-    """Targets in the middle and at the edges of what a search can reach on a smooth curve."""
+    """Targets in the middle and at the edges of a search's range on the smooth curve."""
     world = World(SMOOTH)
     sizes, losses = zip(*possible(name, world))
     return {
@@ -213,7 +214,7 @@ def targets(name: str) -> dict[str, Target]:
 
 
 def searches(effort: str) -> Experiment:
-    """Every search on every curve at 1 dB, and on the smooth one at the edges."""
+    """Run every search on every curve at 1 dB, and on the smooth one at the edges of its range."""
     rows: list[dict[str, Cell]] = []
     for name in SEARCHES:
         at = targets(name)
@@ -237,12 +238,12 @@ def searches(effort: str) -> Experiment:
     names = [curve.name for curve in CURVES]
     return Experiment(
         "search",
-        "The searches on curves that scenes need not have",
-        "Three searches over a pretended scene whose loss is a known function of what is removed: smooth, with "
+        "The searches on artificial curves",
+        "Three searches over an artificial scene whose loss is a known function of the removed share: smooth, with "
         "waves (more compression may lose less), in steps, nearly flat, with a cliff at the target, and measured "
-        f"with noise, as from a sample of tiles (the worst of {SEEDS} draws). A search fails where it takes "
-        f"{100 * FAR:g} % more bytes than the best possible, misses a target that can be met, or says that one holds "
-        "which does not.",
+        f"with noise, as from a sample of tiles (the worst of {SEEDS} draws). A search fails if it takes "
+        f"{100 * FAR:g} % more bytes than the best possible, misses a target that can be met, or wrongly says that a "
+        "target holds.",
         table,
         BarChart(
             "Bytes beyond the best possible at 1 dB",
@@ -268,7 +269,7 @@ def _row(name: str, curve: Curve, words: str, target: Target, effort: str) -> di
     every = [
         _judged(name, World(curve, seed), target, SEARCHES[name](World(curve, seed), target, effort)) for seed in seeds
     ]
-    # The worst draw: one that broke, else the one with the most bytes.
+    # The worst draw is one that broke, else the one with the most bytes.
     worst = max(every, key=lambda cells: (cells["broke"] is not None, float(cells["more_bytes"] or 0.0)))
     return {"search": name, "curve": curve.name, "target": words, **worst}
 
@@ -282,7 +283,7 @@ def _judged(name: str, world: World, target: Target, answer: Answer) -> dict[str
         holding = [size for size, _ in possible(name, world) if size <= limit]
     can = bool(holding)
     over = answer.loss / losses - 1 if limit is None else answer.size / limit - 1
-    # Of a size the best is the largest that fits.
+    # For a size target, the largest file that fits is the best.
     best = 0 if not can else min(holding) if limit is None else max(holding)
     more = None if not (can and answer.reached) else (answer.size / best - 1) * (1 if limit is None else -1)
     broke = None

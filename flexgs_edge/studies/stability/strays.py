@@ -1,4 +1,4 @@
-"""Stray values: a few Gaussians that no camera sees, with values far from all others."""
+"""Experiment on stray values: a few Gaussians that no camera sees, with values far from all others."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.methods.best.choose_steps import holdable, reachable
 from flexgs_edge.methods.best.rounds import take_rows
-from flexgs_edge.methods.paper.evaluator import SceneEvaluator
+from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.report.plots import BarChart
 from flexgs_edge.scene.fields import FIELD, FIELDS
@@ -30,14 +30,16 @@ BITS = 8
 METHODS = ("RTN, per tensor", "RTN, per channel", "RTN, sub-groups", "paper (MPQ)", "best")
 DIRECTIONS = 256
 MARGIN = 1.5
-"""Strays lie this far outside of every frame, in half widths."""
+"""Least distance of strays from the middle of every frame, in half widths and half heights."""
 AGAINST = {"log_scales": -1.0}
-"""Signs of strays: a huge splat is in every view, a tiny one in none. Quaternions are coded at unit length: none can stray."""
+"""Signs of stray values by field, otherwise +1. Huge splats would show in every view, so stray scales are tiny. Quaternions are
+coded at unit length, so none can stray."""
 
 
 def unseen_direction(cameras: Sequence[Camera], middle: np.ndarray, distance: float) -> np.ndarray | None:
-    """[3] f64: a direction in which nothing so far from `middle` is in any view; None where views go all around."""
-    for direction in fibonacci(DIRECTIONS):
+    """[3] f64, a direction in which no view shows a point at `distance` from `middle`; None if there is no such direction."""
+    directions: list[np.ndarray] = list(fibonacci(DIRECTIONS))
+    for direction in directions:
         place = middle + distance * direction
         if not any(_in_view(camera, place) for camera in cameras):
             return direction
@@ -53,14 +55,14 @@ def _in_view(camera: Camera, place: np.ndarray) -> bool:
 
 
 def strays_of(planes: dict[str, np.ndarray], size: float, direction: np.ndarray) -> dict[str, np.ndarray]:
-    """One stray a field but quaternions: the scene's medians, that field `size` spreads away, all at the far place.
+    """One stray for each field but quaternions. It has the scene's medians, except for a far position and its stray field.
 
     Parameters
     ----------
     planes : dict
-        Of the scene.
+        Stored planes of the scene ([width, n] f32 by field).
     size : float
-        In standard deviations of each channel.
+        Distance of the stray values, in standard deviations of each channel.
     direction : np.ndarray
         [3], where no camera looks.
     """
@@ -80,7 +82,7 @@ def strays_of(planes: dict[str, np.ndarray], size: float, direction: np.ndarray)
 
 
 def strays(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
-    """Quantizers with and without strays; the strays are part of what is coded, and in no view."""
+    """Compare quantizers with and without strays. Strays are coded, but no view shows them."""
     source = studied.run.source
     planes = source.read(slice(0, source.count), list(FIELD))
     cameras = [camera.moved(source.origin) for camera in studied.views.cameras]
@@ -102,9 +104,9 @@ def strays(studied: StudyScene, ours: Whole, amounts: Amounts) -> Experiment:
         "strays",
         "Stray values",
         f"{len(strays_of(planes, 1.0, np.zeros(3))['means'][0])} Gaussians are added where no camera looks, each "
-        "with one attribute so many standard deviations away from all others, and all of them so far from the "
+        "with one attribute far from all others, by so many standard deviations, and a position as far from the "
         f"scene. RTN with {BITS} bits and the paper's bits, nothing removed; best with the rows that it keeps and "
-        "the strays. Views are those without strays." + note,
+        "the strays. Losses are over views that show no strays." + note,
         table,
         BarChart(
             "A few stray values, and what they cost all others",
@@ -132,9 +134,7 @@ def _coded(
 
     def evaluator(bits: BitSpec, groups: int | None) -> SceneEvaluator:
         order = np.arange(source.count)
-        return SceneEvaluator(
-            source, order, has_sh, bits, groups, studied.bench.renderer, studied.judge, studied.run.budget
-        )
+        return SceneEvaluator(Ranked(source, order, has_sh), bits, groups, studied.judge, studied.run.budget)
 
     rtn = BitSpec.rtn(BITS)
     return [
@@ -147,12 +147,12 @@ def _coded(
 
 
 def _joined(planes: dict[str, np.ndarray], added: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Rows of both; the second has no more channels than the first."""
+    """Rows of both sets of planes. The second may have fewer channels."""
     return {name: np.concatenate([values, added[name][: len(values)]], axis=1) for name, values in planes.items()}
 
 
 def _best(ours: Whole, added: dict[str, np.ndarray] | None) -> tuple[int, MemorySource]:
-    """The rows that best kept and the strays, which it keeps as it does all that no pose sees."""
+    """The rows that best kept, and the strays, which it keeps like all Gaussians that no pose sees."""
     if added is None:
         return ours.size, ours.source
     kept = from_grid(ours.grid)

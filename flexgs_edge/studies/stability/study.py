@@ -1,4 +1,4 @@
-"""`study stability`: where methods break, experiment by experiment, and where ours stops standing."""
+"""`study stability`: under which conditions methods break, experiment by experiment."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_scene
 LOG = logging.getLogger("flexgs_edge")
 
 EFFORT = "fast"
-"""Of all searches: what breaks does so at every effort, and there are some twenty of them."""
+"""Effort of all searches. The study makes many, and breaks show at every effort."""
 
 
 COPIES = 6
-"""Times the scene's planes that moving it holds at once: as they are, in float64, turned, in float32."""
+"""Copies of the scene's planes that moving it holds at once: as they are, in float64, turned, in float32."""
 
 
 @dataclass(frozen=True)
 class StabilityStudy(WrittenStudy):
-    """What `study stability` found and wrote."""
+    """The results of `study stability`, and their folder."""
 
     quick: bool
 
     command = "study stability"
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """The record for programs."""
         return {**super().to_json(), "quick": self.quick}
 
 
@@ -63,34 +63,34 @@ def study_stability(
     quick: bool = False,
     **words: Any,
 ) -> StabilityStudy:
-    """Look for the points at which methods break on a scene, and write them to a folder.
+    """Find the conditions under which methods break on a scene, and write them to a folder.
 
     Parameters
     ----------
     scene : path
-        What `compress` takes.
+        Any scene that `compress` takes.
     output : path
         Folder of the results: index.html, and every experiment's rows and chart as .csv, .json, .png and .svg. It appears when
-        everything is done; `force` lets it replace files of these names in a folder that is there.
+        everything is done. With `force` it may replace files of these names in an existing folder.
     options : CompressOptions, optional
-        Views, drawing, memory and device as for `compress`; the target is that of the results that are looked at.
+        Views, drawing, memory and device as for `compress`. The target is that of the compared results.
     progress : Progress, optional
-        Bars on long work.
+        Progress bars. Default: none.
     quick : bool
-        Few points of every experiment, on small views.
+        Measure only a few points of every experiment, on small views.
     **words
-        Single options by the names of `CompressOptions`.
+        Single options, by their names in `CompressOptions`.
 
     Raises
     ------
     FlexGSError
-        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
+        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "best", "effort": EFFORT})
     amounts = QUICK if quick else FULL
     if amounts.width is not None:
         options = replace(options, resolution=min(options.resolution, amounts.width))
-    # Loaded before the memory is planned, so that its bytes count as taken.
+    # Matplotlib is loaded before the memory is planned, so that its bytes count as taken.
     require_matplotlib()
     check_folder(output, options.force)
     with atomic_folder(output, options.force) as folder:
@@ -104,10 +104,10 @@ def study_stability(
 
 
 _INTRO = (
-    "Where methods break. A method has broken at a point if it loses more than 3 dB there, or ends in an error; "
-    "charts cross out the first such point of each method, and the dashed line is the limit. All files are judged "
-    "by the same renderer; means over few views hide single bad ones, so the worst view, and where it matters the "
-    "worst tile, stand beside them."
+    "Where methods break. A method has broken at a point if it loses more than 3 dB there, or ends in an error. "
+    "Charts cross out the first such point of each method, and the dashed line is the limit. All files are judged "
+    "by the same renderer. Means over few views hide single bad ones, so the worst view, and where it matters the "
+    "worst tile, are shown beside them."
 )
 
 
@@ -118,7 +118,7 @@ def _experiments(studied: StudyScene, amounts: Amounts, folder: Path) -> list[Ex
     )
     temporary = tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder)
     with temporary as place:
-        # First: two paths at once would take twice the memory.
+        # These rounds come first: two at once would take twice the memory.
         with walked(studied, source, train, margin=True) as path:
             guarded = search(studied, path, studied.target)
         with walked(studied, source, train) as path:
@@ -157,7 +157,7 @@ def _along_the_path(
         made.append(moves(studied, ours, amounts, place))
     with part("generations"):
         made.append(generations(studied, path, ours, amounts, place))
-    # Last: it walks the path down to its end.
+    # This comes last, because it prunes until nothing is left.
     with part("pruning"):
         made.insert(3, removal.pruning(studied, path, amounts))
     made.append(searches(EFFORT))

@@ -1,4 +1,4 @@
-"""Poses that nobody scored: nearer and farther, between and above the path, other lenses and sizes; and the held-out views."""
+"""Experiments on poses that were not scored: nearer and farther, in between, above, with other lenses and sizes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flexgs_edge.views.depths import visible_depths
 
 TILE_SIDE = 64
 TURNS = (15.0, 30.0)
-"""Degrees above the path, about what a pose looks at."""
+"""Degrees by which a pose is turned up about the point that it looks at."""
 ZOOMS = (0.5, 2.0, 4.0)
 SIZES = (0.5, 2.0)
 TRAINING, HELD_OUT, DISTANCE = "training", "held out", "distance"
@@ -49,13 +49,13 @@ class Poses:
 
 
 def evenly(cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """So many of them, evenly by place in the list; all where there are no more."""
+    """`count` cameras, evenly spread over the list; all if there are no more."""
     count = min(count, len(cameras))
     return [cameras[i * len(cameras) // count] for i in range(count)]
 
 
 def above(camera: Camera, depth: float, degrees: float) -> Camera:
-    """The pose turned up about what lies at `depth` on its axis, still looking there."""
+    """The pose turned up about the point at `depth` on its axis, and still looking there."""
     angle = math.radians(degrees)
     turn = np.array(
         [[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]]
@@ -88,7 +88,7 @@ def _sized(camera: Camera, factor: float) -> Camera:
 
 
 def worst_tile(image: np.ndarray, reference: np.ndarray, side: int = TILE_SIDE) -> float:
-    """Largest mean squared error of a tile of two [H, W, 3] images clamped to [0, 1]; tiles at the edges may be cut."""
+    """Largest mean squared error of a tile, between two [H, W, 3] images clamped to [0, 1]. Tiles at the edges may be smaller."""
     square = np.square(np.clip(image, 0.0, 1.0).astype(np.float64) - np.clip(reference, 0.0, 1.0)).sum(axis=2)
     height, width = square.shape
     rows, across = np.arange(0, height, side), np.arange(0, width, side)
@@ -99,20 +99,20 @@ def worst_tile(image: np.ndarray, reference: np.ndarray, side: int = TILE_SIDE) 
 
 @dataclass(frozen=True)
 class Seen:
-    """Squared errors of views against the original's renders, and those of their worst tiles."""
+    """Mean squared errors of views against the original's renders, and of their worst tiles."""
 
     errors: list[float]
     tiles: list[float]
 
     def cells(self) -> dict[str, Cell]:
-        """Mean over the views, worst view and worst tile, dB."""
+        """Fidelity in dB: mean over the views, worst view and worst tile."""
         mean = mean_psnr([psnr(error) for error in self.errors])
         figures = {"fidelity": mean, "worst": psnr(max(self.errors)), "tile": psnr(max(self.tiles))}
         return {name: None if value is None else round(value, 3) for name, value in figures.items()}
 
 
 def look(studied: StudyScene, contenders: Contenders, cameras: Sequence[Camera]) -> dict[str, Seen]:
-    """Every contender against the original over some views."""
+    """Compare all contenders with the original over some views."""
     renderer = studied.bench.renderer
     with renderer.load(studied.run.source) as scene:
         originals = [renderer.render(scene, camera) for camera in cameras]
@@ -130,14 +130,14 @@ def look(studied: StudyScene, contenders: Contenders, cameras: Sequence[Camera])
 
 
 def poses(studied: StudyScene, contenders: Contenders, amounts: Amounts) -> list[Experiment]:
-    """Fidelity from poses that were never scored: by distance, and by all else."""
+    """Measure fidelity from poses that were not scored, by distance and by kind."""
     rows: list[dict[str, Cell]] = []
     base: dict[str, float] = {}
     every = make_poses(studied, amounts)
     for made in studied.run.progress.track(every, "poses", len(every)):
         for name, seen in look(studied, contenders, made.cameras).items():
             cells = seen.cells()
-            # Identical pictures have no fidelity: nothing is below it, and it is below nothing.
+            # Identical pictures have no finite fidelity, so nothing can be compared with them.
             fidelity = math.inf if cells["fidelity"] is None else number(cells, "fidelity")
             below = base.setdefault(name, fidelity) - fidelity
             rows.append(
@@ -157,8 +157,8 @@ def poses(studied: StudyScene, contenders: Contenders, amounts: Amounts) -> list
 
 
 _LOOK = (
-    "Fidelity to the original's renders, mean over the views, of the worst view and of the worst tile of "
-    f"{TILE_SIDE}x{TILE_SIDE} pixels; a method has broken where it is more than {BREAK:g} dB below its own at "
+    "Fidelity to the original's renders: mean over the views, worst view, and worst tile of "
+    f"{TILE_SIDE}x{TILE_SIDE} pixels. A method has broken if it is more than {BREAK:g} dB below its own fidelity at "
     "training poses. "
 )
 
@@ -173,13 +173,13 @@ def _by_distance(rows: list[dict[str, Cell]], contenders: Contenders, base: floa
     return Experiment(
         "distance",
         "Nearer and farther",
-        "Held-out poses moved along their axes, so that what is in the middle of the frame is at so many times its distance. "
+        "Held-out poses are moved along their axes, to so many times the distance of the middle of the frame. "
         + _LOOK
         + WORDS,
         table,
         LineChart(
-            "Poses nearer and farther than any that was scored",
-            "distance to what the pose looks at, times",
+            "Poses nearer and farther than the scored ones",
+            "distance to the scene, times",
             "fidelity (dB)",
             tuple(curve(part, name, "amount", "fidelity", every=True) for name, part in series.items()),
             limit=round(base - BREAK, 2) if math.isfinite(base) else None,
@@ -191,7 +191,7 @@ def _by_distance(rows: list[dict[str, Cell]], contenders: Contenders, base: floa
 
 
 def _near_and_far(rows: Sequence[Row], name: str) -> str:
-    """Where a method stands, from both sides of the poses as they are."""
+    """A sentence: from which distances, nearer and farther, a method still stands."""
     broken = [row for row in rows if row["broke"] is not None]
     words = ", ".join(f"{number(row, 'amount'):g}x ({_below(row)})" for row in broken)
     gentle = ", ".join(f"{number(row, 'amount'):g}x {_below(row)}" for row in rows if row["amount"] in (0.5, 2.0))

@@ -1,1 +1,1 @@
-"""What pruning and quantization broke, mended in the values that are kept."""
+"""Refits: the remaining Gaussians are fitted to renders of the original after pruning and quantization."""

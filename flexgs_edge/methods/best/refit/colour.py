@@ -1,4 +1,7 @@
-"""Colour refit in closed form: SIRT rounds that back-project the residual against the original's own renders."""
+"""Refits colours to renders of the original, in closed form, without photos.
+
+Each round back-projects the residual images to the Gaussians' colours (SIRT). Geometry stays as it is.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +26,9 @@ from flexgs_edge.views.sums import Maker, ViewSums
 
 RELAX_DC = 1.0
 RELAX_SH = 0.25
-"""Step of a round, as a share of the SIRT step of the constant alone. With all bands moving at once, a pixel seen by one pose
-moves by its residual times 1 + 15 mean |Y_k| * this. It must stay below 2, or steps from few poses grow and grow:
-docs/results/tuning.md#relax_sh"""
+"""Steps of the constant and of SH, as shares of the SIRT step of the constant alone. All bands move at once. So a pixel seen
+by one pose moves by its residual times 1 + 15 mean |Y_k| * RELAX_SH. That factor must stay below 2, or steps from few poses
+diverge: docs/results/tuning.md#relax_sh"""
 
 
 def refit_colours(
@@ -42,25 +45,31 @@ def refit_colours(
 ) -> dict[str, np.ndarray]:
     """Move colours towards the original's renders, all at once, for a fixed number of rounds.
 
-    Each step adds to every coefficient `relax * sum(Y alpha T r) / sum(|Y| alpha T)` over pixels and poses, with r the
-    original's render minus the present one (SIRT: Gilbert 1972). Gaussians that no pose sees stay as they are.
+    Each step adds `relax * sum(Y alpha T r) / sum(|Y| alpha T)` to every coefficient (SIRT: Gilbert 1972). Sums are over
+    pixels and poses, and r is the original's render minus the present one. Gaussians that no pose sees stay as they are.
 
     Parameters
     ----------
+    bench : Bench
+        Draws the views.
     planes : dict
         Stored planes of the kept Gaussians ([width, n] f32 by field); not changed.
     degrees : np.ndarray
-        [n] SH degree kept for each row: coefficients above it stay zero.
+        [n] u8, SH degree kept for each row. Coefficients above it stay zero.
     origin : np.ndarray
         [3] f64, as in `SceneSource`.
+    cameras : sequence of Camera
+        The scored poses.
     targets : References
-        The original from `cameras`.
+        Renders of the original from `cameras`.
     rounds : int
-        Times that every pose is looked at.
+        How often we look at every pose. Each round takes about as long as rendering all poses.
     bands : bool
-        Refit the SH above degree 0 as well (otherwise the constant only).
+        Refit the SH above degree 0 too (default). Otherwise only the constant moves.
     subsets : int
-        Steps a round, each after an interleaved part of the poses (ordered subsets: Hudson & Larkin 1994).
+        Steps of a round, each from an interleaved part of the poses (ordered subsets: Hudson & Larkin 1994). Default: 1.
+    progress : Progress
+        Told of each step.
 
     Returns
     -------
@@ -93,7 +102,7 @@ def normal_bytes(sh_degree: int) -> int:
 
 
 def normal_sums(renderer: Renderer) -> Maker:
-    """Sums over views that a step of the refit is made of: back-projected residuals and weights, for every basis function.
+    """Maker of the sums over views for a step of the refit: back-projected residuals and weights, for every basis function.
 
     Residual sums come first among a view's.
     """
@@ -101,7 +110,7 @@ def normal_sums(renderer: Renderer) -> Maker:
 
 
 class _ChunkNormal:
-    """These sums of one chunk."""
+    """The sums of `normal_sums` for one chunk."""
 
     def __init__(self, renderer: Renderer, chunk: Chunk) -> None:
         self._renderer, self._count = renderer, chunk.count
@@ -116,7 +125,7 @@ class _ChunkNormal:
         )  # fmt: skip
 
     def values(self) -> np.ndarray:
-        """[K + 1, 4, n] f32: residual of three channels and weight."""
+        """[K + 1, 4, n] f32 sums for each basis function: residuals of three channels, and weight."""
         values: np.ndarray = self._renderer.backend.read(self._array)[:, :, : self._count]
         return values
 
@@ -129,7 +138,21 @@ class _ChunkNormal:
 def step_colours(
     planes: dict[str, np.ndarray], degrees: np.ndarray, rows: slice, normal: np.ndarray, bands: bool = True
 ) -> None:
-    """One step of some rows, in place: `normal` is their part of `normal_sums`, the rest as for `refit_colours`."""
+    """Take one step of the refit for some rows, in place.
+
+    Parameters
+    ----------
+    planes : dict
+        Stored planes ([width, n] f32 by field); colours of `rows` change.
+    degrees : np.ndarray
+        [n] u8, SH degrees of all rows.
+    rows : slice
+        The rows to change.
+    normal : np.ndarray
+        [K + 1, 4, rows] f32, their sums (`normal_sums`).
+    bands : bool
+        Change the SH above degree 0 too.
+    """
     weight = np.where(normal[:, 3] > 0, normal[:, 3], np.float32(np.inf))
     # The constant's basis is Y_0 everywhere: its step in coefficients is 1 / Y_0 of the mean residual.
     moved = read_rows(planes["sh_dc"], rows) + np.float32(RELAX_DC / SH_C0) * normal[0, :3] / weight[0]

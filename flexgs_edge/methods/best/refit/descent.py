@@ -1,4 +1,4 @@
-"""A scene whose values all move: on a device, step by step down the squared error of single views."""
+"""Gradient descent on a device: all values of a scene move by Adam, one view a step."""
 
 from __future__ import annotations
 
@@ -22,47 +22,49 @@ from flexgs_edge.units import format_mib
 ORDER = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 """Fields in the order of a gradient's planes (cl_kernels/backward.cl)."""
 DECAYS = (0.9, 0.99)
-"""Of the running means of gradients and of their squares. The usual 0.999 of the second remembers longer than a descent of a few
-hundred views lasts."""
+"""Decay of Adam's running means of gradients and of their squares. The usual 0.999 of the second would remember longer than
+a descent of a few hundred views lasts."""
 GRID_VALUES = 14
-"""Steps that `snap` takes."""
+"""Step sizes that the kernel `snap` takes."""
 
 
 def widths(sh_degree: int) -> dict[str, int]:
-    """Planes of each field, in their order."""
+    """How many planes each field has, in the order of `ORDER`."""
     return {name: FIELD[name].width(sh_degree) for name in ORDER}
 
 
 def descent_bytes(sh_degree: int) -> int:
     """Bytes a row that a descent takes on the backend beside the scene.
 
-    Sums of a view; all planes four times (values, gradient, two running means); stored geometry, degrees, flags and powers.
+    They hold the sums of a view; all planes four times (values, gradient, two running means); stored geometry, degrees,
+    flags and powers.
     """
     return sum_bytes(GRADIENT_SUMS) + 4 * (4 * sum(widths(sh_degree).values()) + 8 + 4)
 
 
 class Descent:
-    """Values of a scene, their gradients, and what Adam remembers of these.
+    """Values of a scene, their gradients, and Adam's running means of these.
 
-    Views are drawn from the values as a file of `steps` would give them back, and the gradients there move the values themselves
-    (the straight-through rule): errors of rounding are errors like others then, and neighbours mend them.
+    After `put_on`, views are drawn from values rounded to their grids, but gradients move the values themselves (the
+    straight-through rule). Neighbours then compensate for errors of rounding, too.
 
     Parameters
     ----------
     renderer : Renderer
+        With nothing loaded.
     planes : dict
         Stored planes ([width, n] f32 by field); not changed.
     degrees : np.ndarray
-        [n] SH degree of each row: coefficients above it stay as they are.
+        [n] u8, SH degree of each row. Coefficients above it stay as they are.
     origin : np.ndarray
-        [3] f64.
+        [3] f64, as in `SceneSource`.
     camera : Camera
-        The largest view: memory is planned with it.
+        The largest view, from which memory is planned.
 
     Raises
     ------
     BudgetError
-        When the scene and what is remembered of it do not fit at once.
+        When the scene, its gradients and their running means do not fit at once: a descent does not stream.
     """
 
     def __init__(
@@ -101,19 +103,19 @@ class Descent:
         return self._arrays[-1]
 
     def put_on(self, steps: StepSizes | None) -> None:
-        """Draw from values on this grid from now on (None: from the values themselves)."""
+        """From now on, draw from values on this grid (None: from the values themselves)."""
         self.backend.write(self._steps, step_record(steps))
         for part in self._parts:
             part.snap(self._steps)
 
     def differentiate(self, camera: Camera, target: np.ndarray) -> None:
-        """Gradients of the squared error of a view against `target` ([3, H, W] f16, as for `Renderer.residual_sums`)."""
+        """Compute gradients of the squared error of a view against `target` ([3, H, W] f16, as for `Renderer.residual_sums`)."""
         sums = self.renderer.gradient_sums(self._scene, camera, target)
         for part in self._parts:
             part.differentiate(self.renderer, sums)
 
     def step(self, camera: Camera, target: np.ndarray, rates: dict[str, float]) -> None:
-        """One step of Adam down the squared error of a view; `rates` are the largest changes of each field's values."""
+        """Take one step of Adam down the squared error of a view; `rates` are the largest changes of each field's values."""
         self.differentiate(camera, target)
         per_plane = np.concatenate([np.full(width, rates[name], np.float32) for name, width in self.widths.items()])
         self.backend.write(self._rates, per_plane)
@@ -122,7 +124,7 @@ class Descent:
             part.snap(self._steps)
 
     def gradients(self) -> dict[str, np.ndarray]:
-        """The last view's gradients, zero where it has none."""
+        """Gradients of the last view ([width, n] f32 by field), zero for rows that it does not show."""
 
         def read(part: _Part) -> np.ndarray:
             return np.where(self.backend.read(part.touched) > 0, self.backend.read(part.gradient), np.float32(0))
@@ -130,7 +132,7 @@ class Descent:
         return self._gathered(read)
 
     def planes(self) -> dict[str, np.ndarray]:
-        """The values, not on any grid."""
+        """The values ([width, n] f32 by field), not rounded to any grid."""
         return self._gathered(lambda part: self.backend.read(part.values))
 
     def _gathered(self, read: Any) -> dict[str, np.ndarray]:
@@ -159,7 +161,7 @@ class Descent:
 
 
 class _Part:
-    """One chunk of it."""
+    """One chunk of a descent."""
 
     def __init__(self, scene: DeviceScene, chunk: Chunk, planes: dict[str, np.ndarray], degrees: np.ndarray) -> None:
         self.backend, self.chunk, self.antialiased = scene.backend, chunk, int(scene.antialiased)
@@ -233,7 +235,7 @@ class _Part:
 
 
 def _fields(planes: dict[str, np.ndarray], own: dict[str, int]) -> Iterator[tuple[str, slice, np.ndarray]]:
-    """Name, planes in an array of all, and values of each field; of SH the first coefficients of every channel, a view."""
+    """Name, slice among all planes, and values of each field, as views. SH are cut to the first coefficients of each channel."""
     at = 0
     for name, width in own.items():
         values = planes[name]
@@ -244,7 +246,7 @@ def _fields(planes: dict[str, np.ndarray], own: dict[str, int]) -> Iterator[tupl
 
 
 def step_record(steps: StepSizes | None) -> np.ndarray:
-    """What `snap` takes for steps (None: zeros)."""
+    """[GRID_VALUES] f32, step sizes in the order of the kernel `snap`; zeros for None."""
     record = np.zeros(GRID_VALUES, np.float32)
     if steps is not None:
         record[:4] = steps.position, steps.scale, steps.rotation, steps.opacity

@@ -1,4 +1,7 @@
-"""Self-distillation: a short descent of all kept values towards the original's own renders. No photos, and nothing is added."""
+"""Self-distillation: fine-tunes all values of the remaining Gaussians against renders of the original.
+
+It needs no photos and adds no Gaussians, so the result cannot look better than the original.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from flexgs_edge.scene.rotations import canonical_axes
 from flexgs_edge.views.references import References
 
 MEANS_RATE = 1.6e-4
-"""Largest change of a position in a step, as a share of the cameras' extent (the reference program's first rate)."""
+"""Largest change of a position in a step, as a share of the cameras' extent. The reference program begins with it too."""
 FIELD_RATES = {
     "log_scales": 1.5e-2,
     "quats": 3e-3,
@@ -24,30 +27,30 @@ FIELD_RATES = {
     "sh_dc": 2.5e-3,
     "sh_rest": 2.5e-3 / 20,
 }
-"""The same of the other values: the reference program's, three times as much for scales and rotations. That program
-takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
+"""Largest changes of the other values in a step. Those of scales and rotations are three times the reference program's, the
+others are equal. That program takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
 LAST = 0.1
-"""Rates at the end as a share of those at the beginning, of the steps with geometry and of those without; they fall by the same
-share at each step."""
+"""Rates at the end as a share of those at the beginning, once while geometry moves and once while it is held. They fall by the
+same factor at each step."""
 ON_GRID, HOLDING = 0.5, 0.75
-"""Shares of the steps before views are drawn from values on their grids, and before geometry is held there."""
+"""Share of the steps before views are drawn from values on their grids, and share before geometry is held there."""
 HELD = ("means", "log_scales", "quats")
-"""Fields that stay where they are from then on. Codes of geometry that flip back and forth move whole splats, so the
-views that come last would decide: docs/results/tuning.md#held"""
+"""Fields that are held in the last steps. Codes of geometry that flip back and forth would move whole splats, and the
+last views would decide where they stay: docs/results/tuning.md#held"""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long a descent is, and how it goes.
+    """Length and course of a descent.
 
     Parameters
     ----------
     steps : int
-        Views looked at, one a step.
+        How many views it looks at, one a step.
     rate : float
-        Factor of all rates.
+        Factor on all rates.
     on_grid, holding : float
-        Shares of the steps before values are put on their grids for drawing, and before geometry is held there.
+        Share of the steps before values are put on their grids for drawing, and share before geometry is held there.
     """
 
     steps: int
@@ -56,19 +59,19 @@ class Schedule:
     holding: float = HOLDING
 
     def parts(self, grid: bool) -> tuple[range, range, range]:
-        """Steps off the grid, on it, and on it with geometry held (all of them off it where there is none)."""
+        """Steps off the grid, on it, and on it with geometry held. Without a grid, all steps are off it."""
         free, moving = (round(share * self.steps) if grid else self.steps for share in (self.on_grid, self.holding))
         return range(free), range(free, moving), range(moving, self.steps)
 
     def order(self, views: int) -> np.ndarray:
-        """[steps] i64, which view each step looks at: all of them in a shuffled order, then in another."""
+        """[steps] i64, the view of each step: all views in a shuffled order, then all again in another order."""
         rng = np.random.default_rng(0)
         rounds = [rng.permutation(views) for _ in range(-(-self.steps // max(views, 1)))]
         return np.concatenate([*rounds, np.zeros(0, np.int64)])[: self.steps]
 
 
 def rates_for(cameras: Sequence[Camera]) -> dict[str, float]:
-    """Rates of all fields; those of positions follow 1.1 times the largest distance of a camera from their mean."""
+    """Rates of all fields. That of positions scales with the cameras' extent, 1.1 times the largest distance from their mean."""
     centres = np.stack([camera.center for camera in cameras])
     extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     return {"means": MEANS_RATE * extent, **FIELD_RATES}
@@ -90,30 +93,40 @@ def distil(
 
     Parameters
     ----------
+    renderer : Renderer
+        With nothing loaded.
     planes : dict
         Stored planes of the kept Gaussians ([width, n] f32 by field); not changed.
     degrees : np.ndarray
-        [n] SH degree kept for each row: coefficients above it stay zero.
+        [n] u8, SH degree kept for each row. Coefficients above it stay zero.
     origin : np.ndarray
         [3] f64, as in `SceneSource`.
+    cameras : sequence of Camera
+        The scored poses, and those between them.
     targets : References
-        The original from `cameras`.
+        Renders of the original from `cameras`.
+    schedule : Schedule
+        Number of steps, and when the grid comes in.
     steps : StepSizes, optional
-        The grid that the values will be put on: the last steps repair its rounding.
+        Step sizes of the grid that the values will be put on. The last steps then compensate for its rounding.
+    progress : Progress
+        Told of each step.
+    rates : dict, optional
+        Rates by field, in place of those of `rates_for`.
 
     Returns
     -------
     dict
-        The values, not on any grid.
+        The values ([width, n] f32 by field), not rounded to any grid.
 
     Raises
     ------
     BudgetError
-        When the scene does not fit into memory with what a descent remembers.
+        When the scene, its gradients and their running means do not fit into memory.
     """
     rates = {**rates_for(cameras), **(rates or {})}
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
-    # Quaternions in the form that the grid has; rows with SH first: chunks of the others are drawn and moved without.
+    # Quaternions get the form that the grid has. Rows with SH come first, so that the other chunks are drawn without SH.
     quats, log_scales = canonical_axes(planes["quats"], planes["log_scales"])
     ordered = {**planes, "quats": quats.astype(np.float32), "log_scales": log_scales}
     rows = np.argsort(degrees == 0, kind="stable")
@@ -123,7 +136,7 @@ def distil(
         parts = schedule.parts(steps is not None)
         for place, part in enumerate(parts):
             held = HELD if place == 2 else ()
-            # Rates fall while geometry moves, and again while it does not.
+            # Rates fall while geometry moves, and fall again while it is held.
             falling = part if held else range(parts[1].stop)
             if place and len(part):
                 descent.put_on(steps)
