@@ -23,6 +23,7 @@ from flexgs_edge.goals.steps import REFINE_STEPS
 from flexgs_edge.methods.best.effort import EFFORTS
 from flexgs_edge.methods.paper.scores import SCORES
 from flexgs_edge.run.options import EFFORT_WORDS, METHODS, SELECTS, CompressOptions, ViewOptions
+from interruptible import running
 from tiny_project import COUNT, make_project
 
 COMMANDS = list(app.COMMANDS)
@@ -324,13 +325,8 @@ def test_ctrl_c_leaves_nothing_behind(sample_dir: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "flexgs_edge", "compress", str(sample_dir / "point_cloud.ply"), "-o", "a.fgs"]
     root = str(Path(cli.__file__).parents[2])
     # On the twins this would take minutes: the interrupt surely comes in the middle.
-    with subprocess.Popen(
-        [*command, "--method", "paper", "--device", "numpy", "--resolution", "48"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": root},
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
+    words = ["--method", "paper", "--device", "numpy", "--resolution", "48"]
+    with running(*command, *words, cwd=tmp_path, env={**os.environ, "PYTHONPATH": root}) as process:
         assert process.stderr is not None
         for line in process.stderr:
             if "scoring" in line:
