@@ -82,6 +82,8 @@ class Encoded:
     """What writes the streams; None: NumPy."""
     written: tuple[bytes, ...] | None = None
     """The streams, if they are there already."""
+    threads: int | None = None
+    """Chunks in work at once where NumPy codes; None: as many as suit this machine."""
 
     @property
     def information(self) -> float:
@@ -109,7 +111,9 @@ class Encoded:
         if self.device is not None and self.device.threads:
             yield from _streams_on(self.device, self.model, pairs)
             return
-        yield from in_order(lambda pair: encode_chunk(self.model, *pair), pairs, thread_count(len(pairs)))
+        yield from in_order(
+            lambda pair: encode_chunk(self.model, *pair), pairs, self.threads or thread_count(len(pairs))
+        )
 
     def finished(self) -> Encoded:
         """The same with its streams, the bytes of a file, in place of its symbols, which are several times as many."""
@@ -117,12 +121,17 @@ class Encoded:
 
 
 def encode_grid(
-    grid: GridScene, chunk_rows: int = CHUNK_ROWS, device: Device | None = None, storage: Storage = IN_MEMORY
+    grid: GridScene,
+    chunk_rows: int = CHUNK_ROWS,
+    device: Device | None = None,
+    storage: Storage = IN_MEMORY,
+    threads: int | None = None,
 ) -> Encoded:
     """Fit a model to a scene and count its symbols; `Encoded.streams` gives the chunks.
 
     Holds two or three bytes a coded number beside the grid itself; with a device, which gives the same result, a kilobyte
-    a row of as many chunks as it works on at once. The bytes for each number lie in `storage`.
+    a row of as many chunks as it works on at once. The bytes for each number lie in `storage`. NumPy codes `threads` chunks at
+    once, by default as many as suit this machine.
     """
     cells, low, depth = cells_of(grid, storage)
     layers = np.bincount(grid.layer, minlength=1).tolist()
@@ -144,7 +153,7 @@ def encode_grid(
     ports = (
         _counted_on(device, grid, cells, chunks, depth, groups)
         if device is not None and device.threads
-        else in_order(counted, chunks, thread_count(len(chunks)))
+        else in_order(counted, chunks, threads or thread_count(len(chunks)))
     )
     for port in ports:
         batches.append(_put_away(port.batches, storage))
@@ -161,7 +170,7 @@ def encode_grid(
     costs = (
         float((n * (PRECISION - np.log2(np.maximum(t.freqs, 1)))).sum()) for (_, n), t in zip(merged, model.tables)
     )
-    return Encoded(model, low, layers, chunks, batches, count.raw + np.array(list(costs)), device)
+    return Encoded(model, low, layers, chunks, batches, count.raw + np.array(list(costs)), device, threads=threads)
 
 
 def _put_away(batches: list[Batch], storage: Storage) -> list[Batch]:
