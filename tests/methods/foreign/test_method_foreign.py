@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -114,14 +113,12 @@ def test_out_of_reach(project: Path, tmp_path: Path) -> None:
     assert closest.reached is False and closest.count == COUNT and "NOT reached" in compress_text(closest)
 
 
-def test_without_writing(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+def test_without_writing(project: Path, tmp_path: Path, own_temporary_folder: Path) -> None:
     dry = compress(project / "point_cloud.ply", tmp_path / "a.spz", dry_run=True, max_drop=2.0, **PAPER)
     assert dry.output is None and dry.format == "spz" and [p.name for p in tmp_path.iterdir()] == ["tmp"]
     real = compress(project / "point_cloud.ply", tmp_path / "a.spz", max_drop=2.0, **PAPER)
     assert real.size == dry.size == (tmp_path / "a.spz").stat().st_size and real.quality == dry.quality
-    assert list((tmp_path / "tmp").iterdir()) == []
+    assert list(own_temporary_folder.iterdir()) == []
 
 
 def test_fixed_rates_and_scores_of_a_file(project: Path, tmp_path: Path) -> None:
@@ -196,7 +193,9 @@ def test_nothing_is_left_behind(project: Path, tmp_path: Path, monkeypatch: pyte
     with pytest.raises(KeyboardInterrupt):
         compress(project / "point_cloud.ply", tmp_path / "a.spz", force=True, **PAPER)
     assert [path.name for path in tmp_path.iterdir()] == ["a.spz"] and (tmp_path / "a.spz").read_text() == "earlier"
-    monkeypatch.setattr("flexgs_edge.io.converter.CONVERTER", "gaussforge_that_nobody_has")
+
+
+def test_without_the_converter(project: Path, tmp_path: Path, without_converter: None) -> None:
     with pytest.raises(InputError, match=r"pip install 'flexgs-edge\[formats\]'"):
         compress(project / "point_cloud.ply", tmp_path / "b.spz", **PAPER)
 
