@@ -350,11 +350,15 @@ def test_devices_lists_and_explains(capsys: pytest.CaptureFixture[str]) -> None:
     assert code == 4 and "chosen" not in out and "no" in err
 
 
-def test_no_device_is_exit_code_4(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("flexgs_edge.kernels.choose_device.list_devices", lambda *_: [])
-    code, out, err = run("devices", "--json", "-", capsys=capsys)
-    assert code == 4 and json.loads(out) == {"devices": [], "chosen": None, "reason": json.loads(out)["reason"]}
-    assert "pocl-opencl-icd" in err
+def test_no_device_is_exit_code_4(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loader looks for runtimes in an empty folder, in a process of its own."""
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path))
+    monkeypatch.delenv("OCL_ICD_FILENAMES", raising=False)
+    done = spawn("devices", "--json", "-")
+    assert done.returncode == 4, done.stderr
+    found = json.loads(done.stdout)
+    assert found == {"devices": [], "chosen": None, "reason": found["reason"]}
+    assert "pocl-opencl-icd" in done.stderr
 
 
 @pytest.mark.parametrize(

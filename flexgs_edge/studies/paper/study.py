@@ -24,7 +24,9 @@ from flexgs_edge.studies.written import SceneStudy, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
 
-EXPERIMENTS: tuple[Callable[[StudyScene], Experiment], ...] = (
+Maker = Callable[[StudyScene], Experiment]
+"""Makes an experiment on a scene."""
+EXPERIMENTS: tuple[Maker, ...] = (
     quantization.rtn,
     quantization.attributes,
     pruning.splits,
@@ -64,6 +66,7 @@ def study_paper(
     output: str | Path,
     options: CompressOptions | None = None,
     progress: Progress = SILENT,
+    experiments: Sequence[Maker] = EXPERIMENTS,
     **words: Any,
 ) -> PaperStudy:
     """Make the paper's experiments on every scene and write them to a folder.
@@ -79,6 +82,8 @@ def study_paper(
         Views, drawing, memory and device as for `compress`; `max_drop` and `effort` are the search's.
     progress : Progress, optional
         Bars on long work.
+    experiments : sequence of callable, optional
+        What is made of every scene, in this order.
     **words
         Single options by the names of `CompressOptions`.
 
@@ -95,22 +100,24 @@ def study_paper(
     check_folder(output, options.force)
     with atomic_folder(output, options.force) as folder:
         names = scene_names(scenes)
-        found = [_study_scene(path, name, options, progress) for path, name in zip(scenes, names)]
+        found = [_study_scene(path, name, options, progress, experiments) for path, name in zip(scenes, names)]
         _write(folder, found)
     LOG.info("wrote %s", Path(output) / "index.html")
     return PaperStudy(os.fspath(output), tuple(found))
 
 
-def _study_scene(path: str | Path, name: str, options: CompressOptions, progress: Progress) -> SceneStudy:
+def _study_scene(
+    path: str | Path, name: str, options: CompressOptions, progress: Progress, makers: Sequence[Maker]
+) -> SceneStudy:
     with open_study_scene(path, name, options, progress, scores=("gs", "meson")) as studied:
         # First: several experiments build on its answer, and its steps must be measured and not remembered.
         LOG.info("%s: searching for %s", name, studied.target.describe())
         chosen = studied.search.chosen
         LOG.info("%s: prune %g, SH %g", name, chosen.choice.prune / 1000, chosen.choice.sh / 1000)
         experiments = []
-        for number, make in enumerate(EXPERIMENTS, 1):
+        for number, make in enumerate(makers, 1):
             started = time.perf_counter()
-            LOG.info("%s: experiment %d of %d, %s", name, number, len(EXPERIMENTS), make.__name__)
+            LOG.info("%s: experiment %d of %d, %s", name, number, len(makers), make.__name__)
             experiments.append(make(studied))
             LOG.info("%s: %s: %.1f s", name, experiments[-1].key, time.perf_counter() - started)
         return SceneStudy.of(studied, experiments)

@@ -61,6 +61,7 @@ def study_stability(
     options: CompressOptions | None = None,
     progress: Progress = SILENT,
     quick: bool = False,
+    amounts: Amounts | None = None,
     **words: Any,
 ) -> StabilityStudy:
     """Look for the points at which methods break on a scene, and write them to a folder.
@@ -78,6 +79,8 @@ def study_stability(
         Bars on long work.
     quick : bool
         Few points of every experiment, on small views.
+    amounts : Amounts, optional
+        How many points, in place of the amounts that `quick` chooses.
     **words
         Single options by the names of `CompressOptions`.
 
@@ -87,7 +90,7 @@ def study_stability(
         `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "best", "effort": EFFORT})
-    amounts = QUICK if quick else FULL
+    amounts = amounts or (QUICK if quick else FULL)
     if amounts.width is not None:
         options = replace(options, resolution=min(options.resolution, amounts.width))
     # Loaded before the memory is planned, so that its bytes count as taken.

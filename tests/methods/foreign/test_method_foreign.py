@@ -28,6 +28,7 @@ from flexgs_edge.report.summary import compress_text
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from stopped import Stopped
 from synthetic import random_scene
 from tiny_project import COUNT, make_project
 
@@ -181,17 +182,14 @@ def test_what_is_refused(project: Path, tmp_path: Path, name: str, words: dict[s
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nothing_is_left_behind(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_left_behind(project: Path, tmp_path: Path) -> None:
     (tmp_path / "a.spz").write_text("earlier")
     with pytest.raises(InputError, match="the file exists"):
         compress(project / "point_cloud.ply", tmp_path / "a.spz", **PAPER)
 
-    def stop(*args: object, **kwargs: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("flexgs_edge.methods.foreign.method.publish", stop)  # after the last file has been measured
+    words = {"force": True, "progress": Stopped(enabled=False), **PAPER}
     with pytest.raises(KeyboardInterrupt):
-        compress(project / "point_cloud.ply", tmp_path / "a.spz", force=True, **PAPER)
+        compress(project / "point_cloud.ply", tmp_path / "a.spz", **words)
     assert [path.name for path in tmp_path.iterdir()] == ["a.spz"] and (tmp_path / "a.spz").read_text() == "earlier"
 
 
