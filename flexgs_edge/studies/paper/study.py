@@ -66,7 +66,7 @@ def study_paper(
     output: str | Path,
     options: CompressOptions | None = None,
     progress: Progress = SILENT,
-    experiments: Sequence[Maker] = EXPERIMENTS,
+    experiments: Sequence[Maker] | None = None,
     **words: Any,
 ) -> PaperStudy:
     """Make the paper's experiments on every scene and write them to a folder.
@@ -83,7 +83,7 @@ def study_paper(
     progress : Progress, optional
         Bars on long work.
     experiments : sequence of callable, optional
-        What is made of every scene, in this order.
+        What is made of every scene, in this order; by default all of `EXPERIMENTS`.
     **words
         Single options by the names of `CompressOptions`.
 
@@ -93,6 +93,7 @@ def study_paper(
         `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`; nothing is left behind then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "paper"})
+    experiments = EXPERIMENTS if experiments is None else experiments
     if not scenes:
         raise InputError("no scene: give one or more .ply, .fgs or model folders")
     # Loaded before the memory is planned, so that its bytes count as taken.
