@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.harness import SCENES, Timer, backend_of, parse
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.made import at_distance, between
+from flexgs_edge.cameras.generated import at_distance, between
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 from fits import use_fit
+from flexgs_edge.io import converter
 from flexgs_edge.methods.best.effort import EFFORTS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -60,6 +62,20 @@ def short_searches() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(EFFORTS, "fast", replace(EFFORTS["fast"], steps=1, close=1.0))
         yield
+
+
+@pytest.fixture
+def without_converter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine that lacks the package which converts scenes."""
+    monkeypatch.setattr(converter, "CONVERTER", "gaussforge_that_nobody_has")
+
+
+@pytest.fixture
+def own_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where temporary files are made: `tmp` in the test's folder, so that it can look for what is left."""
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    return tmp_path / "tmp"
 
 
 @pytest.hookimpl(wrapper=True)

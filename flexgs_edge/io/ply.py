@@ -20,7 +20,7 @@ from flexgs_edge.io.ply_layout import SMOOTHING, PlyHeader, gaussian_layout, rea
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
-_BLOCK_ROWS = 4096
+BLOCK_ROWS = 4096
 """Rows read at a time: 1 MB at SH degree 3, so that gathering stays in the processor's cache."""
 _SPAN = 4
 """A list of rows is read as one span of the file if the span has at most this many rows for each wanted one."""
@@ -45,6 +45,8 @@ class PlySource(SceneSource):
     ----------
     path : path
         The file; it must not change while the source is in use (checked at every read).
+    block_rows : int, optional
+        Rows that are read at a time.
 
     Raises
     ------
@@ -55,7 +57,7 @@ class PlySource(SceneSource):
         bytes.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], block_rows: int = BLOCK_ROWS) -> None:
         self.path = Path(path)
         self.name = os.fspath(path)
         try:
@@ -67,7 +69,9 @@ class PlySource(SceneSource):
             self._smoothed = smoothing_of(header)
             self.settings: dict[str, Any] = {"antialiased": True} if self._smoothed else {}
             header.check_size(stamp[1])
-            self._rows: _RowReader = _FileRows(header, stamp) if header.plain else _ArrayRows(_load_whole(header))
+            self._rows: _RowReader = (
+                _FileRows(header, stamp, block_rows) if header.plain else _ArrayRows(_load_whole(header), block_rows)
+            )
         except OSError as error:
             raise InputError(f"{path}: cannot read the scene ({error.strerror})") from error
         self.count = header.vertex.count
@@ -160,24 +164,25 @@ class _RowReader(Protocol):
 class _ArrayRows:
     """Rows of a structured array in memory."""
 
-    def __init__(self, array: np.ndarray) -> None:
-        self.array = array
+    def __init__(self, array: np.ndarray, block_rows: int) -> None:
+        self.array, self.block_rows = array, block_rows
 
     def blocks(self, rows: Rows) -> Iterator[tuple[slice, np.ndarray]]:
         if isinstance(rows, slice):
             yield slice(0, rows.stop - rows.start), self.array[rows]
             return
-        for start in range(0, len(rows), _BLOCK_ROWS):
-            part = slice(start, min(start + _BLOCK_ROWS, len(rows)))
+        for start in range(0, len(rows), self.block_rows):
+            part = slice(start, min(start + self.block_rows, len(rows)))
             yield part, self.array[rows[part]]
 
 
 class _FileRows:
     """Rows of a file, read block by block."""
 
-    def __init__(self, header: PlyHeader, stamp: tuple[int, int, int]) -> None:
+    def __init__(self, header: PlyHeader, stamp: tuple[int, int, int], block_rows: int) -> None:
         self.path, self.stamp = header.path, stamp
         self.offset, self.dtype = header.vertex_offset, header.vertex_dtype
+        self.block_rows = block_rows
 
     def blocks(self, rows: Rows) -> Iterator[tuple[slice, np.ndarray]]:
         size = rows.stop - rows.start if isinstance(rows, slice) else len(rows)
@@ -187,9 +192,9 @@ class _FileRows:
             with open(self.path, "rb", buffering=0) as file:
                 if _stamp(file) != self.stamp:
                     raise InputError(f"{self.path}: the file was changed after it was opened; start again")
-                block = np.empty(min(size, _BLOCK_ROWS) * (1 if isinstance(rows, slice) else _SPAN), self.dtype)
-                for start in range(0, size, _BLOCK_ROWS):
-                    part = slice(start, min(start + _BLOCK_ROWS, size))
+                block = np.empty(min(size, self.block_rows) * (1 if isinstance(rows, slice) else _SPAN), self.dtype)
+                for start in range(0, size, self.block_rows):
+                    part = slice(start, min(start + self.block_rows, size))
                     if isinstance(rows, slice):
                         first = rows.start + start
                         yield part, self._range(file, first, block[: part.stop - part.start])

@@ -21,7 +21,7 @@ HINT = (
 
 # Fused and separate multiply-add on vectors of 16. It catches runtimes that cannot build for this processor, such as
 # PoCL's wheels on newer CPUs. It also catches those that fuse operations they must not fuse, or that miss lanes.
-_SELF_TEST = """
+SELF_TEST = """
 #pragma OPENCL FP_CONTRACT OFF
 __kernel void self_test(__global const float *a, __global const float *b, __global float *out) {
   const size_t i = get_global_id(0) * 16;
@@ -125,8 +125,8 @@ def _describe(index: int, platform: Any, device: Any, self_test: bool) -> Device
     )
 
 
-def run_self_test(context: cl.Context) -> str:
-    """Run the self-test; returns `ok`, or one line about the failure."""
+def run_self_test(context: cl.Context, source: str = SELF_TEST) -> str:
+    """Run the self-test of this source; returns `ok`, or one line about the failure."""
     import pyopencl as cl
 
     a = np.linspace(0.5, 3.0, 64, dtype=np.float32)
@@ -136,7 +136,7 @@ def run_self_test(context: cl.Context) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            program = cl.Program(context, _SELF_TEST).build(options=["-cl-std=CL1.2"], cache_dir=False)  # type: ignore[arg-type]
+            program = cl.Program(context, source).build(options=["-cl-std=CL1.2"], cache_dir=False)  # type: ignore[arg-type]
         queue = cl.CommandQueue(context)
         inputs = [cl.Buffer(context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=x) for x in (a, b)]
         output = cl.Buffer(context, flags.WRITE_ONLY, got.nbytes)

@@ -17,8 +17,8 @@ from flexgs_edge.memory.process import AnonymousPeak
 from flexgs_edge.memory.rows import COPY_ROWS, MappedFile, blocks, put_rows, read_rows, take_rows
 from flexgs_edge.units import format_size
 
-_SMALL = 1 << 16
-"""Arrays smaller than so many bytes always stay in memory; a file for each would cost more than it saves."""
+LEAST_BYTES = 1 << 16
+"""Bytes of the smallest array that lies in a file. A file for each smaller one would cost more than it saves."""
 WHOLE_BYTES = 1 << 26
 """Least size of a plane, in bytes, that may be read as a whole to take rows in any order. Otherwise each row would be a
 read of its own: docs/results/tuning.md#disks"""
@@ -93,6 +93,10 @@ class ScratchStorage(Storage):
         On a disk.
     limit : int
         Bytes that the process may hold; larger limits let larger planes be held as a whole.
+    least : int
+        Arrays of fewer bytes always stay in memory.
+    whole : int
+        See `WHOLE_BYTES`.
 
     Raises
     ------
@@ -103,10 +107,13 @@ class ScratchStorage(Storage):
 
     spills = True
 
-    def __init__(self, folder: str | os.PathLike[str], limit: int = 0) -> None:
+    def __init__(
+        self, folder: str | os.PathLike[str], limit: int = 0, least: int = LEAST_BYTES, whole: int = WHOLE_BYTES
+    ) -> None:
         self.folder: Path = Path(os.path.realpath(folder))
-        self.whole_bytes = max(WHOLE_BYTES, limit // WHOLE_SHARE)
+        self.whole_bytes = max(whole, limit // WHOLE_SHARE)
         self.used = self.peak = 0
+        self._least = least
         self._watch: AnonymousPeak | None = None
         kind = file_system_of(self.folder)
         if kind in _IN_MEMORY:
@@ -136,7 +143,7 @@ class ScratchStorage(Storage):
     def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         """See `Storage.empty`; raises `BudgetError` if the disk is full."""
         size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
-        if size < _SMALL:
+        if size < self._least:
             return np.empty(shape, dtype)
         file = self.file()
         try:

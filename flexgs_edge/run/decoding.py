@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS
 from flexgs_edge.codec.v2.device.encode_kernels import device_bytes
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.kernels.choose_device import DeviceInfo, list_devices
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.clock import Stopwatch
@@ -17,14 +18,37 @@ from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
 
 DECODE_BYTES = 800
 """Bytes a row that decoding a chunk holds: codes, features, neighbours' weights, sums."""
+DEVICE_ROWS = 40_000
+"""Gaussians from which a device codes. Below, the kernels take longer to start than they save:
+docs/results/tuning.md#device_rows"""
 
 
-def decoder(device: str | None, source: SceneSource, budget: MemoryBudget, clock: Stopwatch) -> Backend | None:
+def decoder(
+    device: str | None,
+    source: SceneSource,
+    budget: MemoryBudget,
+    clock: Stopwatch,
+    least: int = DEVICE_ROWS,
+    devices: Callable[[], list[DeviceInfo]] = list_devices,
+) -> Backend | None:
     """The device that decodes a scene; None: NumPy does, with the same results.
 
     That is so for files that are not of container version 2, with `device` "numpy", on GPUs (a work-item decodes a chunk: theirs
     would crawl), and, unless a device is named, for scenes too small to make up for opening one, and where no processor has a
     driver that works.
+
+    Parameters
+    ----------
+    device : str or None
+        As the user names it.
+    source : SceneSource
+        What is decoded.
+    budget, clock
+        Of the run.
+    least : int, optional
+        Gaussians from which a device decodes that nobody named.
+    devices : callable, optional
+        Lists those that there are.
 
     Raises
     ------
@@ -34,11 +58,9 @@ def decoder(device: str | None, source: SceneSource, budget: MemoryBudget, clock
     if device == "numpy" or not isinstance(source, GridSource):
         return None
     if device is None:
-        if source.count < DEVICE_ROWS:
+        if source.count < least:
             return None
-        from flexgs_edge.kernels.choose_device import list_devices
-
-        if not any(found.type == "cpu" and found.usable for found in list_devices()):
+        if not any(found.type == "cpu" and found.usable for found in devices()):
             return None
         device = "cpu"
     backend = counted_backend(device, budget, clock)
@@ -78,11 +100,6 @@ def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
     with ahead(source, budget):
         planes = read_all(source, storage)
     return MemorySource(planes, source.sh_degree, source.origin, source.name)
-
-
-DEVICE_ROWS = 40_000
-"""Gaussians from which a device codes. Below, the kernels take longer to start than they save:
-docs/results/tuning.md#device_rows"""
 
 
 def coding_device(backend: Backend | None, budget: MemoryBudget, count: int, sh_degree: int) -> Backend | None:

@@ -23,6 +23,7 @@ from flexgs_edge.goals.steps import REFINE_STEPS
 from flexgs_edge.methods.best.effort import EFFORTS
 from flexgs_edge.methods.paper.scores import SCORES
 from flexgs_edge.run.options import EFFORT_WORDS, METHODS, SELECTS, CompressOptions, ViewOptions
+from interruptible import running
 from tiny_project import COUNT, make_project
 
 COMMANDS = list(app.COMMANDS)
@@ -319,13 +320,8 @@ def test_ctrl_c_leaves_nothing_behind(sample_dir: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "flexgs_edge", "compress", str(sample_dir / "point_cloud.ply"), "-o", "a.fgs"]
     root = str(Path(cli.__file__).parents[2])
     # On the twins this would take minutes: the interrupt surely comes in the middle.
-    with subprocess.Popen(
-        [*command, "--method", "paper", "--device", "numpy", "--resolution", "48"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": root},
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
+    words = ["--method", "paper", "--device", "numpy", "--resolution", "48"]
+    with running(*command, *words, cwd=tmp_path, env={**os.environ, "PYTHONPATH": root}) as process:
         assert process.stderr is not None
         for line in process.stderr:
             if "scoring" in line:
@@ -349,11 +345,15 @@ def test_devices_lists_and_explains(capsys: pytest.CaptureFixture[str]) -> None:
     assert code == 4 and "chosen" not in out and "no" in err
 
 
-def test_no_device_is_exit_code_4(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("flexgs_edge.kernels.choose_device.list_devices", lambda *_: [])
-    code, out, err = run("devices", "--json", "-", capsys=capsys)
-    assert code == 4 and json.loads(out) == {"devices": [], "chosen": None, "reason": json.loads(out)["reason"]}
-    assert "pocl-opencl-icd" in err
+def test_no_device_is_exit_code_4(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loader looks for runtimes in an empty folder, in a process of its own."""
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path))
+    monkeypatch.delenv("OCL_ICD_FILENAMES", raising=False)
+    done = spawn("devices", "--json", "-")
+    assert done.returncode == 4, done.stderr
+    found = json.loads(done.stdout)
+    assert found == {"devices": [], "chosen": None, "reason": found["reason"]}
+    assert "pocl-opencl-icd" in done.stderr
 
 
 @pytest.mark.parametrize(

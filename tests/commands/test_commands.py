@@ -31,6 +31,7 @@ from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from stopped import Stopped
 from tiny_project import COUNT, HEIGHT, VIEWS, WIDTH, make_project, write_cameras
 
 FAST: dict[str, Any] = {"method": "paper", "device": "numpy", "effort": "fast", "holdout": 4}
@@ -336,14 +337,11 @@ def test_outputs_are_checked_before_any_work(project: Path, tmp_path: Path) -> N
     assert (tmp_path / "old.fgs").read_text() == "precious"
 
 
-def test_an_interrupted_run_leaves_nothing(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(*args: object, **kwargs: object) -> None:
-        raise KeyboardInterrupt
-
+def test_an_interrupted_run_leaves_nothing(project: Path, tmp_path: Path) -> None:
     (tmp_path / "a.fgs").write_text("earlier")
-    monkeypatch.setattr("flexgs_edge.methods.paper.method.FgsSource", stop)  # after the file has been written
+    words = {"prune_rate": 0.1, "sh_rate": 0.1, "force": True, "progress": Stopped(enabled=False), **FAST}
     with pytest.raises(KeyboardInterrupt):
-        compress(project / "point_cloud.ply", tmp_path / "a.fgs", prune_rate=0.1, sh_rate=0.1, force=True, **FAST)
+        compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
     assert [path.name for path in tmp_path.iterdir()] == ["a.fgs"]
     assert (tmp_path / "a.fgs").read_text() == "earlier"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -11,6 +12,8 @@ import time
 from pathlib import Path
 
 import pytest
+
+from interruptible import running
 
 SCRIPT = Path(__file__).resolve().parents[2] / "deploy" / "capped-run.sh"
 HOLD = """
@@ -126,17 +129,10 @@ def test_what_is_left_running_is_killed(groups: None) -> None:
 def test_signals_reach_the_command_and_the_group_goes(
     groups: None, sent: signal.Signals, status: int, last: str
 ) -> None:
-    process = subprocess.Popen(
-        [str(SCRIPT), "64MiB", sys.executable, "-c", SLEEP],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=ENVIRONMENT,
-        start_new_session=True,
-    )
-    assert process.stdout is not None and process.stdout.readline() == "ready\n"
-    process.send_signal(sent)
-    out, said = process.communicate(timeout=30)
+    with running(str(SCRIPT), "64MiB", sys.executable, "-c", SLEEP, env=ENVIRONMENT) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        process.send_signal(sent)
+        out, said = process.communicate(timeout=30)
     assert process.returncode == status, said
     assert ("ready\n" + out).split("\n")[-2] == last
     assert "KILLED" not in said
@@ -146,22 +142,24 @@ def test_signals_reach_the_command_and_the_group_goes(
 def test_ctrl_c_at_a_terminal_comes_once(groups: None) -> None:
     """The terminal sends it to the command itself; a second one would break into its clean-up."""
     pty = pytest.importorskip("pty")
-    pid, terminal = pty.fork()
-    if pid == 0:
-        os.execve(str(SCRIPT), [str(SCRIPT), "64MiB", sys.executable, "-c", SLEEP], ENVIRONMENT)
+    terminal, other_side = pty.openpty()
+    streams = dict.fromkeys(("stdin", "stdout", "stderr"), other_side)
     said, sent = b"", False
-    while True:
-        try:
-            said += os.read(terminal, 4096)
-        except OSError:  # the other side has closed
-            break
-        if not sent and b"ready" in said:
-            time.sleep(0.2)
-            os.write(terminal, b"\x03")
-            sent = True
-    _, status = os.waitpid(pid, 0)
-    os.close(terminal)
-    assert os.waitstatus_to_exitcode(status) == 130, said
+    with (
+        os.fdopen(terminal, "r+b", buffering=0) as ours,
+        running(str(SCRIPT), "64MiB", sys.executable, "-c", SLEEP, env=ENVIRONMENT, **streams) as process,
+    ):
+        os.close(other_side)
+        while select.select([ours], [], [], 30)[0]:
+            try:
+                said += os.read(terminal, 4096)
+            except OSError:  # the other side has closed
+                break
+            if not sent and b"ready" in said:
+                time.sleep(0.2)
+                sent = os.write(terminal, b"\x03") == 1
+        status = process.wait(30)
+    assert status == 130, said
     assert b"cleaned up" in said
     assert not group_of(said.decode().replace("\r", "")).exists()
 

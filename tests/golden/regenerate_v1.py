@@ -34,12 +34,12 @@ def golden_scene() -> SceneSource:
     return MemorySource(arrays, origin=(0.1, -2.0, 1e6))
 
 
-def main() -> None:
+def main(folder: Path = FOLDER) -> None:
     quantized = quantize_scene(golden_scene(), ROWS_WITH_SH, ROWS_WITHOUT_SH, BITS, 2)
-    FOLDER.mkdir(exist_ok=True)
-    write_container(FOLDER / "tiny.fgs", quantized, SETTINGS, force=True)
-    source = FgsSource(FOLDER / "tiny.fgs")
-    np.savez(FOLDER / "tiny.npz", **source.read(slice(0, source.count), [field.name for field in FIELDS]))
+    folder.mkdir(exist_ok=True)
+    write_container(folder / "tiny.fgs", quantized, SETTINGS, force=True)
+    source = FgsSource(folder / "tiny.fgs")
+    np.savez(folder / "tiny.npz", **source.read(slice(0, source.count), [field.name for field in FIELDS]))
 
 
 if __name__ == "__main__":

@@ -36,11 +36,11 @@ def golden_grid() -> GridScene:
     return to_grid(planes, degrees, StepSizes(0.125, 0.25, 0.0625, 0.5, 0.125, (0.25, 0.5)), (0.1, -2.0, 1e6), layer)[0]
 
 
-def main() -> None:
-    FOLDER.mkdir(exist_ok=True)
-    write_grid(FOLDER / "tiny.fgs", golden_grid(), SETTINGS, force=True, chunk_rows=128)
-    source = GridSource(FOLDER / "tiny.fgs")
-    np.savez_compressed(FOLDER / "tiny.npz", **source.read(slice(0, source.count), [field.name for field in FIELDS]))
+def main(folder: Path = FOLDER) -> None:
+    folder.mkdir(exist_ok=True)
+    write_grid(folder / "tiny.fgs", golden_grid(), SETTINGS, force=True, chunk_rows=128)
+    source = GridSource(folder / "tiny.fgs")
+    np.savez_compressed(folder / "tiny.npz", **source.read(slice(0, source.count), [field.name for field in FIELDS]))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,16 @@ from flexgs_edge.codec.open_fgs import verify
 from flexgs_edge.errors import FormatError
 
 Change = Callable[[dict[str, Any]], object]
+
+
+@contextmanager
+def away(path: Path) -> Iterator[None]:
+    """While this lasts, the file is not there: a source has what it holds, and nothing else."""
+    aside = path.rename(path.with_suffix(".away"))
+    try:
+        yield
+    finally:
+        aside.rename(path)
 
 
 def reseal(data: bytearray) -> bytes:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.scene.fields import sh_rest_count
-from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.scene.fields import FIELD, sh_rest_count
+from flexgs_edge.scene.source import MemorySource, Planes, Rows
 
 SIZES = ((1, 1), (15, 17), (16, 16), (17, 33), (1, 100))
 """Width and height at the borders of tiles and blocks."""
@@ -108,9 +109,20 @@ def make_splats(
     return MemorySource({name: np.ascontiguousarray(values, np.float32) for name, values in arrays.items()})
 
 
+class NotedSource(MemorySource):
+    """A scene that notes which rows are read of it."""
+
+    def __init__(self, scene: MemorySource) -> None:
+        fields = [name for name in FIELD if scene.width(name)]
+        super().__init__(scene.read(slice(0, scene.count), fields), scene.sh_degree, scene.origin)
+        self.reads: list[Rows] = []
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        self.reads.append(rows)
+        return super().read(rows, fields, out)
+
+
 def joined(*sources: MemorySource) -> MemorySource:
     """Several scenes of one SH degree in one."""
-    from flexgs_edge.scene.fields import FIELD
-
     parts = [source.read(slice(0, source.count), list(FIELD)) for source in sources]
     return MemorySource({name: np.concatenate([part[name] for part in parts], axis=1) for name in FIELD})

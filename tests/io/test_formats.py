@@ -6,7 +6,6 @@ import gc
 import gzip
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -22,18 +21,15 @@ from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import MemorySource, SceneSource
 
 SUFFIXES = tuple(FORMATS)
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    pytest.mark.usefixtures("own_temporary_folder"),
+]
 
 
 @pytest.fixture(scope="module", autouse=True)
 def converter() -> None:
     pytest.importorskip("gaussforge", reason="the extra [formats] is not installed")
-
-
-@pytest.fixture(autouse=True)
-def own_folder_for_expanded_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
 
 
 def scene(count: int = 700, degree: int = 3, seed: int = 0, far: float = 0.0) -> MemorySource:
@@ -251,8 +247,7 @@ def test_nothing_is_printed(tmp_path: Path) -> None:
     assert (done.stdout, done.stderr) == ("5\n", "")
 
 
-def test_without_the_converter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flexgs_edge.io.converter.CONVERTER", "gaussforge_that_nobody_has")
+def test_without_the_converter(tmp_path: Path, without_converter: None) -> None:
     for job in (lambda: read_foreign(tmp_path / "a.spz"), lambda: write_foreign(tmp_path / "a.spz", scene(3))):
         with pytest.raises(InputError, match=r"pip install 'flexgs-edge\[formats\]'"):
             job()
@@ -271,7 +266,12 @@ def test_without_the_converter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_a_converter_that_breaks_down(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, error: type[Exception], words: str
 ) -> None:
-    monkeypatch.setattr("flexgs_edge.io.converter._CHILD", code)
+    """What its process imports is a package of this name that does so."""
+    (tmp_path / "packages").mkdir()
+    (tmp_path / "packages" / "gaussforge.py").write_text(code)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "packages"))
     with pytest.raises(error, match=words):
         write_foreign(tmp_path / "a.spz", scene(3))
-    assert [p.name for p in tmp_path.iterdir()] == ["tmp"] and list((tmp_path / "tmp").iterdir()) == []
+    assert (
+        sorted(p.name for p in tmp_path.iterdir()) == ["packages", "tmp"] and list((tmp_path / "tmp").iterdir()) == []
+    )

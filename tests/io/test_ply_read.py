@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.io import ply as ply_module
 from flexgs_edge.io.ply import PlySource, choose_origin
 from flexgs_edge.scene.fields import FIELDS
 from scene_files import header, planes_of, property_names, random_rows, write_rows
@@ -138,18 +137,18 @@ def test_plyfile_is_imported_only_where_it_is_needed(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def long_file(tmp_path_factory: pytest.TempPathFactory) -> tuple[PlySource, np.ndarray]:
+def long_file(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[int, PlySource], np.ndarray]:
+    """A file, read by blocks of any size."""
     rows = random_rows(3000, 1)
-    return PlySource(write_rows(tmp_path_factory.mktemp("long") / "a.ply", rows)), rows
+    path = write_rows(tmp_path_factory.mktemp("long") / "a.ply", rows)
+    return {size: PlySource(path, block_rows=size) for size in (1, 3, 64, 4096)}, rows
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None)
 @given(data=st.data())
-def test_any_rows_in_any_block_size(
-    long_file: tuple[PlySource, np.ndarray], monkeypatch: pytest.MonkeyPatch, data: st.DataObject
-) -> None:
-    source, rows = long_file
-    monkeypatch.setattr(ply_module, "_BLOCK_ROWS", data.draw(st.sampled_from([1, 3, 64, 4096])))
+def test_any_rows_in_any_block_size(long_file: tuple[dict[int, PlySource], np.ndarray], data: st.DataObject) -> None:
+    sources, rows = long_file
+    source = sources[data.draw(st.sampled_from(sorted(sources)))]
     if data.draw(st.booleans()):
         start = data.draw(st.integers(0, 3000))
         where: slice | np.ndarray = slice(start, data.draw(st.integers(start, min(3000, start + 300))))

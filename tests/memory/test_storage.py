@@ -81,13 +81,21 @@ def test_rows_that_are_put_are_read(
         np.testing.assert_array_equal(held, expected)
 
 
-def test_rows_in_any_order_are_taken(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def fetched(monkeypatch: pytest.MonkeyPatch) -> list[slice]:
+    """Rows that were looked up through the pages."""
+    found: list[slice] = []
+    monkeypatch.setattr(memory_rows, "fetch", lambda plane, rows: found.append(rows))
+    return found
+
+
+def test_rows_in_any_order_are_taken(storage: Storage, tmp_path: Path, fetched: list[slice]) -> None:
     """From a plane that is read as a whole, where memory holds it; else rows far apart are looked up through the pages."""
-    values = storage.copy(np.random.default_rng(4).normal(size=(3, COUNT)))
-    fetched = []
-    monkeypatch.setattr(memory_rows, "fetch", lambda plane, rows: fetched.append(rows))
+    spills = storage.spills
     for whole in (storage_module.WHOLE_BYTES, 0):
-        monkeypatch.setattr(storage, "whole_bytes", whole)
+        storage = ScratchStorage(tmp_path, whole=whole) if spills else Storage()
+        storage.whole_bytes = whole
+        values = storage.copy(np.random.default_rng(4).normal(size=(3, COUNT)))
         for rows, apart in (
             (np.arange(0, COUNT, 2), False),
             (np.array([5, COUNT - 1, 7]), True),
@@ -99,12 +107,11 @@ def test_rows_in_any_order_are_taken(storage: Storage, monkeypatch: pytest.Monke
             np.testing.assert_array_equal(memory_rows.read_listed(values, rows), values[:, rows])
 
 
-def test_larger_planes_are_held_where_the_limit_is_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(storage_module, "WHOLE_BYTES", 0)
-    monkeypatch.setattr(memory_rows, "fetch", lambda *_: pytest.fail("looked up through the pages"))
-    storage = ScratchStorage(tmp_path, 16 * 8 * COUNT)
+def test_larger_planes_are_held_where_the_limit_is_large(tmp_path: Path, fetched: list[slice]) -> None:
+    storage = ScratchStorage(tmp_path, 16 * 8 * COUNT, whole=0)
     values, rows = storage.copy(np.random.default_rng(5).normal(size=(2, COUNT))), np.array([5, COUNT - 1, 7])
     np.testing.assert_array_equal(storage.take(values, rows), values[:, rows])
+    assert not fetched
 
 
 def test_a_part_is_fetched_plane_by_plane(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,14 +172,19 @@ def test_a_kill_leaves_nothing(tmp_path: Path) -> None:
     assert done.returncode == -9 and not list(tmp_path.iterdir())
 
 
+def refuse_blocks(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """No file gets blocks any more."""
+
+    def refused(descriptor: int, offset: int, size: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "posix_fallocate", refused)
+
+
 def test_a_full_disk_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     storage = ScratchStorage(tmp_path)
     held = storage.empty((1 << 20,), np.uint8)
-
-    def full(descriptor: int, offset: int, size: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "posix_fallocate", full)
+    refuse_blocks(monkeypatch, errno.ENOSPC)
     with pytest.raises(
         BudgetError, match=r"disk is full: scratch files hold 1\.05 MB there, 2\.10 MB more .*--scratch"
     ):
@@ -182,11 +194,7 @@ def test_a_full_disk_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_other_failures_are_errors_of_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     storage = ScratchStorage(tmp_path)
-
-    def broken(descriptor: int, offset: int, size: int) -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-    monkeypatch.setattr(os, "posix_fallocate", broken)
+    refuse_blocks(monkeypatch, errno.EIO)
     with pytest.raises(InputError, match="cannot make a scratch file of 2097152 bytes"):
         storage.empty((1 << 21,), np.uint8)
 

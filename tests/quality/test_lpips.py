@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,6 +16,7 @@ import pytest
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.progress import Progress, T
 from flexgs_edge.quality.lpips import BACKBONE, LPIPS_SIDE, Lpips
 from flexgs_edge.report.summary import evaluate_text
 from tiny_project import make_project, write_photos
@@ -181,13 +182,22 @@ def test_evaluate_reports_every_pair(fake: Path, tmp_path: Path, photos: bool) -
     assert "LPIPS" not in evaluate_text(plain)
 
 
+class Undrawn(Progress):
+    """Fails where views begin to be drawn."""
+
+    def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+        raise AssertionError("drawn in vain")
+
+
 def test_missing_packages_stop_before_any_drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     forget(monkeypatch)
     monkeypatch.setitem(sys.modules, "lpips", None)  # an import of it then fails
     scene = make_project(tmp_path / "scene", photos=False) / "point_cloud.ply"
-    monkeypatch.setattr("flexgs_edge.run.judge.Judge.prepare", lambda *_: pytest.fail("drawn in vain"))
+    progress = Undrawn(enabled=False)
     with pytest.raises(InputError, match="--lpips needs the packages"):
-        evaluate(scene, scene, lpips=True, device="numpy", memory_limit=LIMIT)
+        evaluate(scene, scene, lpips=True, device="numpy", memory_limit=LIMIT, progress=progress)
+    with pytest.raises(AssertionError, match="drawn in vain"):
+        evaluate(scene, scene, device="numpy", memory_limit=LIMIT, progress=progress)
 
 
 def real_package() -> ModuleType:

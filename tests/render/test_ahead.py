@@ -19,14 +19,13 @@ from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.render import ahead, fit
-from flexgs_edge.render.chunks import SourcePlanes
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import GROWTH
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from kernel_fixtures import default_device, large_budget
-from synthetic import look_from, make_camera, random_scene
+from synthetic import NotedSource, look_from, make_camera, random_scene
 
 SCENE = random_scene(600, 5, 2)
 CHUNKS = 10
@@ -56,34 +55,27 @@ def alone(views: Sequence[Camera], source: MemorySource = SCENE, backend: Backen
 
 
 @pytest.fixture
-def loads(compact: None, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """First rows of the chunks that were read."""
-    read, plain = [], SourcePlanes.load
-
-    def load(self: SourcePlanes, start: int, *words: Any) -> None:
-        read.append(start)
-        plain(self, start, *words)
-
-    monkeypatch.setattr(SourcePlanes, "load", load)
-    return read
+def noted(compact: None) -> NotedSource:
+    """The scene, which notes the chunks that are read of it."""
+    return NotedSource(SCENE)
 
 
 @pytest.mark.parametrize("form", ["numpy", "opencl"])
 @pytest.mark.parametrize("most", [0, 1, 3, 9])
 def test_the_scene_is_read_once_for_several_views(
-    form: str, most: int, loads: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    form: str, most: int, noted: NotedSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use_fit(monkeypatch, ahead=most)
     views = cameras(8)
     renderer = spilling(tmp_path, form)
     used = renderer.budget.used
-    with renderer.load(SCENE) as scene:
+    with renderer.load(noted) as scene:
         renderer.render(scene, views[0])
         scene.shown = SCENE.count  # room for whatever a view shows
         renderer.release()
-        loads.clear()
+        noted.reads.clear()
         found = [renderer.render(scene, camera) for camera in renderer.in_turn(scene, views)]
-        assert len(loads) <= CHUNKS * -(-len(views) // (most + 1))
+        assert 0 < len(noted.reads) <= CHUNKS * -(-len(views) // (most + 1))
         rows = [renderer.view_rows for camera in views if renderer.render(scene, camera) is not None]
     renderer.release()
     assert renderer.budget.used == used
@@ -92,9 +84,9 @@ def test_the_scene_is_read_once_for_several_views(
         np.testing.assert_array_equal(image, expected)
 
 
-def test_a_view_without_room_is_counted_before_it_gets_some(loads: list[int], tmp_path: Path) -> None:
+def test_a_view_without_room_is_counted_before_it_gets_some(compact: None, tmp_path: Path) -> None:
     """One pass finds that there is too little room, one how much is needed; no more are made for what the first four show."""
-    views, renderer, wide = cameras(4), spilling(tmp_path), random_scene(600, 7, 1, size=-3.0, spread=4.0)
+    views, renderer, wide = cameras(4), spilling(tmp_path), NotedSource(random_scene(600, 7, 1, size=-3.0, spread=4.0))
     rows = []
     with renderer.load(wide) as scene:
         found = []
@@ -102,7 +94,7 @@ def test_a_view_without_room_is_counted_before_it_gets_some(loads: list[int], tm
             found.append(renderer.render(scene, camera))
             assert renderer.view_rows is not None
             rows.append(len(renderer.view_rows))
-        assert len(loads) <= 2 * CHUNKS
+        assert 0 < len(wide.reads) <= 2 * CHUNKS
         assert scene.shown is not None and max(rows) <= scene.shown <= GROWTH * max(rows) + fit.DEFAULT.capacity_step
         assert 100 < max(rows) < wide.count / GROWTH
     for image, expected in zip(found, alone(views, wide), strict=True):
@@ -189,14 +181,14 @@ def test_a_full_disk_is_an_error(compact: None, tmp_path: Path, monkeypatch: pyt
 
 
 def test_systems_without_such_calls_read_again(
-    loads: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    noted: NotedSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr(os, "pwritev")
     views, renderer = cameras(3), spilling(tmp_path)
-    with renderer.load(SCENE) as scene:
+    with renderer.load(noted) as scene:
         for camera, expected in zip(renderer.in_turn(scene, views), alone(views), strict=True):
             np.testing.assert_array_equal(renderer.render(scene, camera), expected)
-    assert len(loads) > 2 * CHUNKS
+    assert len(noted.reads) > 2 * CHUNKS
 
 
 def test_lists_of_tiles_leave_room_for_chunks(compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

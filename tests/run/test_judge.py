@@ -11,6 +11,7 @@ import pytest
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.companions import companions_of
@@ -59,17 +60,20 @@ def half_of(source: SceneSource) -> dict[str, np.ndarray]:
     return source.select(np.arange(0, COUNT, 2)).read(slice(0, COUNT // 2), list(FIELD))
 
 
-def count_images(monkeypatch: pytest.MonkeyPatch) -> list[None]:
-    """Gets longer whenever a scene's views are drawn from now on."""
-    drawn: list[None] = []
-    images = Bench.images
+class CountingBench(Bench):
+    """Counts how often a scene's views are drawn."""
 
-    def counted(self: Bench, *words: object) -> object:
-        drawn.append(None)
-        return images(self, *words)  # type: ignore[arg-type]
+    drawn = 0
 
-    monkeypatch.setattr(Bench, "images", counted)
-    return drawn
+    def images(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
+        self.drawn += 1
+        return super().images(scene, cameras)
+
+
+def counting(judge: Judge) -> CountingBench:
+    """The judge's bench from now on, which counts."""
+    judge.bench = CountingBench(judge.bench.renderer, judge.bench.cluster)
+    return judge.bench
 
 
 class Workers:
@@ -99,9 +103,9 @@ def test_references_that_do_not_fit_are_drawn_again(judged: MakeJudge, monkeypat
     assert found[0] == found[1]
 
 
-def test_one_that_reports_draws_nothing_twice(judged: MakeJudge, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_that_reports_draws_nothing_twice(judged: MakeJudge) -> None:
     with judged(reports=True) as (judge, source, renderer, _):
-        drawn, planes = count_images(monkeypatch), half_of(source)
+        bench, planes = counting(judge), half_of(source)
 
         def compare(planes: dict[str, np.ndarray], resident: bool = True, with_ssim: bool = True) -> object:
             with renderer.load(MemorySource(planes)) as loaded:
@@ -110,14 +114,14 @@ def test_one_that_reports_draws_nothing_twice(judged: MakeJudge, monkeypatch: py
                 return judge.compare(loaded, with_ssim=with_ssim)
 
         first = compare(planes)
-        assert len(drawn) == 1 and compare(planes) == first and len(drawn) == 1
+        assert bench.drawn == 1 and compare(planes) == first and bench.drawn == 1
         # Not on the backend yet: nobody knows what it is.
-        assert compare(planes, resident=False) == first and len(drawn) == 2
-        assert compare(planes, with_ssim=False) != first and len(drawn) == 3
+        assert compare(planes, resident=False) == first and bench.drawn == 2
+        assert compare(planes, with_ssim=False) != first and bench.drawn == 3
         # A bit of one number is another scene.
         planes["log_scales"][0, 5] = np.nextafter(planes["log_scales"][0, 5], np.float32(9))
         compare(planes)
-        assert len(drawn) == 4
+        assert bench.drawn == 4
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
@@ -130,7 +134,7 @@ def test_scenes_that_are_not_on_the_backend_are_known_again(
     with judged(reports=True) as (judge, source, renderer, _):
         if elsewhere:
             judge.bench.cluster = Workers(renderer)  # type: ignore[assignment]
-        drawn, planes = count_images(monkeypatch), half_of(source)
+        bench, planes = counting(judge), half_of(source)
 
         def compare(planes: dict[str, np.ndarray]) -> object:
             with renderer.load(MemorySource(planes)) as loaded:
@@ -139,7 +143,7 @@ def test_scenes_that_are_not_on_the_backend_are_known_again(
                 return judge.compare(loaded, with_ssim=True)
 
         first = compare(planes)
-        assert len(drawn) == 1 and compare(planes) == first and len(drawn) == 1
+        assert bench.drawn == 1 and compare(planes) == first and bench.drawn == 1
         planes["sh_dc"][0, 5] = np.nextafter(planes["sh_dc"][0, 5], np.float32(9))
         compare(planes)
-        assert len(drawn) == 2
+        assert bench.drawn == 2

@@ -172,10 +172,7 @@ def test_csv_page_and_charts_hold_the_same(study: tuple[RateStudy, Path]) -> Non
     assert "Left out or not reached" not in result.to_text()
 
 
-def test_without_photos_and_without_the_converter(
-    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("flexgs_edge.io.converter.CONVERTER", "a_package_that_is_not_there")
+def test_without_photos_and_without_the_converter(project: Path, tmp_path: Path, without_converter: None) -> None:
     found = study_rate(
         project / "point_cloud.ply",
         tmp_path / "out",

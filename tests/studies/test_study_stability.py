@@ -30,7 +30,7 @@ from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.studies.stability import heldout, moves, ours, removal, searches, strays, unseen_poses
+from flexgs_edge.studies.stability import heldout, moves, removal, searches, strays, unseen_poses
 from flexgs_edge.studies.stability.amounts import QUICK
 from flexgs_edge.studies.stability.baselines import half_positions, tensor_rounded
 from flexgs_edge.studies.stability.bits import BEST, CHANNEL, TENSOR
@@ -82,10 +82,7 @@ def studied(project: Path) -> Iterator[StudyScene]:
 @pytest.fixture(scope="module")
 def study(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Study:
     out = tmp_path_factory.mktemp("written") / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("flexgs_edge.studies.stability.study.FULL", AMOUNTS)
-        found = study_stability(project / "point_cloud.ply", out, OPTIONS)
-    return found, out
+    return study_stability(project / "point_cloud.ply", out, OPTIONS, amounts=AMOUNTS), out
 
 
 def rows_of(study: Study, key: str, **where: object) -> list[dict[str, object]]:
@@ -191,18 +188,15 @@ def test_a_bit_is_worth_the_same_in_each_pixel_of_fewer(studied: StudyScene) -> 
     """Poses of a fourth of the pixels get a fourth of the multiplier."""
     given: list[float] = []
 
-    def whole_at(studied: StudyScene, path: PruneRounds, judge: Judge, multiplier: float) -> Whole:
-        given.append(multiplier)
-        return ours.whole_at(studied, path, judge, multiplier)
+    class Noting(moves.Place):
+        def whole(self, rounds: PruneRounds, judge: Judge, multiplier: float) -> Whole:
+            given.append(multiplier)
+            return super().whole(rounds, judge, multiplier)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(moves, "whole_at", whole_at)
-        for width in (40, 20):
-            place = moves.Place(
-                studied, moves.MOVES[moves.AS_IT_IS][0], studied.run.source, replace(AMOUNTS, few_width=width)
-            )
-            with place.judge() as judge:
-                place.best(judge, 1e-6)
+    for width in (40, 20):
+        place = Noting(studied, moves.MOVES[moves.AS_IT_IS][0], studied.run.source, replace(AMOUNTS, few_width=width))
+        with place.judge() as judge:
+            place.best(judge, 1e-6)
     assert given[0] == pytest.approx(4 * given[1], rel=0.05)
 
 

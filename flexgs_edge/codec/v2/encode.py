@@ -85,6 +85,8 @@ class Encoded:
     """The device that codes the streams; None for NumPy."""
     written: tuple[bytes, ...] | None = None
     """The coded streams, if they are made already."""
+    threads: int | None = None
+    """Chunks that NumPy codes at once; None for as many as suit this machine."""
 
     @property
     def information(self) -> float:
@@ -112,7 +114,9 @@ class Encoded:
         if self.device is not None and self.device.threads:
             yield from _streams_on(self.device, self.model, pairs)
             return
-        yield from in_order(lambda pair: encode_chunk(self.model, *pair), pairs, thread_count(len(pairs)))
+        yield from in_order(
+            lambda pair: encode_chunk(self.model, *pair), pairs, self.threads or thread_count(len(pairs))
+        )
 
     def finished(self) -> Encoded:
         """A copy that holds the coded streams in place of the symbols, which are several times larger."""
@@ -120,7 +124,11 @@ class Encoded:
 
 
 def encode_grid(
-    grid: GridScene, chunk_rows: int = CHUNK_ROWS, device: Device | None = None, storage: Storage = IN_MEMORY
+    grid: GridScene,
+    chunk_rows: int = CHUNK_ROWS,
+    device: Device | None = None,
+    storage: Storage = IN_MEMORY,
+    threads: int | None = None,
 ) -> Encoded:
     """Fit a model to a scene and count its symbols; `Encoded.streams` then codes the chunks.
 
@@ -133,6 +141,8 @@ def encode_grid(
         Counts the symbols, with the same result. It takes a kilobyte for each row of the chunks in work.
     storage : Storage
         Holds the symbols: two or three bytes a code beside the grid.
+    threads : int, optional
+        Chunks that NumPy codes at once. Default: as many as suit this machine.
     """
     cells, low, depth = cells_of(grid, storage)
     layers = np.bincount(grid.layer, minlength=1).tolist()
@@ -154,7 +164,7 @@ def encode_grid(
     ports = (
         _counted_on(device, grid, cells, chunks, depth, groups)
         if device is not None and device.threads
-        else in_order(counted, chunks, thread_count(len(chunks)))
+        else in_order(counted, chunks, threads or thread_count(len(chunks)))
     )
     for port in ports:
         batches.append(_put_away(port.batches, storage))
@@ -171,7 +181,7 @@ def encode_grid(
     costs = (
         float((n * (PRECISION - np.log2(np.maximum(t.freqs, 1)))).sum()) for (_, n), t in zip(merged, model.tables)
     )
-    return Encoded(model, low, layers, chunks, batches, count.raw + np.array(list(costs)), device)
+    return Encoded(model, low, layers, chunks, batches, count.raw + np.array(list(costs)), device, threads=threads)
 
 
 def _put_away(batches: list[Batch], storage: Storage) -> list[Batch]:

@@ -20,6 +20,7 @@ from flexgs_edge.grid.on_grid import lowered
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import recolour, to_grid
 from flexgs_edge.grid.values import values_of
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOPE, Candidate, bounds, misses
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
 from flexgs_edge.methods.best.effort import Effort
@@ -27,7 +28,8 @@ from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import Schedule, distil
-from flexgs_edge.methods.best.rounds import PruneRounds
+from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
+from flexgs_edge.scene.source import Planes
 
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
@@ -111,7 +113,45 @@ class GridSearch(MultiplierSearch[GridScene]):
 
     def _before_refit(self, multiplier: float) -> GridScene:
         kept, steps = self._choice(multiplier)
-        return to_grid(kept.planes, kept.degrees, steps, self.rounds.origin, storage=self.rounds.storage)[0]
+        return self._to_grid(kept.planes, kept.degrees, steps, self.rounds.storage)[0]
+
+    def _to_grid(
+        self, planes: Planes, degrees: np.ndarray, steps: StepSizes, storage: Storage = IN_MEMORY
+    ) -> tuple[GridScene, np.ndarray]:
+        return to_grid(planes, degrees, steps, self.rounds.origin, storage=storage)
+
+    def _probe_slopes(self, snapshot: Snapshot) -> Slopes:
+        rounds = self.rounds
+        return probe_slopes(rounds.renderer, snapshot.planes, rounds.origin, rounds.cameras, self.effort.probed)
+
+    def _distil(self, kept: Kept, schedule: Schedule, steps: StepSizes) -> Planes:
+        rounds = self.rounds
+        return distil(
+            rounds.renderer,
+            kept.planes,
+            kept.degrees,
+            rounds.origin,
+            [*rounds.cameras, *rounds.between],
+            rounds.targets,
+            schedule,
+            steps,
+            progress=rounds.progress,
+        )
+
+    def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
+        rounds = self.rounds
+        return refit_colours(
+            rounds.bench,
+            planes,
+            degrees,
+            rounds.origin,
+            rounds.cameras,
+            rounds.targets,
+            rounds=times,
+            bands=bands,
+            subsets=self.effort.subsets_of(len(rounds.cameras)),
+            progress=rounds.progress,
+        )
 
     def _probe(self, multiplier: float, target: Target) -> float:
         """Excess of a probe: the grid of a multiplier, without a refit of its own."""
@@ -165,9 +205,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         snapshot = self.rounds.snapshots[kept.snapshot]
         if self._slopes is None:
             # Measured once, near the answer: slopes change little between snapshots, and steps must not jump there.
-            self._slopes = probe_slopes(
-                self.rounds.renderer, snapshot.planes, self.rounds.origin, self.rounds.cameras, self.effort.probed
-            )
+            self._slopes = self._probe_slopes(snapshot)
         steps = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
         count = len(kept.rows)
         kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0), self.rounds.storage)
@@ -197,72 +235,32 @@ class GridSearch(MultiplierSearch[GridScene]):
 
     def _distilled(self, multiplier: float, kept: Kept, steps: StepSizes) -> GridScene:
         """Move all values towards the references, put them on the grid, and refit the constant colour."""
-        rounds = self.rounds
         first = self._descended(multiplier) is None
         count, rate = (self.steps, 1.0) if first else (math.ceil(FURTHER_STEPS * self.steps), FURTHER_RATE)
         rate *= rate_from(self.measure(kept.planes, estimate=True).fidelity)
-        moved = distil(
-            rounds.renderer,
-            kept.planes,
-            kept.degrees,
-            rounds.origin,
-            [*rounds.cameras, *rounds.between],
-            rounds.targets,
-            Schedule(count, rate),
-            steps,
-            progress=rounds.progress,
-        )
+        moved = self._distil(kept, Schedule(count, rate), steps)
         own = np.arange(len(kept.rows))
         self._descents.append((multiplier, Refitted.of(kept.rows, kept.degrees, own, moved, fields=tuple(moved))))
-        grid, order = to_grid(moved, kept.degrees, holdable(steps, moved), rounds.origin)
+        grid, order = self._to_grid(moved, kept.degrees, holdable(steps, moved))
         if not self.refit:
             return grid
-        moved = refit_colours(
-            rounds.bench,
-            values_of(grid),
-            kept.degrees[order],
-            rounds.origin,
-            rounds.cameras,
-            rounds.targets,
-            rounds=1,
-            bands=False,
-            subsets=self.effort.subsets_of(len(rounds.cameras)),
-            progress=rounds.progress,
-        )
+        moved = self._refit_colours(values_of(grid), kept.degrees[order], 1, bands=False)
         return recolour(grid, moved["sh_dc"], moved["sh_rest"])
 
     def _finish(self, kept: Kept, steps: StepSizes) -> GridScene:
         """Put geometry on its grid, refit all colours, put SH on their grid, refit the constant colour, put it on its grid."""
-        rounds, storage, planes = self.rounds, self.rounds.storage, kept.planes
+        storage, planes = self.rounds.storage, kept.planes
         fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
         fine = holdable(fine, planes)
-        grid, order = to_grid(planes, kept.degrees, fine, rounds.origin, storage=storage)
+        grid, order = self._to_grid(planes, kept.degrees, fine, storage)
         degrees = kept.degrees[order]
         moved = values_of(grid, storage)
         if self.refit:
-            shared = (rounds.origin, rounds.cameras, rounds.targets)
             if self.effort.refit_rounds:
-                moved = refit_colours(
-                    rounds.bench,
-                    moved,
-                    degrees,
-                    *shared,
-                    rounds=self.effort.refit_rounds,
-                    subsets=self.effort.subsets_of(len(rounds.cameras)),
-                    progress=rounds.progress,
-                )
+                moved = self._refit_colours(moved, degrees, self.effort.refit_rounds)
                 self._mended = Refitted.of(kept.rows, kept.degrees, order, moved, storage)
             grid = replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree]))
             coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], storage), storage)
-            moved = refit_colours(
-                rounds.bench,
-                coarse,
-                degrees,
-                *shared,
-                rounds=1,
-                bands=False,
-                subsets=self.effort.subsets_of(len(rounds.cameras)),
-                progress=rounds.progress,
-            )
+            moved = self._refit_colours(coarse, degrees, 1, bands=False)
         final = replace(grid.steps, dc=steps.dc, sh=steps.sh[: grid.sh_degree])
         return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"], storage)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.made import at_distance, between
+from flexgs_edge.cameras.generated import at_distance, between
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.depths import visible_depths

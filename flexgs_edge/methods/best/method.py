@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera, largest_of
-from flexgs_edge.cameras.made import poses_between
+from flexgs_edge.cameras.generated import poses_between
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.errors import TargetError

@@ -24,7 +24,9 @@ from flexgs_edge.studies.written import SceneStudy, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
 
-EXPERIMENTS: tuple[Callable[[StudyScene], Experiment], ...] = (
+Maker = Callable[[StudyScene], Experiment]
+"""Makes an experiment on a scene."""
+EXPERIMENTS: tuple[Maker, ...] = (
     quantization.rtn,
     quantization.attributes,
     pruning.splits,
@@ -64,6 +66,7 @@ def study_paper(
     output: str | Path,
     options: CompressOptions | None = None,
     progress: Progress = SILENT,
+    experiments: Sequence[Maker] | None = None,
     **words: Any,
 ) -> PaperStudy:
     """Make the paper's experiments on every scene and write them to a folder.
@@ -79,6 +82,8 @@ def study_paper(
         Views, drawing, memory and device as for `compress`. `max_drop` and `effort` are those of the search.
     progress : Progress, optional
         Progress bars. Default: none.
+    experiments : sequence of callable, optional
+        Experiments for every scene, in this order. Default: all of `EXPERIMENTS`.
     **words
         Single options, by their names in `CompressOptions`.
 
@@ -88,6 +93,7 @@ def study_paper(
         `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "paper"})
+    experiments = EXPERIMENTS if experiments is None else experiments
     if not scenes:
         raise InputError("no scene: give one or more .ply, .fgs or model folders")
     # Matplotlib is loaded before the memory is planned, so that its bytes count as taken.
@@ -95,22 +101,24 @@ def study_paper(
     check_folder(output, options.force)
     with atomic_folder(output, options.force) as folder:
         names = scene_names(scenes)
-        found = [_study_scene(path, name, options, progress) for path, name in zip(scenes, names)]
+        found = [_study_scene(path, name, options, progress, experiments) for path, name in zip(scenes, names)]
         _write(folder, found)
     LOG.info("wrote %s", Path(output) / "index.html")
     return PaperStudy(os.fspath(output), tuple(found))
 
 
-def _study_scene(path: str | Path, name: str, options: CompressOptions, progress: Progress) -> SceneStudy:
+def _study_scene(
+    path: str | Path, name: str, options: CompressOptions, progress: Progress, makers: Sequence[Maker]
+) -> SceneStudy:
     with open_study_scene(path, name, options, progress, scores=("gs", "meson")) as studied:
         # The search runs first: experiments build on its answer, and its steps must be measured, not remembered.
         LOG.info("%s: searching for %s", name, studied.target.describe())
         chosen = studied.search.chosen
         LOG.info("%s: prune %g, SH %g", name, chosen.choice.prune / 1000, chosen.choice.sh / 1000)
         experiments = []
-        for number, make in enumerate(EXPERIMENTS, 1):
+        for number, make in enumerate(makers, 1):
             started = time.perf_counter()
-            LOG.info("%s: experiment %d of %d, %s", name, number, len(EXPERIMENTS), make.__name__)
+            LOG.info("%s: experiment %d of %d, %s", name, number, len(makers), make.__name__)
             experiments.append(make(studied))
             LOG.info("%s: %s: %.1f s", name, experiments[-1].key, time.perf_counter() - started)
         return SceneStudy.of(studied, experiments)

@@ -14,6 +14,7 @@ from flexgs_edge.cameras.order import farthest_order
 from flexgs_edge.errors import FlexGSError
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.io.ply import write_ply
+from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores, ranks_from_order, select_rows
 from flexgs_edge.methods.paper.scores import score_scene
@@ -126,9 +127,13 @@ class Place:
     def best(self, judge: Judge, price: float) -> Found:
         """Compress by best, at a multiplier of `price` times the number of scored pixels."""
         train = self.views.of(self.views.train)
-        with walked(self.studied, self.source, train, self.bench) as path:
-            whole = whole_at(self.studied, path, judge, price * scored_pixels(path))
+        with walked(self.studied, self.source, train, self.bench) as rounds:
+            whole = self.whole(rounds, judge, price * scored_pixels(rounds))
         return Found(whole.rows, whole.size, self._fidelity(judge, whole.source))
+
+    def whole(self, rounds: PruneRounds, judge: Judge, multiplier: float) -> Whole:
+        """What the measured method makes at a multiplier."""
+        return whole_at(self.studied, rounds, judge, multiplier)
 
     def paper(self, judge: Judge, choice: Choice) -> Found:
         """Compress by the paper's method at fixed rates, with scores of the moved scene."""

@@ -61,6 +61,7 @@ def study_stability(
     options: CompressOptions | None = None,
     progress: Progress = SILENT,
     quick: bool = False,
+    amounts: Amounts | None = None,
     **words: Any,
 ) -> StabilityStudy:
     """Find the conditions under which methods break on a scene, and write them to a folder.
@@ -78,6 +79,8 @@ def study_stability(
         Progress bars. Default: none.
     quick : bool
         Measure only a few points of every experiment, on small views.
+    amounts : Amounts, optional
+        How many points, in place of the amounts that `quick` chooses.
     **words
         Single options, by their names in `CompressOptions`.
 
@@ -87,7 +90,7 @@ def study_stability(
         `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "best", "effort": EFFORT})
-    amounts = QUICK if quick else FULL
+    amounts = amounts or (QUICK if quick else FULL)
     if amounts.width is not None:
         options = replace(options, resolution=min(options.resolution, amounts.width))
     # Matplotlib is loaded before the memory is planned, so that its bytes count as taken.

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.made import at_distance, between
+from flexgs_edge.cameras.generated import at_distance, between
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.report.plots import BarChart, LineChart
 from flexgs_edge.studies.experiment import Experiment

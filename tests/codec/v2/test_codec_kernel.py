@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS
 from flexgs_edge.codec.v2.container import GridContainer, coded_size, write_grid
 from flexgs_edge.codec.v2.decode import decode_chunk
 from flexgs_edge.codec.v2.device.decode_kernel import ChunkKernel
-from flexgs_edge.codec.v2.device.encode_kernels import CountKernel, device_bytes
+from flexgs_edge.codec.v2.device.encode_kernels import device_bytes
+from flexgs_edge.codec.v2.device.launch import INFO, Device
 from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.codec.v2.model import Model
@@ -26,6 +27,7 @@ from flexgs_edge.errors import FormatError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.values import from_grid
+from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.memory.budget import MemoryBudget
@@ -38,6 +40,17 @@ from kernel_fixtures import default_device, large_budget, open_form
 
 FINE = StepSizes(0.05, 2.0**-14, 2.0**-9, 2.0**-12, 2.0**-10, (2.0**-9, 0.25, 2.0**-8, 0.3))
 """Steps at which alphabets have raw low bits."""
+
+
+@dataclass
+class WatchedBudget(MemoryBudget):
+    """A budget that knows the most that was taken of it."""
+
+    most: int = 0
+
+    def take(self, stage: str, size: int) -> None:
+        super().take(stage, size)
+        self.most = max(self.most, self.used)
 
 
 def same_codes(one: ChunkCodes, two: ChunkCodes) -> bool:
@@ -135,24 +148,33 @@ def test_no_rows(tmp_path: Path) -> None:
         assert source.grid().count == 0
 
 
-def test_a_chunk_of_many_escapes_is_left_to_numpy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fitted to the first chunk alone, whose values say nothing of the others'."""
-    monkeypatch.setattr("flexgs_edge.codec.v2.encode.SAMPLE_CHUNKS", 1)
-    grid = make_grid(3000, 2)
+class Noting:
+    """A device that notes which chunks its kernel has counted."""
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend = backend
+        self.counted: list[bool] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._backend, name)
+
+    def read(self, array: Any, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
+        found = self._backend.read(array, out, offset)
+        if found.ndim == 2 and found.shape[1] == len(INFO):
+            self.counted += (found[:, INFO.index("status")] == 0).tolist()
+        return found
+
+
+def test_a_chunk_of_many_escapes_is_left_to_numpy(tmp_path: Path) -> None:
+    """The model is fitted to the first and the third of four chunks, whose values say nothing of the second's."""
+    grid = make_grid(4000, 2)
     scale = grid.scale.copy()
     scale[:, 1000:2000] += np.arange(1000, dtype=np.int32) * 300
     grid = replace(grid, scale=scale)
-    done = []
-    count = CountKernel.count
-
-    def noted(self: CountKernel, *arguments: Any) -> list[bool]:
-        done.extend(count(self, *arguments))
-        return done[-len(arguments[0]) :]
-
-    monkeypatch.setattr(CountKernel, "count", noted)
+    device = Noting(open_form("w16"))
     write_grid(tmp_path / "a.fgs", grid, {}, chunk_rows=1000)
-    write_grid(tmp_path / "b.fgs", grid, {}, chunk_rows=1000, device=open_form("w16"))
-    assert done == [True, False, True]
+    write_grid(tmp_path / "b.fgs", grid, {}, chunk_rows=1000, device=device)
+    assert device.counted == [True, False, True, True]
     assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
 
 
@@ -166,20 +188,12 @@ def test_when_a_device_codes() -> None:
 
 
 @pytest.mark.parametrize("name", ["both", "degree 4"])
-def test_work_of_coding_stays_below_what_is_declared(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work_of_coding_stays_below_what_is_declared(name: str) -> None:
     grid, _ = GRIDS[name]
-    budget = MemoryBudget(1 << 40)
-    taken = []
+    budget = WatchedBudget(1 << 40)
     watched = OpenCLBackend(default_device(), budget, width=16)
-    take = budget.take
-
-    def noted(stage: str, size: int) -> None:
-        take(stage, size)
-        taken.append(budget.used)
-
-    monkeypatch.setattr(budget, "take", noted)
     assert len(list(encode_grid(grid, device=watched).streams())) == 1
-    assert budget.used == 0 and 0 < max(taken) <= device_bytes(grid.count, grid.sh_degree)
+    assert budget.used == 0 and 0 < budget.most <= device_bytes(grid.count, grid.sh_degree)
 
 
 def test_the_grids_have_what_their_names_say(files: dict[str, Path]) -> None:
@@ -319,58 +333,52 @@ def test_decompress_writes_the_same_file_on_a_device(files: dict[str, Path], tmp
     assert written["numpy"] == written["cpu"] == written[None]
 
 
-def test_which_device_decodes(files: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_which_device_decodes(files: dict[str, Path]) -> None:
     clock, budget = Stopwatch(), large_budget()
     source = GridSource(files["odd"])
     planes = MemorySource(from_grid(GRIDS["odd"][0]))
     assert decoder(None, source, budget, clock) is None
     assert decoder("cpu", planes, budget, clock) is None
-    monkeypatch.setattr("flexgs_edge.run.decoding.DEVICE_ROWS", 1000)
-    backend = decoder(None, source, budget, clock)
+    backend = decoder(None, source, budget, clock, source.count)
     assert backend is not None and backend.threads >= 1
     assert decoder("numpy", source, budget, clock) is None
     gpu = [DeviceInfo(0, "a", "b", "gpu", "", "", 1, 1, 1, 1, 1, 1, "ok")]
-    for found_devices in ([], gpu):
-        monkeypatch.setattr("flexgs_edge.kernels.choose_device.list_devices", lambda devices=found_devices: devices)
-        assert decoder(None, source, budget, clock) is None
+    for there in ([], gpu):
+        assert decoder(None, source, budget, clock, source.count, there.copy) is None
     assert open_form("gpu").threads == open_form("numpy").threads == 0
 
 
-def test_as_many_chunks_on_the_device_as_the_budget_allows(
-    files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-    monkeypatch.setattr(GridSource, "threads", 2)
-    source = GridSource(files["layers"])
-    on_device = GridSource.on_device
+class OnTwo(GridSource):
+    """A file on a machine of two processors, which notes how many chunks a device decodes at once."""
 
-    def noted(self: GridSource, device: object, chunks: int) -> object:
-        asked.append(chunks)
-        return on_device(self, device, chunks)  # type: ignore[arg-type]
+    threads = 2
 
-    monkeypatch.setattr(GridSource, "on_device", noted)
-    backend = open_form("w16")
-    monkeypatch.setattr(backend, "threads", 2)
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.asked: list[int] = []
+
+    @contextmanager
+    def on_device(self, device: Device, chunks: int) -> Iterator[None]:
+        self.asked.append(chunks)
+        with super().on_device(device, chunks):
+            yield
+
+
+def test_as_many_chunks_on_the_device_as_the_budget_allows(files: dict[str, Path]) -> None:
+    source = OnTwo(files["layers"])
+    backend = OpenCLBackend(replace(default_device(), compute_units=2), large_budget(), width=16)
+    assert backend.threads == 2
     need, more = source.device_bytes(1), source.device_bytes(2)
     for limit in (need - 1, need, more - 1, more, 9 * more):
         with ahead(source, MemoryBudget(limit), backend):
             assert (source._kernel is not None) == (limit >= need)
-    assert asked == [1, 1, 2, 2]
+    assert source.asked == [1, 1, 2, 2]
 
 
 @pytest.mark.parametrize("name", ["degree 4", "layers", "one row"])
-def test_work_of_decoding_stays_below_what_is_declared(
-    name: str, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    budget, taken = MemoryBudget(1 << 40), []
-    take = budget.take
-
-    def noted(stage: str, size: int) -> None:
-        take(stage, size)
-        taken.append(budget.used)
-
-    monkeypatch.setattr(budget, "take", noted)
+def test_work_of_decoding_stays_below_what_is_declared(name: str, files: dict[str, Path]) -> None:
+    budget = WatchedBudget(1 << 40)
     source = GridSource(files[name])
     with source.on_device(OpenCLBackend(default_device(), budget, width=16), 2):
         source.read_table(slice(0, 1), np.zeros((1, 17 + source.width("sh_rest")), np.float32))
-    assert budget.used == 0 and 0 < max(taken) <= source.device_bytes(2)
+    assert budget.used == 0 and 0 < budget.most <= source.device_bytes(2)

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import educational_decoder2
+from fgs_damage import away
 from flexgs_edge.codec.open_fgs import file_version, open_fgs, read_header, verify
 from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v1.packed_source import FgsSource
@@ -88,23 +89,23 @@ def test_parts_of_a_scene(tmp_path: Path) -> None:
     np.testing.assert_array_equal(got, expected["quats"][:, shuffled])
 
 
-def test_only_touched_chunks_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_touched_chunks_are_decoded(tmp_path: Path) -> None:
+    """Without its file, a source gives what it holds: the chunk that was decoded last, its SH only where they were asked for."""
     path = tmp_path / "a.fgs"
     write_grid(path, make_grid(500), {}, chunk_rows=64)
     source = GridSource(path)
-    decoded: list[tuple[str, bool]] = []
-    plain = source.container.decode
-
-    def counted(model, chunk, entry, base_only=False):  # type: ignore[no-untyped-def]
-        decoded.append((entry.section.name, base_only))
-        return plain(model, chunk, entry, base_only)
-
-    monkeypatch.setattr(source.container, "decode", counted)
-    for row in range(130, 150):
-        source.read(slice(row, row + 1), ["means"])
-    source.read(slice(130, 131), ["sh_rest"])
-    source.read(slice(131, 132), ["means"])
-    assert decoded == [("chunk 2", True), ("chunk 2", False)]
+    means, sh_rest, other = (slice(130, 131), ["means"]), (slice(130, 131), ["sh_rest"]), (slice(127, 128), ["means"])
+    for asked, refused in ((means, [sh_rest, other]), (sh_rest, [other])):
+        source.read(*asked)
+        with away(path):
+            for row in range(130, 150):
+                source.read(slice(row, row + 1), ["means"])
+            for words in refused:
+                with pytest.raises(InputError):
+                    source.read(*words)
+        source.read(*means)  # what is refused takes the chunk's place
+    with away(path):
+        source.read(*means)
 
 
 def test_a_scene_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,10 +253,9 @@ def regenerator() -> ModuleType:
     return module
 
 
-def test_golden_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_golden_bytes(tmp_path: Path) -> None:
     module = regenerator()
-    monkeypatch.setattr(module, "FOLDER", tmp_path)
-    module.main()
+    module.main(tmp_path)
     assert (tmp_path / "tiny.fgs").read_bytes() == (GOLDEN / "v2" / "tiny.fgs").read_bytes()
     check_written_format(GOLDEN / "v2" / "tiny.fgs")
 

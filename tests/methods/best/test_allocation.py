@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexgs_edge.constants import SH_C0
-from flexgs_edge.memory import rows as memory_rows
+from flexgs_edge.memory.rows import BLOCK_ROWS
 from flexgs_edge.methods.best.allocation import (
     REMOVAL_FACTOR,
     SH_FACTOR,
@@ -144,18 +144,21 @@ def test_nothing_to_drop() -> None:
     assert none["sh_dc"].shape == (3, 0)
 
 
-def test_bands_of_some_rows_in_any_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bands_of_some_rows_in_any_blocks() -> None:
     """The rows that stay give what they would give alone, wherever the blocks of a pass end."""
-    rng = np.random.default_rng(63)
-    planes, mean = planes_of(40, 3), rng.normal(size=(3, 3, 40)).astype(np.float32)
-    rows = np.sort(rng.permutation(40)[:25])
-    degrees = rng.integers(0, 4, 25).astype(np.uint8)
-    alone = {name: values[:, rows] for name, values in planes.items()}
-    expected = drop_bands(alone, np.arange(25), degrees, mean[..., rows], SH_C0)
-    for size in (1, 7, 40):
-        monkeypatch.setattr(memory_rows.blocks, "__defaults__", (size,))
-        for name, values in drop_bands(planes, rows, degrees, mean, SH_C0).items():
-            np.testing.assert_array_equal(values, expected[name])
+    rng, count = np.random.default_rng(63), 2 * BLOCK_ROWS + BLOCK_ROWS // 2
+    planes, mean = planes_of(count, 3), rng.normal(size=(3, 3, count)).astype(np.float32)
+    rows = np.sort(rng.permutation(count)[: count - 99])
+    degrees = rng.integers(0, 4, len(rows)).astype(np.uint8)
+    found = drop_bands(planes, rows, degrees, mean, SH_C0)
+    for size in (7, 999, BLOCK_ROWS - 1):
+        for start in range(0, len(rows), size if size > 7 else BLOCK_ROWS - 3):
+            part = slice(start, start + size)
+            some = rows[part]
+            alone = {name: values[:, some] for name, values in planes.items()}
+            expected = drop_bands(alone, np.arange(len(some)), degrees[part], mean[..., some], SH_C0)
+            for name, values in found.items():
+                np.testing.assert_array_equal(values[:, part], expected[name])
 
 
 @settings(deadline=None)

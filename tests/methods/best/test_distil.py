@@ -11,7 +11,7 @@ import pytest
 
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.made import poses_between
+from flexgs_edge.cameras.generated import poses_between
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.grid.step_sizes import StepSizes

@@ -12,18 +12,17 @@ import pytest
 
 from flexgs_edge.errors import TargetError
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, MinFidelity, Target
-from flexgs_edge.grid import to_grid as grid
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.memory.storage import IN_MEMORY
-from flexgs_edge.methods.best import grid_search as search_module
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses
 from flexgs_edge.methods.best.grid_search import DISTILLED, GridSearch, rate_from
-from flexgs_edge.methods.best.kept import Refitted
+from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.multiplier import EXTRA_STEPS
+from flexgs_edge.methods.best.refit.distil import Schedule
 from flexgs_edge.methods.best.rounds import Snapshot, take_rows
 from flexgs_edge.scene.fields import FIELD
 from synthetic import make_camera, random_scene
@@ -93,24 +92,32 @@ def powers(loss: float = 0.6, size: float = -0.45) -> World:
     return World(lambda m: (m / AT) ** loss, lambda m: BYTES * (m / AT) ** size)
 
 
-@pytest.fixture(autouse=True)
-def _known_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
-    def to_grid(planes: Any, degrees: Any, steps: StepSizes, origin: Any, **words: Any) -> Any:
-        World.multiplier = (steps.opacity / UNIT) ** 2
-        return grid.to_grid(planes, degrees, steps, origin, **words)
+class KnownSearch(GridSearch):
+    """A search in a world: slopes are known, and the world learns the multiplier."""
 
-    monkeypatch.setattr(World, "multiplier", None)
-    monkeypatch.setattr(search_module, "to_grid", to_grid)
-    monkeypatch.setattr(search_module, "probe_slopes", lambda *_: SLOPES)
+    world: World
+
+    def _to_grid(self, planes: Any, degrees: Any, steps: StepSizes, storage: Storage = IN_MEMORY) -> Any:
+        self.world.multiplier = (steps.opacity / UNIT) ** 2
+        return super()._to_grid(planes, degrees, steps, storage)
+
+    def _probe_slopes(self, snapshot: Snapshot) -> Slopes:
+        return SLOPES
 
 
 def search(
-    world: World, target: Target, rounds: FakeRounds | None = None, best_effort: bool = False, **words: Any
+    world: World,
+    target: Target,
+    rounds: FakeRounds | None = None,
+    best_effort: bool = False,
+    kind: type[KnownSearch] = KnownSearch,
+    **words: Any,
 ) -> RateResult[GridScene]:
     words = {"effort": EFFORT, "refit": False, **words}
-    World.multiplier = None
+    world.multiplier = None
     world.rounds = rounds or FakeRounds()
-    found = GridSearch(world.rounds, world.size_of, world.measure, **words)  # type: ignore[arg-type]
+    found = kind(world.rounds, world.size_of, world.measure, **words)  # type: ignore[arg-type]
+    found.world = world
     return found.run(target, best_effort)
 
 
@@ -273,22 +280,29 @@ def test_descents_with_less_to_mend_go_at_smaller_rates() -> None:
 
 
 @pytest.mark.parametrize("found", [0.2, 0.33, 0.5])
-def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: float) -> None:
+def test_descents_go_on_from_each_other(found: float) -> None:
     """The first whole result takes all steps, the next ones a part; values go on where they were, also those of geometry."""
     seen: list[tuple[int, float, float]] = []
 
-    def distil(renderer: Any, planes: Any, *rest: Any, **_: Any) -> Any:
-        schedule = rest[-2]
-        seen.append((schedule.steps, schedule.rate, float(planes["opacity_logits"].max())))
-        return {**planes, "opacity_logits": np.full_like(planes["opacity_logits"], 9.0)}
+    class Descending(KnownSearch):
+        def _distil(self, kept: Kept, schedule: Schedule, steps: StepSizes) -> Any:
+            logits = kept.planes["opacity_logits"]
+            seen.append((schedule.steps, schedule.rate, float(logits.max())))
+            return {**kept.planes, "opacity_logits": np.full_like(logits, 9.0)}
 
-    monkeypatch.setattr(search_module, "distil", distil)
-    monkeypatch.setattr(search_module, "refit_colours", lambda renderer, planes, *_, **__: planes)
-    monkeypatch.setattr(search_module, "rate_from", lambda fidelity: 1.0)
-    world = World(lambda m: found / DISTILLED * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
+        def _refit_colours(self, planes: Any, *_: Any, **__: Any) -> Any:
+            return planes
+
+    class Blurred(World):
+        """Nothing is so near the original that descents go at smaller rates."""
+
+        def measure(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
+            return replace(super().measure(planes, estimate), fidelity=30.0)
+
+    world = Blurred(lambda m: found / DISTILLED * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
     rounds = FakeRounds()
     rounds.cameras, rounds.between, rounds.progress, rounds.bench = [], [], None, None  # type: ignore[attr-defined]
-    result = search(world, MaxDrop(1.0), rounds, refit=True, steps=100)
+    result = search(world, MaxDrop(1.0), rounds, kind=Descending, refit=True, steps=100)
     assert result.reached and len(seen) == len(result.steps)
     tried: list[float] = []
     for step, call in zip(result.steps, seen, strict=True):
@@ -300,25 +314,23 @@ def test_descents_go_on_from_each_other(monkeypatch: pytest.MonkeyPatch, found: 
 
 
 @pytest.mark.parametrize(("steps", "after"), [(100, 1), (100, 0), (0, 1)])
-def test_an_interrupted_search_with_descents_keeps_the_best(
-    monkeypatch: pytest.MonkeyPatch, steps: int, after: int
-) -> None:
+def test_an_interrupted_search_with_descents_keeps_the_best(steps: int, after: int) -> None:
     done: list[int] = []
 
-    def whole(self: GridSearch, multiplier: float, target: Target) -> Any:
-        if len(done) == after:
-            raise KeyboardInterrupt
-        done.append(1)
-        grid = self._before_refit(multiplier)
-        measurement = Measurement(0.5, 42.0, 0.5)
-        return Candidate(multiplier, 1, 0, 4000, measurement, target.excess(4000, measurement), 0.0), grid
+    class Interrupted(KnownSearch):
+        def _whole(self, multiplier: float, target: Target) -> Any:
+            if len(done) == after:
+                raise KeyboardInterrupt
+            done.append(1)
+            grid = self._before_refit(multiplier)
+            measurement = Measurement(0.5, 42.0, 0.5)
+            return Candidate(multiplier, 1, 0, 4000, measurement, target.excess(4000, measurement), 0.0), grid
 
-    monkeypatch.setattr(GridSearch, "_whole", whole)
     if steps and after:
-        assert search(powers(), MaxDrop(1.0), steps=steps).chosen.size == 4000
+        assert search(powers(), MaxDrop(1.0), kind=Interrupted, steps=steps).chosen.size == 4000
     else:
         with pytest.raises(KeyboardInterrupt):
-            search(powers(), MaxDrop(1.0), steps=steps)
+            search(powers(), MaxDrop(1.0), kind=Interrupted, steps=steps)
 
 
 def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> None:

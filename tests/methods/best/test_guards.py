@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.made import at_distance, between
+from flexgs_edge.cameras.generated import at_distance, between
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.commands.compress import compress

@@ -38,7 +38,7 @@ from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.references import References
 from kernel_fixtures import FORMS, large_budget, open_form
-from synthetic import joined, look_from, make_camera, random_scene
+from synthetic import NotedSource, joined, look_from, make_camera, random_scene
 from tiny_project import make_project, write_cameras
 
 SCENE = joined(random_scene(700, 5, 2), random_scene(300, 6, 2, size=-1.0))
@@ -132,24 +132,22 @@ def test_sums_of_a_chunk_take_the_place_of_a_view(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_chunks_that_stay_give_way(seed: int, compact: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_that_stay_give_way(seed: int, compact: None) -> None:
     """They are read once, unless memory is wanted for something else, at any moment; the one that is used is never taken."""
-    rng, backend, budget, read = np.random.default_rng(seed), open_form("w8"), large_budget(), []
-    monkeypatch.setattr(DeviceScene, "_may_stay", lambda *_: rng.random() < 0.8)
-    plain_read, used = MemorySource.read, budget.used
+    rng, backend, budget = np.random.default_rng(seed), open_form("w8"), large_budget()
+    source, used = NotedSource(SCENE), budget.used
 
-    def note(self: MemorySource, rows: slice, *words: Any) -> Any:
-        read.append(rows.start)
-        return plain_read(self, rows, *words)
+    class Whim(DeviceScene):
+        def _may_stay(self, rows: int) -> bool:
+            return bool(rng.random() < 0.8)
 
-    monkeypatch.setattr(MemorySource, "read", note)
     planes = SCENE.read(slice(0, SCENE.count), ["means", "sh_rest"])
     starts = list(range(0, SCENE.count, 64))
-    with DeviceScene(backend, SourcePlanes(backend, SCENE), budget) as scene:
+    with Whim(backend, SourcePlanes(backend, source), budget) as scene:
         scene.be_compact(100)
         for turn in range(12):
             stayed = set(scene._pinned)
-            read.clear()
+            source.reads.clear()
             found = []
             for chunk in scene.chunks():
                 if turn % 2:
@@ -159,6 +157,7 @@ def test_chunks_that_stay_give_way(seed: int, compact: None, monkeypatch: pytest
                 for name, array in (("means", chunk.means), ("sh_rest", chunk.sh_rest)):
                     np.testing.assert_array_equal(backend.read(array)[:, : chunk.count], planes[name][:, rows])
                 found.append(chunk.base)
+            read = [rows.start for rows in source.reads if isinstance(rows, slice)]
             assert found == starts
             if turn % 2 == 0:
                 assert read == [start for start in starts if start not in stayed]
@@ -182,10 +181,9 @@ def wide_scene() -> MemorySource:
     [("w8", "exact", False), ("w8", "inria", False), ("w8", "exact", True), ("numpy", "inria", True)],
 )
 def test_views_read_the_chunks_that_they_see(
-    form: str, extent: str, antialiased: bool, compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    form: str, extent: str, antialiased: bool, compact: None, tmp_path: Path
 ) -> None:
-    source, views = wide_scene(), cameras()
-    read: list[slice] = []
+    source, views, counts = NotedSource(wide_scene()), cameras(), list[int]()
 
     def drawn(storage: ScratchStorage | None) -> list[np.ndarray]:
         drawer = Renderer(open_form(form), large_budget(), extent=extent, antialiased=antialiased)
@@ -194,27 +192,20 @@ def test_views_read_the_chunks_that_they_see(
         found = []
         with drawer.load(source) as scene:
             for camera in views:
-                read.clear()
+                source.reads.clear()
                 found.append(drawer.render(scene, camera))
-                counts.append(len(read))
+                counts.append(len(source.reads))
                 statistics = Statistics.zeros(source.count)
                 drawer.add_statistics(scene, camera, statistics)
                 found += [statistics.hits, statistics.weights]
         drawer.release()
         return found
 
-    def note(self: MemorySource, rows: slice, *words: Any) -> Any:
-        read.append(rows)
-        return plain_read(self, rows, *words)
-
-    plain_read, counts = MemorySource.read, []
-    monkeypatch.setattr(MemorySource, "read", note)
     spilled = drawn(ScratchStorage(tmp_path))
     chunks = -(-source.count // 64)
     # The first view of the scene looks at every chunk, and the one that sees nothing at none.
     assert counts[0] >= chunks and counts[-1] == 0
     assert 0 < counts[1] < chunks and 0 < counts[2] < chunks, counts
-    monkeypatch.undo()
     for values, expected in zip(spilled, drawn(None), strict=True):
         np.testing.assert_array_equal(values, expected)
 
@@ -263,15 +254,14 @@ def expected(project: Path) -> bytes:
 @pytest.fixture
 def spilled(compact: None, monkeypatch: pytest.MonkeyPatch) -> list[ScratchStorage]:
     """Every scene goes to scratch files, however small."""
-    rooms: list[ScratchStorage] = []
+    storages: list[ScratchStorage] = []
 
     def choose(run: Any, renderer: Any, cameras: Any, folder: Path) -> ScratchStorage:
-        rooms.append(ScratchStorage(folder))
-        return rooms[-1]
+        storages.append(ScratchStorage(folder, least=1))
+        return storages[-1]
 
     monkeypatch.setattr(best_method, "choose_storage", choose)
-    monkeypatch.setattr("flexgs_edge.memory.storage._SMALL", 1)
-    return rooms
+    return storages
 
 
 def test_the_bytes_are_those_of_a_run_in_memory(

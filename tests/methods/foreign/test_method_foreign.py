@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from flexgs_edge.report.summary import compress_text
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from stopped import Stopped
 from synthetic import random_scene
 from tiny_project import COUNT, make_project
 
@@ -114,14 +114,12 @@ def test_out_of_reach(project: Path, tmp_path: Path) -> None:
     assert closest.reached is False and closest.count == COUNT and "NOT reached" in compress_text(closest)
 
 
-def test_without_writing(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+def test_without_writing(project: Path, tmp_path: Path, own_temporary_folder: Path) -> None:
     dry = compress(project / "point_cloud.ply", tmp_path / "a.spz", dry_run=True, max_drop=2.0, **PAPER)
     assert dry.output is None and dry.format == "spz" and [p.name for p in tmp_path.iterdir()] == ["tmp"]
     real = compress(project / "point_cloud.ply", tmp_path / "a.spz", max_drop=2.0, **PAPER)
     assert real.size == dry.size == (tmp_path / "a.spz").stat().st_size and real.quality == dry.quality
-    assert list((tmp_path / "tmp").iterdir()) == []
+    assert list(own_temporary_folder.iterdir()) == []
 
 
 def test_fixed_rates_and_scores_of_a_file(project: Path, tmp_path: Path) -> None:
@@ -184,19 +182,18 @@ def test_what_is_refused(project: Path, tmp_path: Path, name: str, words: dict[s
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nothing_is_left_behind(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_left_behind(project: Path, tmp_path: Path) -> None:
     (tmp_path / "a.spz").write_text("earlier")
     with pytest.raises(InputError, match="the file exists"):
         compress(project / "point_cloud.ply", tmp_path / "a.spz", **PAPER)
 
-    def stop(*args: object, **kwargs: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("flexgs_edge.methods.foreign.method.publish", stop)  # after the last file has been measured
+    words = {"force": True, "progress": Stopped(enabled=False), **PAPER}
     with pytest.raises(KeyboardInterrupt):
-        compress(project / "point_cloud.ply", tmp_path / "a.spz", force=True, **PAPER)
+        compress(project / "point_cloud.ply", tmp_path / "a.spz", **words)
     assert [path.name for path in tmp_path.iterdir()] == ["a.spz"] and (tmp_path / "a.spz").read_text() == "earlier"
-    monkeypatch.setattr("flexgs_edge.io.converter.CONVERTER", "gaussforge_that_nobody_has")
+
+
+def test_without_the_converter(project: Path, tmp_path: Path, without_converter: None) -> None:
     with pytest.raises(InputError, match=r"pip install 'flexgs-edge\[formats\]'"):
         compress(project / "point_cloud.ply", tmp_path / "b.spz", **PAPER)
 
