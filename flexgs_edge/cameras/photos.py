@@ -106,6 +106,8 @@ class Photos:
             with Image.open(path) as image:
                 image.load()
                 pixels = _pixels(image, self.background, path)
+        except InputError:  # a ValueError too, and said already what is wrong
+            raise
         except (*_DAMAGED, Image.DecompressionBombError) as error:
             raise InputError(f"{path}: the photo cannot be decoded ({error}); is the file complete?") from error
         if pixels.shape[:2] == (camera.height, camera.width):
