@@ -12,7 +12,7 @@ from flexgs_edge.io.exchange import write_foreign
 from flexgs_edge.io.formats import FORMATS, format_of
 from flexgs_edge.io.ply import inria_dtype, write_ply
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.report.results import DecompressResult
+from flexgs_edge.report.file_results import DecompressResult
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.decoding import ahead, decoder
 from flexgs_edge.run.inputs import load_scene, scene_info

@@ -93,7 +93,7 @@ class Reporter:
     def read_contents(self, path: str | Path) -> None:
         """What the channels of a finished `.fgs` take (other formats have none that `info` knows)."""
         if Path(path).suffix.lower() == ".fgs":
-            self._contents = contents(Path(path))
+            self._contents = contents(Path(path)).to_json()
 
     def read_contents_of(self, write: Callable[[Path], object]) -> None:
         """The same in a dry run: `write` makes the file, which is gone afterwards."""

@@ -17,7 +17,7 @@ from flexgs_edge.codec.v1.packed_source import FgsSource
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.evaluate import evaluate
-from flexgs_edge.commands.info import info, info_text
+from flexgs_edge.commands.info import info
 from flexgs_edge.commands.render import render_views
 from flexgs_edge.commands.score import score_gaussians
 from flexgs_edge.commands.verify import verify
@@ -25,7 +25,6 @@ from flexgs_edge.errors import BudgetError, InputError, TargetError
 from flexgs_edge.io.ply import PlySource, write_ply
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.report.summary import compress_text
 from flexgs_edge.run.inputs import read_scene
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import CompressOptions
@@ -75,7 +74,7 @@ def test_what_was_found_beside_the_scene_is_named(project: Path, done: tuple[Pat
     _, result = done
     assert result.views is not None
     assert (result.views.total, result.views.train, result.views.held_out) == (VIEWS, 6, 3)
-    text = compress_text(result)
+    text = result.summary()
     for word in (
         project / "cameras.json",
         project / "images",
@@ -158,14 +157,14 @@ def test_a_fixed_choice_has_no_search(project: Path, tmp_path: Path) -> None:
     assert result.target is None and result.reached is None and result.search is not None
     assert len(result.search.steps) == 1 and result.count == COUNT - COUNT // 4
     assert result.sh_count == COUNT // 4
-    assert "fixed rates" in compress_text(result)
+    assert "fixed rates" in result.summary()
 
 
 def test_without_photos_the_modelled_drop_decides(project: Path, tmp_path: Path) -> None:
     result = compress(project / "point_cloud.ply", tmp_path / "a.fgs", images="none", max_drop=3.0, **FAST)
     assert result.decided_by == "modelled drop" and result.views is not None and result.views.images is None
     assert result.quality is not None and result.quality.drop is None and result.quality.modelled_drop <= 3.0
-    assert "no photos decide" in compress_text(result)
+    assert "no photos decide" in result.summary()
 
 
 def test_training_poses_decide_and_held_out_views_report(project: Path, tmp_path: Path) -> None:
@@ -198,7 +197,7 @@ def test_a_dry_run_writes_nothing_and_says_the_size(
 ) -> None:
     result = compress(project / "point_cloud.ply", None, max_drop=2.0, dry_run=True, **FAST)
     assert result.output is None and result.size == done[1].size and result.quality == done[1].quality
-    assert list(tmp_path.iterdir()) == [] and "nothing was written" in compress_text(result)
+    assert list(tmp_path.iterdir()) == [] and "nothing was written" in result.summary()
 
 
 def test_an_unreachable_target_leaves_nothing(project: Path, tmp_path: Path) -> None:
@@ -207,7 +206,7 @@ def test_an_unreachable_target_leaves_nothing(project: Path, tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == []
     result = compress(project / "point_cloud.ply", tmp_path / "a.fgs", min_fidelity=150.0, best_effort=True, **FAST)
     assert result.reached is False and (tmp_path / "a.fgs").is_file()
-    assert "NOT reached" in compress_text(result) and info(tmp_path / "a.fgs")["settings"]["reached"] is False
+    assert "NOT reached" in result.summary() and info(tmp_path / "a.fgs")["settings"]["reached"] is False
 
 
 @pytest.mark.parametrize(
@@ -219,7 +218,7 @@ def test_bits(project: Path, tmp_path: Path, bits: str, expected: dict[str, int]
     assert result.score is None  # nothing is pruned: no score is needed
     if expected is None:
         assert {item.attribute for item in result.sensitivity} == {"dc", "rest", "opacity", "scale", "rot"}
-        assert set(result.bits.values()) <= {4, 8, 16} and "found by sensitivity" in compress_text(result)
+        assert set(result.bits.values()) <= {4, 8, 16} and "found by sensitivity" in result.summary()
     else:
         assert {name: result.bits[name] for name in expected} == expected
     assert set(result.groups.values()) == {1}
@@ -237,7 +236,7 @@ def test_views_of_a_lone_scene_are_made_from_it(tmp_path: Path, project: Path) -
         assert (result.views.total, result.views.held_out, result.views.width) == (48, 6, 32)
         assert any("automatic views" in note for note in result.views.notes)
         assert result.quality is not None and result.quality.drop is None
-    text = compress_text(alone)
+    text = alone.summary()
     assert "cameras from auto" in text and "automatic views" in text
 
 
@@ -276,7 +275,7 @@ def test_no_cameras_at_all(tmp_path: Path, done: tuple[Path, CompressResult], pr
         compress(lonely, tmp_path / "a.fgs", images=str(project / "images"), **FAST)
     whole = compress(lonely, tmp_path / "a.fgs", prune_rate=0, sh_rate=0, method="paper", cameras="none")
     assert whole.count == COUNT and whole.quality is None and whole.run.device is None
-    assert whole.size == os.stat(tmp_path / "a.fgs").st_size and "none" in compress_text(whole)
+    assert whole.size == os.stat(tmp_path / "a.fgs").st_size and "none" in whole.summary()
     rates: dict[str, Any] = {"method": "paper", "prune_rate": 0.5, "sh_rate": 0.2, "cameras": "none"}
     scored = compress(lonely, tmp_path / "b.fgs", score=str(done[0] / "s.npy"), **rates)
     assert scored.count == COUNT // 2
@@ -364,7 +363,7 @@ def test_invalid_rows_are_refused_or_dropped_with_a_count(project: Path, tmp_pat
     with pytest.raises(InputError, match=r"3 of 400 Gaussians are invalid.*first row 5.*--drop-invalid"):
         compress(tmp_path / "bad.ply", tmp_path / "a.fgs", **words)
     result = compress(tmp_path / "bad.ply", tmp_path / "a.fgs", drop_invalid=True, **words)
-    assert result.scene.count == COUNT - 3 and "3 of 400 Gaussians left out" in compress_text(result)
+    assert result.scene.count == COUNT - 3 and "3 of 400 Gaussians left out" in result.summary()
     assert info(tmp_path / "a.fgs")["settings"]["source_count"] == COUNT
 
 
@@ -433,7 +432,7 @@ def test_info_of_a_file_adds_up(done: tuple[Path, CompressResult]) -> None:
     assert found["settings"]["target"] == "drop <= 2 dB" and found["settings"]["reached"] is True
     assert found["ratio"] == pytest.approx(result.ratio, abs=1e-3)
     json.dumps(found, allow_nan=False)
-    text = info_text(found)
+    text = found.summary()
     for word in ("bits", "rest", "target: drop <= 2 dB", f"{result.count}"):
         assert word in text
 
@@ -441,7 +440,7 @@ def test_info_of_a_file_adds_up(done: tuple[Path, CompressResult]) -> None:
 def test_info_of_a_ply_names_its_companions(project: Path) -> None:
     found = info(project / "point_cloud.ply")
     assert found["format"] == "ply" and found["count"] == COUNT and found["sh_degree"] == 1
-    assert str(project / "cameras.json") in info_text(found)
+    assert str(project / "cameras.json") in found.summary()
 
 
 def test_verify_names_the_damaged_part(done: tuple[Path, CompressResult], tmp_path: Path) -> None:

@@ -14,9 +14,9 @@ from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v2.channels import Channels
 from flexgs_edge.codec.v2.container import channel_bytes, write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
-from flexgs_edge.commands.info import info, info_text
-from flexgs_edge.commands.trim import trim, trim_text
-from flexgs_edge.commands.verify import verify, verify_json, verify_text
+from flexgs_edge.commands.info import info
+from flexgs_edge.commands.trim import trim
+from flexgs_edge.commands.verify import verify
 from flexgs_edge.errors import FormatError, InputError, TargetError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import from_grid
@@ -73,7 +73,7 @@ def test_info_of_version_2_shares_every_byte_out(tmp_path: Path) -> None:
 def test_text_of_version_2_comes_from_the_record(tmp_path: Path) -> None:
     path, _ = written(tmp_path)
     found = info(path)
-    text = info_text(found)
+    text = found.summary()
     for word in ("fgs version 2", "sh degree", "bits a Gaussian", "layers:      3", "target: drop <= 1 dB", "chroma"):
         assert word in text
     rows = {line.split("  ")[0]: line.split() for line in text.splitlines()}
@@ -87,7 +87,7 @@ def test_info_of_small_scenes(tmp_path: Path, count: int, degree: int) -> None:
     found = info(path)
     assert found["count"] == count and found["sh_count"] == grid.sh_count
     assert sum(channel["bytes"] for channel in found["channels"].values()) + found["overhead_bytes"] == found["size"]
-    assert "layers:" not in info_text(found) and "cut from:" not in info_text(found)
+    assert "layers:" not in found.summary() and "cut from:" not in found.summary()
 
 
 def test_info_of_version_1_reads_the_header_only(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_info_of_version_1_reads_the_header_only(tmp_path: Path) -> None:
     path.write_bytes(data)
     found = info(path)
     assert found["version"] == 1 and "layers" not in found and found["channels"]["rest"]["bits"] == 4
-    assert "fgs version 1" in info_text(found)
+    assert "fgs version 1" in found.summary()
 
 
 def test_verify_of_version_2_names_the_damaged_part(tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_trim_keeps_whole_layers(tmp_path: Path) -> None:
         out = tmp_path / f"{layers}.fgs"
         found = trim(path, out, most)
         assert (found["layers"], found["size"]) == (layers, out.stat().st_size) and found["size"] <= most
-        assert f"kept  {layers} of 3 layers, {found['count']} of 900" in trim_text(found)
+        assert f"kept  {layers} of 3 layers, {found['count']} of 900" in found.summary()
         source = open_scene(out)
         expected = from_grid(grid.take(grid.layer < layers), fields=("means", "sh_dc"))
         got = source.read(slice(0, source.count), ["means", "sh_dc"])
@@ -159,7 +159,7 @@ def test_trim_keeps_whole_layers(tmp_path: Path) -> None:
     assert path.read_bytes() == (tmp_path / "3.fgs").read_bytes()
     cut = info(tmp_path / "1.fgs")
     assert cut["cut_from"] == {"bytes": path.stat().st_size, "count": 900, "layers": 3}
-    assert f"cut from:    {path.stat().st_size} bytes, 900 Gaussians in 3 layers" in info_text(cut)
+    assert f"cut from:    {path.stat().st_size} bytes, 900 Gaussians in 3 layers" in cut.summary()
     # A cut file that is cut again remembers the first one.
     trim(tmp_path / "2.fgs", tmp_path / "again.fgs", sizes[1] - 1)
     assert (tmp_path / "again.fgs").read_bytes() == (tmp_path / "1.fgs").read_bytes()

@@ -27,7 +27,6 @@ from flexgs_edge.methods.best.grid_coder import SETTINGS_MOST, GridCoder, bit_mo
 from flexgs_edge.methods.best.method import alive
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.report.summary import compress_text
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
@@ -117,7 +116,7 @@ def test_the_tiny_scene_holds_its_drop(project: Path, tiny: tuple[Path, Compress
     record = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert record["method"] == "best" and record["score"] is None and record["steps"]["position"] > 0
     assert record["search"] and all(step["phase"] == "multiplier" for step in record["search"])
-    text = compress_text(result)
+    text = result.summary()
     assert f"{result.size} bytes" in text and "drop" in text
 
 
