@@ -206,7 +206,7 @@ def test_an_unreachable_target_leaves_nothing(project: Path, tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == []
     result = compress(project / "point_cloud.ply", tmp_path / "a.fgs", min_fidelity=150.0, best_effort=True, **FAST)
     assert result.reached is False and (tmp_path / "a.fgs").is_file()
-    assert "NOT reached" in result.summary() and info(tmp_path / "a.fgs")["settings"]["reached"] is False
+    assert "NOT reached" in result.summary() and info(tmp_path / "a.fgs").settings["reached"] is False
 
 
 @pytest.mark.parametrize(
@@ -364,7 +364,7 @@ def test_invalid_rows_are_refused_or_dropped_with_a_count(project: Path, tmp_pat
         compress(tmp_path / "bad.ply", tmp_path / "a.fgs", **words)
     result = compress(tmp_path / "bad.ply", tmp_path / "a.fgs", drop_invalid=True, **words)
     assert result.scene.count == COUNT - 3 and "3 of 400 Gaussians left out" in result.summary()
-    assert info(tmp_path / "a.fgs")["settings"]["source_count"] == COUNT
+    assert info(tmp_path / "a.fgs").settings["source_count"] == COUNT
 
 
 def test_render_draws_the_chosen_views(project: Path, tmp_path: Path) -> None:
@@ -427,11 +427,11 @@ def test_resolution_scales_views_and_says_so(project: Path) -> None:
 def test_info_of_a_file_adds_up(done: tuple[Path, CompressResult]) -> None:
     folder, result = done
     found = info(folder / "a.fgs")
-    assert found["count"] == result.count and found["sh_count"] == result.sh_count
-    assert sum(item["bytes"] for item in found["channels"].values()) + found["overhead_bytes"] == result.size
-    assert found["settings"]["target"] == "drop <= 2 dB" and found["settings"]["reached"] is True
-    assert found["ratio"] == pytest.approx(result.ratio, abs=1e-3)
-    json.dumps(found, allow_nan=False)
+    assert found.count == result.count and found.sh_count == result.sh_count
+    assert sum(item["bytes"] for item in found.channels.values()) + found.overhead_bytes == result.size
+    assert found.settings["target"] == "drop <= 2 dB" and found.settings["reached"] is True
+    assert found.ratio == pytest.approx(result.ratio, abs=1e-3)
+    json.dumps(found.to_json(), allow_nan=False)
     text = found.summary()
     for word in ("bits", "rest", "target: drop <= 2 dB", f"{result.count}"):
         assert word in text
@@ -439,17 +439,17 @@ def test_info_of_a_file_adds_up(done: tuple[Path, CompressResult]) -> None:
 
 def test_info_of_a_ply_names_its_companions(project: Path) -> None:
     found = info(project / "point_cloud.ply")
-    assert found["format"] == "ply" and found["count"] == COUNT and found["sh_degree"] == 1
+    assert found.format == "ply" and found.count == COUNT and found.sh_degree == 1
     assert str(project / "cameras.json") in found.summary()
 
 
 def test_verify_names_the_damaged_part(done: tuple[Path, CompressResult], tmp_path: Path) -> None:
     folder, _ = done
-    assert all(section.ok for section in verify(folder / "a.fgs"))
+    assert verify(folder / "a.fgs").ok
     data = bytearray((folder / "a.fgs").read_bytes())
     data[-200] ^= 1
     (tmp_path / "a.fgs").write_bytes(data)
-    assert [section.name for section in verify(tmp_path / "a.fgs") if not section.ok] == ["chunk 0"]
+    assert verify(tmp_path / "a.fgs").damaged == ("chunk 0",)
     with pytest.raises(InputError, match=r"expected a \.fgs file"):
         verify(folder / "s.npy")
 

@@ -58,14 +58,14 @@ def test_every_sh_degree_through_the_whole_pipeline(tmp_path: Path, method: str,
     assert result.reached and result.size == file.stat().st_size and result.quality is not None
 
     found = info(file)
-    assert (found["settings"]["background"], found["settings"]["antialiased"]) == (WHITE, True)
-    assert found["settings"]["source_sh_degree"] == degree and found["sh_degree"] <= degree
+    assert (found.settings["background"], found.settings["antialiased"]) == (WHITE, True)
+    assert found.settings["source_sh_degree"] == degree and found.sh_degree <= degree
     assert "antialiased: True" in found.summary()
     if degree == 0 or (zeros and method == "paper"):
-        assert found["sh_count"] == found["sh_degree"] == 0
+        assert found.sh_count == found.sh_degree == 0
 
     assert ANTIALIASED_NOTE in decompress(file, plain).notes
-    assert (PlySource(plain).count, PlySource(plain).sh_degree) == (result.count, found["sh_degree"])
+    assert (PlySource(plain).count, PlySource(plain).sh_degree) == (result.count, found.sh_degree)
     # Neither the .fgs nor its PLY has a cfg_args beside it: the one says how it is drawn, the other's original does.
     bare = tmp_path / "model" / "point_cloud" / "iteration_30000" / "point_cloud.ply"
     for judged, against in ((file, bare), (plain, model)):
@@ -118,7 +118,7 @@ def test_info_says_that_a_model_is_antialiased(model: Path, tmp_path: Path) -> N
     assert "antialiased: yes" in info(model).summary()
     (tmp_path / "cfg_args").write_text("Namespace(antialiasing='yes')")
     shutil.copy(model / "point_cloud" / "iteration_30000" / "point_cloud.ply", tmp_path / "a.ply")
-    assert info(tmp_path / "a.ply")["antialiased"] is None
+    assert info(tmp_path / "a.ply").antialiased is None
     (tmp_path / "cfg_args").write_text("antialiasing=True")
     with pytest.raises(FormatError, match="cfg_args"):
         info(tmp_path / "a.ply")

@@ -43,7 +43,7 @@ def test_evaluate_text_has_a_row_a_view_and_says_identical() -> None:
 
 
 def test_without_photos_no_drop_is_claimed() -> None:
-    text = evaluate_text(EvaluateResult(SCENE, SCENE, VIEWS, Quality((ViewQuality("b", 1e-4),)), "training", RUN))
+    text = EvaluateResult(SCENE, SCENE, VIEWS, Quality((ViewQuality("b", 1e-4),)), "training", RUN).summary()
     assert "against the photos" not in text and "modelled drop" in text and "worst view:  b: fidelity 40.000 dB" in text
 
 

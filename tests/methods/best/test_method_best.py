@@ -81,8 +81,8 @@ def test_the_sample_reads_back(sample: tuple[Path, CompressResult]) -> None:
     assert result.steps is not None and result.steps == source.container.header.steps
     assert source.settings["method"] == "best" and source.settings["reached"] is True
     found = info(path)
-    assert (found["count"], found["sh_count"], found["size"]) == (result.count, result.sh_count, result.size)
-    assert sum(channel["bytes"] for channel in found["channels"].values()) + found["overhead_bytes"] == result.size
+    assert (found.count, found.sh_count, found.size) == (result.count, result.sh_count, result.size)
+    assert sum(channel["bytes"] for channel in found.channels.values()) + found.overhead_bytes == result.size
 
 
 def test_same_command_same_bytes_whatever_the_memory(
@@ -142,7 +142,7 @@ def test_size_targets_are_respected(project: Path, tmp_path: Path) -> None:
 
 def test_the_closest_point_is_written_when_asked(project: Path, tmp_path: Path) -> None:
     closest = compress(project / "point_cloud.ply", tmp_path / "c.fgs", max_size=300, best_effort=True, **TINY)
-    assert closest.reached is False and closest.size > 300 and info(tmp_path / "c.fgs")["settings"]["reached"] is False
+    assert closest.reached is False and closest.size > 300 and info(tmp_path / "c.fgs").settings["reached"] is False
 
 
 def test_fidelity_and_modelled_drop_decide_without_photos(project: Path, tmp_path: Path) -> None:
@@ -256,7 +256,7 @@ def test_layers_are_the_same_scene_and_worth_most_first(project: Path, tmp_path:
     layered = compress(project / "point_cloud.ply", tmp_path / "layered.fgs", layers=3, **words)
     assert plain.quality is not None and layered.quality is not None
     assert plain.count == layered.count and abs(plain.quality.fidelity - layered.quality.fidelity) < 1e-3  # type: ignore[operator]
-    rows = [layer["rows"] for layer in info(tmp_path / "layered.fgs")["layers"]]
+    rows = [layer["rows"] for layer in info(tmp_path / "layered.fgs").layers]
     assert len(rows) == 3 and all(rows)
     trim(tmp_path / "layered.fgs", tmp_path / "half.fgs", layered.size - 1)
     half = open_scene(tmp_path / "half.fgs")

@@ -82,7 +82,7 @@ def test_the_record_says_what_was_written(done: tuple[Path, CompressResult]) -> 
     assert record["search"] and all(step["phase"] in ("line", "multiplier") for step in record["search"])
     text = result.summary()
     assert f"{result.size} bytes" in text and f".{record['format']}, SH degree {result.file_sh_degree}" in text
-    assert info(path)["format"] == record["format"] and info(path)["count"] == result.count
+    assert info(path).format == record["format"] and info(path).count == result.count
 
 
 def test_same_command_same_bytes(project: Path, done: tuple[Path, CompressResult], tmp_path: Path) -> None:
