@@ -23,7 +23,7 @@ from flexgs_edge.report.pages import compress_page, evaluate_page
 from flexgs_edge.report.results import CompressResult, EvaluateResult
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.contents import contents
-from flexgs_edge.run.inputs import Scene
+from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.pictures import draw_shots, rig_of, shots_bytes
 from flexgs_edge.run.view_set import ViewSet
@@ -102,7 +102,7 @@ class Reporter:
             write(place)
             self.read_contents(place)
 
-    def see_cameras(self, views: ViewSet, scene: Scene) -> None:
+    def see_cameras(self, views: ViewSet, scene: CheckedScene) -> None:
         """Take down where the cameras stand."""
         self._rig = rig_of(views, scene.source)
 
