@@ -97,7 +97,7 @@ class Scene:
             "opacity_logits": _plane(_array("opacity_logits", opacity_logits, count, ())[None]),
             "sh_dc": _plane(_array("sh_dc", sh_dc, count, (3,)).T),
             # Channel by channel: all of red, all of green, all of blue.
-            "sh_rest": _plane(_rest(rest, count).transpose(2, 1, 0).reshape(-1, count)),
+            "sh_rest": _plane(_rest(rest, count).transpose(2, 1, 0).reshape(3 * rest.shape[1], count)),
         }
         origin = choose_origin(places[:, origin_rows(count)].T.astype(np.float64)) if count else np.zeros(3)
         planes["means"] = _plane(places.astype(np.float64) - origin[:, None] if origin.any() else places)
@@ -209,7 +209,7 @@ def _plane(values: np.ndarray) -> np.ndarray:
 
 
 def _arrays(planes: Planes, origin: np.ndarray) -> Arrays:
-    means = planes["means"].T
+    means, rest = planes["means"].T, planes["sh_rest"]
     count = len(means)
     return {
         "means": np.ascontiguousarray(means) if not origin.any() else means.astype(np.float64) + origin,
@@ -217,5 +217,5 @@ def _arrays(planes: Planes, origin: np.ndarray) -> Arrays:
         "quats": np.ascontiguousarray(planes["quats"].T),
         "opacity_logits": planes["opacity_logits"].reshape(count),
         "sh_dc": np.ascontiguousarray(planes["sh_dc"].T),
-        "sh_rest": np.ascontiguousarray(planes["sh_rest"].reshape(3, -1, count).transpose(2, 1, 0)),
+        "sh_rest": np.ascontiguousarray(rest.reshape(3, len(rest) // 3, count).transpose(2, 1, 0)),
     }
