@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flexgs_edge.errors import DeviceError
-from flexgs_edge.kernels.choose_device import choose_device, list_devices
+from flexgs_edge.kernels import choose_device as kernels
 from flexgs_edge.report.file_results import DevicesResult
 
 
@@ -20,9 +20,9 @@ def devices(device: str | None = None) -> DevicesResult:
     DevicesResult
         `chosen` is `None` where none works; nothing is raised for that.
     """
-    found = tuple(list_devices())
+    found = tuple(kernels.list_devices())
     try:
-        chosen, reason = choose_device(device, list(found))
+        chosen, reason = kernels.choose_device(device, list(found))
     except DeviceError as error:
         return DevicesResult(found, None, str(error))
     return DevicesResult(found, chosen.index, reason)
