@@ -27,14 +27,16 @@ Size = tuple[int, int]
 
 
 class Photos:
-    """One photo for each camera; sizes are known, and pixels are read when needed. Made by `Photos.open`.
+    """One photo for each camera; sizes are known, and pixels are read when needed.
+
+    Made by `Photos.open` or `Photos.of_arrays`.
 
     Attributes
     ----------
     cameras : list of Camera
         In the given order, scaled to the photos (and to the width limit).
     paths : list of Path
-        The photo of each camera.
+        The photo of each camera (for messages, where they are arrays).
     notes : tuple of str
         Notes on photos that were scaled, for the summary.
     """
@@ -43,6 +45,7 @@ class Photos:
         self, paths: list[Path], cameras: list[Camera], background: np.ndarray, notes: tuple[str, ...] = ()
     ) -> None:
         self.paths, self.cameras, self.background, self.notes = paths, cameras, background, notes
+        self._arrays: Sequence[np.ndarray] | None = None
 
     @classmethod
     def open(
@@ -71,14 +74,46 @@ class Photos:
             If the folder or a photo is missing or damaged, or sizes do not match the cameras.
         """
         folder = Path(images_dir)
-        bent = next((camera for camera in cameras if camera.distortion), None)
-        if bent is not None:
-            raise InputError(
-                f"{folder}: photos cannot be compared: camera {bent.name!r} has lens distortion ({bent.distortion}), "
-                "which was ignored; undistort photos and cameras, or leave the photos out (--images none)"
-            )
+        _refuse_bent(folder, cameras)
         paths = _match(folder, cameras)
-        sizes = [photo_size(path) for path in paths]
+        return cls._of_sizes(paths, [photo_size(path) for path in paths], cameras, background, max_width)
+
+    @classmethod
+    def of_arrays(
+        cls,
+        images: Sequence[np.ndarray],
+        cameras: Sequence[Camera],
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        max_width: int | None = None,
+    ) -> Photos:
+        """Photos from memory, one a camera: [H, W, 3] u8, or [H, W, 4] with an alpha channel.
+
+        Parameters and errors are those of `open`; the arrays are not copied.
+        """
+        _refuse_bent(Path("images"), cameras)
+        if len(images) != len(cameras):
+            raise InputError(f"images: expected {len(cameras)} photos, one a camera, found {len(images)}")
+        arrays = [np.asarray(image) for image in images]
+        for i, array in enumerate(arrays):
+            if array.ndim != 3 or array.shape[2] not in (3, 4) or array.dtype != np.uint8 or not array.size:
+                raise InputError(
+                    f"images[{i}]: expected shape [H, W, 3] or [H, W, 4] of uint8, found {array.shape} {array.dtype}"
+                )
+        names = [Path(f"images[{i}]") for i in range(len(arrays))]
+        sizes = [(array.shape[1], array.shape[0]) for array in arrays]
+        photos = cls._of_sizes(names, sizes, cameras, background, max_width)
+        photos._arrays = arrays
+        return photos
+
+    @classmethod
+    def _of_sizes(
+        cls,
+        paths: list[Path],
+        sizes: list[Size],
+        cameras: Sequence[Camera],
+        background: Sequence[float],
+        max_width: int | None,
+    ) -> Photos:
         scaled, note = _scale_to(sizes, paths, cameras)
         notes: tuple[str, ...] = () if note is None else (note,)
         if max_width is not None:
@@ -99,13 +134,8 @@ class Photos:
         """
         from PIL import Image
 
-        path, camera = self.paths[index], self.cameras[index]
-        try:
-            with Image.open(path) as image:
-                image.load()
-                pixels = _pixels(image, self.background, path)
-        except (*_DAMAGED, Image.DecompressionBombError) as error:
-            raise InputError(f"{path}: the photo cannot be decoded ({error}); is the file complete?") from error
+        camera = self.cameras[index]
+        pixels = self._decoded(index)
         if pixels.shape[:2] == (camera.height, camera.width):
             return pixels
         # Area average in floats, so that colours are not rounded to 8 bits a second time.
@@ -116,6 +146,31 @@ class Photos:
             for c in range(3)
         ]
         return np.stack([np.asarray(plane, np.float32) for plane in planes], axis=2).clip(0.0, 1.0)
+
+    def _decoded(self, index: int) -> np.ndarray:
+        """[H, W, 3] f32 in [0, 1], at the photo's own size."""
+        from PIL import Image
+
+        if self._arrays is not None:
+            return _colours(self._arrays[index], self.background)
+        path = self.paths[index]
+        try:
+            with Image.open(path) as image:
+                image.load()
+                return _pixels(image, self.background, path)
+        except InputError:  # a ValueError too, and said already what is wrong
+            raise
+        except (*_DAMAGED, Image.DecompressionBombError) as error:
+            raise InputError(f"{path}: the photo cannot be decoded ({error}); is the file complete?") from error
+
+
+def _refuse_bent(place: Path, cameras: Sequence[Camera]) -> None:
+    bent = next((camera for camera in cameras if camera.distortion), None)
+    if bent is not None:
+        raise InputError(
+            f"{place}: photos cannot be compared: camera {bent.name!r} has lens distortion ({bent.distortion}), "
+            "which was ignored; undistort photos and cameras, or leave the photos out (--images none)"
+        )
 
 
 def _match(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
@@ -200,8 +255,15 @@ def _pixels(image: Image.Image, background: np.ndarray, path: Path) -> np.ndarra
         grey = np.asarray(image).astype(np.float32) / 65535.0
         return np.repeat(grey[:, :, None], 3, axis=2).clip(0.0, 1.0)
     if mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
-        colours = np.asarray(image.convert("RGBA"), np.float32) / 255.0
-        alpha = colours[:, :, 3:]
-        blended: np.ndarray = colours[:, :, :3] * alpha + background * (1.0 - alpha)
-        return blended
-    return np.asarray(image.convert("RGB"), np.float32) / np.float32(255.0)
+        return _colours(np.asarray(image.convert("RGBA")), background)
+    return _colours(np.asarray(image.convert("RGB")), background)
+
+
+def _colours(pixels: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """[H, W, 3] f32 in [0, 1] of 8-bit colours ([H, W, 3 or 4]); alpha is put on the background."""
+    colours = np.asarray(pixels, np.float32) / np.float32(255.0)
+    if colours.shape[2] == 3:
+        return colours
+    alpha = colours[:, :, 3:]
+    blended: np.ndarray = colours[:, :, :3] * alpha + background * (1.0 - alpha)
+    return blended

@@ -100,7 +100,7 @@ def _exit_code(error: BaseException) -> int:
     if isinstance(error, click.ClickException):
         error.show()
         return InputError.exit_code
-    if isinstance(error, FlexGSError):
+    if isinstance(error, FlexGSError):  # before MemoryError: a BudgetError is one too
         return _say(f"error: {error}", error.exit_code)
     if isinstance(error, MemoryError):
         return _say(

@@ -223,11 +223,10 @@ def command(input: str, output: str | None, json_path: str | None, quiet: bool, 
     """
     progress = talk.start(quiet, json_path, options["force"], options["report"])
     from flexgs_edge.commands.compress import compress
-    from flexgs_edge.report.summary import compress_text
     from flexgs_edge.run.options import METHOD_ONLY, CompressOptions, check_method
 
     # An option that is spelled out is meant, even where it says its default.
     source = click.get_current_context().get_parameter_source
     check_method(options["method"], [name for name in METHOD_ONLY if source(name) is ParameterSource.COMMANDLINE])
     result = compress(input, output, CompressOptions(**options), progress)
-    talk.emit(compress_text(result), result.to_json(), json_path, options["force"])
+    talk.emit(result.summary(), result.to_json(), json_path, options["force"])

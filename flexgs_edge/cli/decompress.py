@@ -55,7 +55,6 @@ def command(
     """
     talk.start(quiet, json_path, force)
     from flexgs_edge.commands.decompress import decompress
-    from flexgs_edge.report.summary import decompress_text
 
     result = decompress(input, output, force, memory_limit, device)
-    talk.emit(decompress_text(result), result.to_json(), json_path, force)
+    talk.emit(result.summary(), result.to_json(), json_path, force)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import click
 
 from flexgs_edge.cli import help_page, shared_options, talk
-from flexgs_edge.commands.devices import device_lines
 from flexgs_edge.errors import DeviceError
 
 
@@ -32,19 +31,9 @@ def command(device: str | None, force: bool, json_path: str | None, quiet: bool)
     Exit code 4: no device works, or not the one asked for. The message says what to install.
     """
     talk.start(quiet, json_path, force)
-    from flexgs_edge.kernels.choose_device import choose_device, list_devices
+    from flexgs_edge.commands.devices import devices
 
-    devices = list_devices()
-    failure: DeviceError | None = None
-    try:
-        chosen, reason = choose_device(device, devices)
-        index: int | None = chosen.index
-    except DeviceError as error:
-        failure, reason, index = error, str(error), None
-    lines = [line for info in devices for line in device_lines(info)]
-    if index is not None:
-        lines.append(f"chosen: [{index}] ({reason})")
-    record = {"devices": [info.to_json() for info in devices], "chosen": index, "reason": reason}
-    talk.emit("".join(line + "\n" for line in lines), record, json_path, force)
-    if failure is not None:
-        raise failure
+    result = devices(device)
+    talk.emit(result.summary(), result.to_json(), json_path, force)
+    if result.chosen is None:
+        raise DeviceError(result.reason)

@@ -59,8 +59,7 @@ def command(
     """
     progress = talk.start(quiet, json_path, force, report)
     from flexgs_edge.commands.evaluate import evaluate
-    from flexgs_edge.report.summary import evaluate_text
     from flexgs_edge.run.options import ViewOptions
 
     result = evaluate(input, against, ViewOptions(**options), base_psnr, progress, report, force, lpips)
-    talk.emit(evaluate_text(result), result.to_json(), json_path, force)
+    talk.emit(result.summary(), result.to_json(), json_path, force)

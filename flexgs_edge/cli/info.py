@@ -54,20 +54,19 @@ def command(
             if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
                 word = "--" + name.replace("_", "-")
                 raise InputError(f"{word} is for --errors: add --errors, or leave {word} out")
-        from flexgs_edge.commands.info import info, info_text
+        from flexgs_edge.commands.info import info
 
         found = info(file)
-        talk.emit(info_text(found), found, json_path, force)
+        talk.emit(found.summary(), found.to_json(), json_path, force)
         return
-    from flexgs_edge.commands.info import info_text
-    from flexgs_edge.commands.worth import worth, worth_text
+    from flexgs_edge.commands.worth import worth
     from flexgs_edge.run.options import ViewOptions
 
     if picture is not None:
         from flexgs_edge.report.worth_plot import check_picture, write_picture
 
         check_picture(picture, force)
-    found = worth(file, ViewOptions(**options), progress)
+    result = worth(file, ViewOptions(**options), progress)
     if picture is not None:
-        write_picture(found, picture, force)
-    talk.emit(info_text(found) + worth_text(found), found, json_path, force)
+        write_picture(result, picture, force)
+    talk.emit(result.summary(), result.to_json(), json_path, force)

@@ -41,8 +41,7 @@ def command(
     """
     progress = talk.start(quiet, json_path, force)
     from flexgs_edge.commands.render import render_views
-    from flexgs_edge.report.summary import render_text
     from flexgs_edge.run.options import ViewOptions
 
     result = render_views(input, output, ViewOptions(**options), views, force, progress)
-    talk.emit(render_text(result), result.to_json(), json_path, force)
+    talk.emit(result.summary(), result.to_json(), json_path, force)

@@ -40,8 +40,7 @@ def command(
     """
     progress = talk.start(quiet, json_path, force)
     from flexgs_edge.commands.score import score_gaussians
-    from flexgs_edge.report.summary import score_text
     from flexgs_edge.run.options import ViewOptions
 
     result = score_gaussians(input, output, ViewOptions(**options), score, force, progress)
-    talk.emit(score_text(result), result.to_json(), json_path, force)
+    talk.emit(result.summary(), result.to_json(), json_path, force)

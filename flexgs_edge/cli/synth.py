@@ -61,7 +61,7 @@ def command(
       flexgs-edge synth huge/point_cloud.ply --from scene.fgs --gaussians 40000000 --memory-limit 300MiB
     """
     talk.start(quiet, json_path, force)
-    from flexgs_edge.commands.synth import synth, synth_text
+    from flexgs_edge.commands.synth import synth
 
-    found = synth(output, input, gaussians, seed, force, memory_limit)
-    talk.emit(synth_text(found), found, json_path, force)
+    result = synth(output, input, gaussians, seed, force, memory_limit)
+    talk.emit(result.summary(), result.to_json(), json_path, force)

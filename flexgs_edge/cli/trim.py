@@ -32,7 +32,7 @@ def command(input: str, output: str, max_size: int, force: bool, json_path: str 
     Exit code 3: not even the first layer fits.
     """
     talk.start(quiet, json_path, force)
-    from flexgs_edge.commands.trim import trim, trim_text
+    from flexgs_edge.commands.trim import trim
 
-    found = trim(input, output, max_size, force)
-    talk.emit(trim_text(found), found, json_path, force)
+    result = trim(input, output, max_size, force)
+    talk.emit(result.summary(), result.to_json(), json_path, force)

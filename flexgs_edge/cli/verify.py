@@ -24,10 +24,9 @@ def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
     Exit code 0: every part is whole. Exit code 2: something is damaged.
     """
     talk.start(quiet, json_path, force)
-    from flexgs_edge.commands.verify import verify, verify_json, verify_text
+    from flexgs_edge.commands.verify import verify
 
-    sections = verify(file)
-    talk.emit(verify_text(file, sections), verify_json(file, sections), json_path, force)
-    damaged = [section.name for section in sections if not section.ok]
-    if damaged:
-        raise FormatError(f"{file}: damaged: {', '.join(damaged)}; get the file again from where it came from")
+    result = verify(file)
+    talk.emit(result.summary(), result.to_json(), json_path, force)
+    if not result.ok:
+        raise FormatError(f"{file}: damaged: {', '.join(result.damaged)}; get the file again from where it came from")

@@ -19,38 +19,41 @@ from flexgs_edge.methods.paper import method as paper
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.doubts import doubts
-from flexgs_edge.run.inputs import scene_info
+from flexgs_edge.run.inputs import ScenePlace, scene_info
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.outputs import check_outputs, foreign_format
 from flexgs_edge.run.reporter import Reporter
 from flexgs_edge.run.run import Run, open_planned
-from flexgs_edge.run.view_set import views_info
+from flexgs_edge.run.view_set import GivenViews, views_info
 from flexgs_edge.views.bench import Bench
 
 LOG = logging.getLogger("flexgs_edge")
 
 
 def compress(
-    input: str | Path,
-    output: str | Path | None,
+    input: ScenePlace,
+    output: str | os.PathLike[str] | None,
     options: CompressOptions | None = None,
     progress: Progress = SILENT,
+    given: GivenViews | None = None,
     **words: Any,
 ) -> CompressResult:
     """Compress a scene to the fewest bytes that hold a target.
 
     Parameters
     ----------
-    input : path
-        A scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`), or INRIA's model folder.
+    input : path or CheckedScene
+        A scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`), INRIA's model folder, or a scene that is open.
     output : path or None
         The `.fgs`, `.spz`, `.sog` or `.compressed.ply` to write (None, for a `.fgs`, only in a dry run).
     options : CompressOptions, optional
         What the command line would say.
     progress : Progress, optional
         Bars on long work.
+    given : GivenViews, optional
+        Cameras and photos from memory.
     **words
         Single options by the names of `CompressOptions`, such as `max_drop=0.5`.
 
@@ -74,7 +77,7 @@ def compress(
         prepare_memory(run)
         scores.append(paper.given_scores(run))
 
-    run = open_planned(input, options, progress, reporter, check)
+    run = open_planned(input, options, progress, reporter, check, given)
     with ExitStack() as stack:
         bench = None if run.views is None else stack.enter_context(open_bench(run, options.cluster))
         if reporter is not None and run.views is not None and run.plan is not None:

@@ -12,10 +12,10 @@ from flexgs_edge.io.exchange import write_foreign
 from flexgs_edge.io.formats import FORMATS, format_of
 from flexgs_edge.io.ply import inria_dtype, write_ply
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.report.results import DecompressResult
+from flexgs_edge.report.file_results import DecompressResult
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.decoding import ahead, decoder
-from flexgs_edge.run.inputs import load_scene, scene_info
+from flexgs_edge.run.inputs import ScenePlace, load_scene, scene_info
 from flexgs_edge.run.open_bench import run_info
 
 WRITE_COPIES = 3
@@ -24,8 +24,8 @@ ANTIALIASED_NOTE = "an antialiased model: the file does not say so; viewers must
 
 
 def decompress(
-    input: str | Path,
-    output: str | Path,
+    input: ScenePlace,
+    output: str | os.PathLike[str],
     force: bool = False,
     memory_limit: int | None = None,
     device: str | None = None,
@@ -34,7 +34,7 @@ def decompress(
 
     Parameters
     ----------
-    input : path
+    input : path or CheckedScene
         Any scene: a `.fgs`, a `.ply`, a file of another program's format, or a model folder.
     output : path
         The `.ply`, `.spz`, `.sog` or `.compressed.ply` to write.

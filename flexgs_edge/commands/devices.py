@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from flexgs_edge.units import format_mib
-
-if TYPE_CHECKING:
-    from flexgs_edge.kernels.choose_device import DeviceInfo
+from flexgs_edge.errors import DeviceError
+from flexgs_edge.kernels import choose_device as kernels
+from flexgs_edge.report.file_results import DevicesResult
 
 
-def device_lines(info: DeviceInfo) -> list[str]:
-    """A device in a few lines."""
-    return [
-        f"[{info.index}] {info.name}",
-        f"    {info.type}, {info.platform}, driver {info.driver}, {info.opencl_c}",
-        f"    {info.compute_units} compute units, native float vectors of {info.native_width}, work-groups up to "
-        f"{info.max_work_group}, local memory {info.local_bytes // 1024} KiB, global memory {format_mib(info.global_bytes)}, "
-        f"buffers up to {format_mib(info.max_alloc_bytes)}",
-        f"    self-test: {info.self_test}",
-    ]
+def devices(device: str | None = None) -> DevicesResult:
+    """List the OpenCL devices, test each, and say which one is used.
+
+    Parameters
+    ----------
+    device : str, optional
+        Which one would be chosen: a number, part of a name, `cpu` or `gpu`.
+
+    Returns
+    -------
+    DevicesResult
+        `chosen` is `None` where none works; nothing is raised for that.
+    """
+    found = tuple(kernels.list_devices())
+    try:
+        chosen, reason = kernels.choose_device(device, list(found))
+    except DeviceError as error:
+        return DevicesResult(found, None, str(error))
+    return DevicesResult(found, chosen.index, reason)

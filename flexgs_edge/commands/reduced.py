@@ -16,11 +16,11 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.packed.bitpack import pack
 from flexgs_edge.packed.quantize import QuantizedArray, QuantizedScene, codes
+from flexgs_edge.report.worth_result import DROPPED, ONE_LESS
 from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.fields import FIELDS, sh_rest_count
 from flexgs_edge.scene.source import MemorySource, SceneSource
 
-ONE_LESS, DROPPED = "one bit less", "dropped"
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 

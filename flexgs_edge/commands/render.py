@@ -16,7 +16,7 @@ import numpy as np
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.report.results import RenderResult
+from flexgs_edge.report.file_results import RenderResult
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import ViewOptions

@@ -14,7 +14,7 @@ from flexgs_edge.files import check_writable
 from flexgs_edge.methods.paper.score_files import save_scores
 from flexgs_edge.methods.paper.scores import SCORES, score_scene
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.report.results import ScoreResult
+from flexgs_edge.report.file_results import ScoreResult
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import ViewOptions

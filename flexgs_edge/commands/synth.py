@@ -6,11 +6,9 @@ import logging
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from flexgs_edge._version import __version__
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.inria import inria_json
 from flexgs_edge.cameras.read import read_cameras
@@ -19,13 +17,13 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.io.ply import inria_dtype, write_ply
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.report.file_results import SynthResult
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.companions import companions_of
 from flexgs_edge.run.inputs import load_scene
 from flexgs_edge.run.open_bench import run_info
 from flexgs_edge.scene.parts import MOST_PARTS, PartsSource
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.units import format_mib, format_size
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -49,7 +47,7 @@ def synth(
     seed: int = 0,
     force: bool = False,
     memory_limit: int | None = None,
-) -> dict[str, Any]:
+) -> SynthResult:
     """Write a scene of `gaussians` Gaussians made from a smaller one, and cameras for it.
 
     Up to `MOST_PARTS` times the scene's count every Gaussian becomes parts that look like it together; beyond that there are
@@ -73,8 +71,8 @@ def synth(
 
     Returns
     -------
-    dict
-        JSON values (`synth_text` makes the text from them).
+    SynthResult
+        What was made.
 
     Raises
     ------
@@ -124,26 +122,21 @@ def synth(
             notes = (*write_ply(target, made, force=force, chunk_rows=rows), *notes)
     if scene.settings.get("antialiased") is True:
         notes = (*notes, ANTIALIASED_NOTE)
-    run = run_info(budget, clock)
-    return {
-        "program": f"flexgs-edge {__version__}",
-        "command": "synth",
-        "input": os.fspath(input),
-        "input_count": source.count,
-        "sh_degree": source.sh_degree,
-        "output": os.fspath(output),
-        "count": gaussians,
-        "size": os.stat(target).st_size,
-        "seed": seed,
-        "tiles": tiles,
-        "parts": [gaussians // (tiles * source.count), -(-gaussians // (tiles * source.count))],
-        "cameras": os.fspath(beside) if cameras else None,
-        "views": len(cameras),
-        "notes": [*source.notes, *notes],
-        "seconds": run.seconds,
-        "memory_limit": run.memory_limit,
-        "peak_memory": run.peak_memory,
-    }
+    return SynthResult(
+        input=os.fspath(input),
+        input_count=source.count,
+        sh_degree=source.sh_degree,
+        output=os.fspath(output),
+        count=gaussians,
+        size=os.stat(target).st_size,
+        seed=seed,
+        tiles=tiles,
+        parts=(gaussians // (tiles * source.count), -(-gaussians // (tiles * source.count))),
+        cameras=os.fspath(beside) if cameras else None,
+        views=len(cameras),
+        notes=(*source.notes, *notes),
+        run=run_info(budget, clock),
+    )
 
 
 def tile_shifts(source: SceneSource, tiles: int) -> np.ndarray:
@@ -198,22 +191,3 @@ def _check_cameras(beside: Path, cameras: Path, force: bool) -> None:
     if beside.exists() and cameras.exists() and beside.samefile(cameras):
         raise InputError(f"{beside}: these are the scene's own cameras, and would be replaced: write to another folder")
     check_writable(beside, force)
-
-
-def synth_text(found: dict[str, Any]) -> str:
-    """The text of what `synth` did."""
-    few, many = found["parts"]
-    parts = f"{few}" if few == many else f"{few} or {many}"
-    tiles = "" if found["tiles"] == 1 else f", in {found['tiles']} copies side by side"
-    lines = [
-        f"{found['input']}: {found['input_count']} Gaussians of SH degree {found['sh_degree']}",
-        f"wrote {found['output']}, {found['count']} Gaussians, {found['size']} bytes ({format_size(found['size'])})",
-        f"made    each Gaussian in {parts} part{'' if many == 1 else 's'}{tiles}; seed {found['seed']}",
-    ]
-    if found["cameras"] is not None:
-        lines.append(f"cameras {found['cameras']}, {found['views']} views")
-    lines += [f"note    {note}" for note in found["notes"]]
-    lines.append(
-        f"run     {found['seconds']:.1f} s, peak memory {format_mib(found['peak_memory'])} of {format_mib(found['memory_limit'])}"
-    )
-    return "\n".join(lines) + "\n"

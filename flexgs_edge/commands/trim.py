@@ -1,20 +1,22 @@
-"""`trim`: a smaller file from a layered one, by copying whole layers. Text and JSON come from one builder."""
+"""`trim`: a smaller file from a layered one, by copying whole layers."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
-from flexgs_edge._version import __version__
 from flexgs_edge.codec.open_fgs import file_version, read_header
+from flexgs_edge.codec.v1.header import Header
 from flexgs_edge.codec.v2.container import trim_container
+from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_writable
-from flexgs_edge.units import format_size
+from flexgs_edge.report.file_results import TrimResult
 
 
-def trim(input: str | Path, output: str | Path, max_size: int, force: bool = False) -> dict[str, Any]:
+def trim(
+    input: str | os.PathLike[str], output: str | os.PathLike[str], max_size: int, force: bool = False
+) -> TrimResult:
     """Copy as many whole layers of a `.fgs` file as fit into a size, at the speed of copying.
 
     Parameters
@@ -30,8 +32,8 @@ def trim(input: str | Path, output: str | Path, max_size: int, force: bool = Fal
 
     Returns
     -------
-    dict
-        JSON values (`trim_text` makes the text from them).
+    TrimResult
+        What was kept.
 
     Raises
     ------
@@ -54,31 +56,18 @@ def trim(input: str | Path, output: str | Path, max_size: int, force: bool = Fal
         )
     size = trim_container(input, output, max_size, force)
     kept = read_header(output)
-    return {
-        "program": f"flexgs-edge {__version__}",
-        "command": "trim",
-        "input": os.fspath(input),
-        "input_size": os.stat(input).st_size,
-        "input_count": header.count,
-        "input_layers": _layers(header),
-        "output": os.fspath(output),
-        "size": size,
-        "count": kept.count,
-        "layers": _layers(kept),
-        "max_size": max_size,
-    }
+    return TrimResult(
+        input=os.fspath(input),
+        input_size=os.stat(input).st_size,
+        input_count=header.count,
+        input_layers=_layers(header),
+        output=os.fspath(output),
+        size=size,
+        count=kept.count,
+        layers=_layers(kept),
+        max_size=max_size,
+    )
 
 
-def _layers(header: Any) -> int:
-    return len(header.layers)
-
-
-def trim_text(found: dict[str, Any]) -> str:
-    """The text of what `trim` did."""
-    lines = [
-        f"{found['input']}: {found['input_size']} bytes ({format_size(found['input_size'])}), "
-        f"{found['input_count']} Gaussians in {found['input_layers']} layers",
-        f"wrote {found['output']}, {found['size']} bytes ({format_size(found['size'])}, {found['max_size']} allowed)",
-        f"kept  {found['layers']} of {found['input_layers']} layers, {found['count']} of {found['input_count']} Gaussians",
-    ]
-    return "\n".join(lines) + "\n"
+def _layers(header: Header | GridHeader) -> int:
+    return len(header.layers) if isinstance(header, GridHeader) else 1

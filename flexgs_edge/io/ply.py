@@ -80,15 +80,8 @@ class PlySource(SceneSource):
         self.origin = choose_origin(self._sample())
 
     def _sample(self) -> np.ndarray:
-        """[n, 3] f64, world positions of every k-th row, at most 65536 rows.
-
-        If k is large, it takes runs of rows instead. Reads of single rows far apart are slow, since each one moves the
-        disk.
-        """
-        step = max(1, -(-self.count // _ORIGIN_ROWS))
-        rows = np.arange(0, self.count, step)
-        if step > _GAP:
-            rows = (np.arange(0, self.count - _GAP, _GAP * step)[:, None] + np.arange(_GAP)).reshape(-1)
+        """[n, 3] f64: world positions of `origin_rows`."""
+        rows = origin_rows(self.count)
         sample = np.empty((rows.size, 3))
         for part, block in self._rows.blocks(rows):
             for axis, name in enumerate(FIELD["means"].ply):
@@ -121,6 +114,17 @@ def _smooth(block: np.ndarray) -> dict[str, np.ndarray]:
         log_opacity = -np.logaddexp(0, -block["opacity"].astype(np.float64)) + (scales - wide).sum(axis=0)
         logits = log_opacity - np.log(-np.expm1(log_opacity))
     return {"log_scales": wide, "opacity_logits": logits[None]}
+
+
+def origin_rows(count: int) -> np.ndarray:
+    """[n] i64: every k-th row, at most 65536; runs of rows where these lie far apart.
+
+    Reading single rows that lie far apart is slow: each costs the disk a move.
+    """
+    step = max(1, -(-count // _ORIGIN_ROWS))
+    if step > _GAP:
+        return (np.arange(0, count - _GAP, _GAP * step)[:, None] + np.arange(_GAP)).reshape(-1)
+    return np.arange(0, count, step)
 
 
 def choose_origin(positions: np.ndarray) -> np.ndarray:

@@ -10,10 +10,10 @@ from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.report.camera_plan import plans
 from flexgs_edge.report.html import count, figure, render
 from flexgs_edge.report.material import Material
-from flexgs_edge.report.results import CompressResult, EvaluateResult
+from flexgs_edge.report.results import CompressResult, EvaluateResult, decided_words
 from flexgs_edge.report.run_info import RunInfo, SceneInfo
 from flexgs_edge.report.search_chart import step_chart
-from flexgs_edge.report.summary import decided_words, device_words, memory_words
+from flexgs_edge.report.summary import device_words, memory_words
 from flexgs_edge.report.tones import ERROR_SCALE, css_ramp
 from flexgs_edge.units import format_size
 

@@ -1,4 +1,4 @@
-"""One record a job: what the summary prints, `--json` writes and the tests read.
+"""Records of the jobs that judge quality: what the summary prints, `--json` writes and the tests read.
 
 Keys of the JSON are the field names below unless a docstring says otherwise; sizes are bytes, times seconds (where the name
 ends in `_ms`, milliseconds), quality dB. null stands for "identical" (PSNRs and fidelity) or "nothing to measure"
@@ -7,15 +7,18 @@ ends in `_ms`, milliseconds), quality dB. null stands for "identical" (PSNRs and
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from flexgs_edge._version import __version__
 from flexgs_edge.goals.steps import Scored, SearchResult
 from flexgs_edge.packed.sensitivity import Sensitivity
-from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.as_json import quality_json, rounded, step_json
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.summary import decibel, line, quality_lines, run_lines, scene_lines, similar, text, view_lines
+from flexgs_edge.units import format_size
 
 
 @dataclass(frozen=True)
@@ -160,6 +163,75 @@ class CompressResult:
             "run": self.run.to_json(),
         }
 
+    def summary(self) -> str:
+        """What the command prints."""
+        lines = [*scene_lines("scene", self.scene), *view_lines(self.views)]
+        size = f"{self.size} bytes ({format_size(self.size)})"
+        if self.output is None:
+            lines.append(line("would write", f"{size}; nothing was written (--dry-run)"))
+        else:
+            lines.append(line("wrote", f"{self.output}, {size}"))
+        lines.append(
+            line(
+                "ratio",
+                f"{self.ratio:.2f}x of the PLY's {format_size(self.scene.ply_bytes)} ({_saved(self):.1f} % smaller)",
+            )
+        )
+        share = f"{self.count} of {self.scene.count} Gaussians, {self.sh_count} of them with SH"
+        lines.append(line("kept", f"{share} (prune rate {self.prune_rate:g}, SH rate {self.sh_rate:g})"))
+        if self.format != "fgs":
+            lines.append(
+                line("format", f".{self.format}, SH degree {self.file_sh_degree}, rounded as that format does")
+            )
+        elif self.steps is not None:
+            steps = (f"{name} {value:.3g}" for name, value in self.steps.items() if not isinstance(value, list))
+            lines.append(line("grid steps", ", ".join(steps)))
+        else:
+            bits = " ".join(f"{name}={bits}" for name, bits in self.bits.items())
+            lines.append(line("bits", bits + (" (found by sensitivity)" if self.sensitivity else "")))
+        lines += _decision_lines(self)
+        if self.quality is not None:
+            decoded = "decoded file" if self.output else "as it would decode"
+            lines += quality_lines(self.quality, f"{decoded}, {len(self.quality.views)} {self.quality_views} views")
+        lines += [line("warning", words) for words in self.warnings]
+        if self.scores_saved:
+            lines.append(line("scores", f"saved to {self.scores_saved}"))
+        if self.score_cache:
+            lines.append(
+                line("scores", f"{'reused from' if self.scores_reused else 'made anew, kept in'} {self.score_cache}")
+            )
+        return text([*lines, *run_lines(self.run)])
+
+
+def _saved(result: CompressResult) -> float:
+    return 100.0 * (1.0 - 1.0 / result.ratio)
+
+
+def _decision_lines(result: CompressResult) -> list[str]:
+    if result.target is None:
+        return [line("target", "none: fixed rates, no search")]
+    steps = result.search.steps if result.search else ()
+    verdict = "reached" if result.reached else "NOT reached: this is the closest point (--best-effort)"
+    lines = [line("target", f"{result.target}: {verdict}, after {len(steps)} steps")]
+    lines.append(line("decided by", decided_words(result)))
+    return lines
+
+
+def decided_words(result: CompressResult) -> str:
+    """Which figure decided, and on which views."""
+    by = {
+        "drop": "the drop against the photos",
+        "modelled drop": "the modelled drop (no photos decide: error against the original's renders)",
+        "fidelity": "the fidelity (PSNR against the original's renders)",
+        "size": "the size; among points that fit, quality",
+    }[result.decided_by or "size"]
+    where = {
+        "held-out": "on the held-out views, which decide only where to stop",
+        "training": "on the training poses",
+        "none": "without views",
+    }[result.decision_views]
+    return f"{by}, {where}"
+
 
 @dataclass(frozen=True)
 class EvaluateResult:
@@ -185,87 +257,45 @@ class EvaluateResult:
             "run": self.run.to_json(),
         }
 
-
-@dataclass(frozen=True)
-class RenderResult:
-    """What `render` drew; start-up and kernel compilation are in `run`, apart from the views."""
-
-    scene: SceneInfo
-    views: ViewsInfo
-    files: tuple[str, ...]
-    view_seconds: tuple[float, ...]
-    warm_up_seconds: float
-    run: RunInfo
-
-    @property
-    def ms_per_view(self) -> float:
-        """Median time of a view in milliseconds, drawing only: no loading, compiling or file writing."""
-        times = sorted(self.view_seconds)
-        return 1000 * (times[(len(times) - 1) // 2] + times[len(times) // 2]) / 2 if times else 0.0
-
-    def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
-        run = self.run.to_json()
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "render",
-            "input": self.scene.to_json(),
-            "views": self.views.to_json(),
-            "files": list(self.files),
-            "ms_per_view": round(self.ms_per_view, 3),
-            "view_ms": [round(1000 * seconds, 3) for seconds in self.view_seconds],
-            "startup_ms": run["startup_ms"],
-            "compile_ms": run["compile_ms"],
-            "warm_up_ms": round(1000 * self.warm_up_seconds, 1),
-            "run": run,
-        }
+    def summary(self) -> str:
+        """What the command prints."""
+        lines = [
+            *scene_lines("scene", self.scene),
+            *scene_lines("against", self.reference),
+            *view_lines(self.views),
+        ]
+        lines += quality_lines(self.quality, f"{len(self.quality.views)} {self.quality_views} views")
+        lines += ["", *_view_table(self.quality.views)]
+        return text([*lines, "", *run_lines(self.run)])
 
 
-@dataclass(frozen=True)
-class ScoreResult:
-    """What `score` wrote."""
-
-    scene: SceneInfo
-    views: ViewsInfo
-    output: str
-    score: str
-    scored_views: int
-    unseen: int
-    run: RunInfo
-
-    def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "score",
-            "input": self.scene.to_json(),
-            "views": self.views.to_json(),
-            "output": self.output,
-            "score": self.score,
-            "scored_views": self.scored_views,
-            "unseen": self.unseen,
-            "run": self.run.to_json(),
-        }
-
-
-@dataclass(frozen=True)
-class DecompressResult:
-    """What `decompress` wrote."""
-
-    scene: SceneInfo
-    output: str
-    size: int
-    run: RunInfo
-    notes: tuple[str, ...] = field(default=())
-
-    def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "decompress",
-            "input": self.scene.to_json(),
-            "output": self.output,
-            "size": self.size,
-            "notes": list(self.notes),
-            "run": self.run.to_json(),
-        }
+def _view_table(views: Sequence[ViewQuality]) -> list[str]:
+    rows: list[tuple[str, ...]] = [
+        ("view", "fidelity", "SSIM to ref.", "drop", "PSNR", "of original", "SSIM", "of original")
+    ]
+    with_lpips = any(view.lpips_original is not None for view in views)
+    if with_lpips:
+        rows[0] += ("LPIPS to ref.", "LPIPS", "of original")
+    for view in views:
+        photo = view.photo_error is not None
+        rows.append(
+            (
+                view.name,
+                decibel(view.fidelity),
+                similar(view.ssim_original),
+                decibel(view.drop) if photo else "-",
+                decibel(view.psnr) if photo else "-",
+                decibel(view.original_psnr) if photo else "-",
+                similar(view.ssim_photo),
+                similar(view.original_ssim),
+            )
+        )
+        if with_lpips:
+            rows[-1] += tuple(map(similar, (view.lpips_original, view.lpips_photo, view.original_lpips)))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return [
+        "  ".join(
+            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        )
+        for row in rows
+    ]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.report.plots import DotChart, picture, require_matplotlib
+from flexgs_edge.report.worth_result import WorthResult
 
 SUFFIXES = (".png", ".svg")
 
@@ -20,26 +20,27 @@ def check_picture(path: str, force: bool) -> None:
     check_writable(path, force)
 
 
-def write_picture(found: dict[str, Any], path: str, force: bool) -> None:
+def write_picture(found: WorthResult, path: str, force: bool) -> None:
     """Draw what `commands.worth` found: a dot a change, its modelled drop, and the share of the bytes that it saves."""
     png, svg = picture(worth_chart(found))
     with atomic_write(path, force) as file:
         file.write(png if Path(path).suffix.lower() == ".png" else svg)
 
 
-def worth_chart(found: dict[str, Any]) -> DotChart:
+def worth_chart(found: WorthResult) -> DotChart:
     """The chart as plain data."""
-    changes, size = found["errors"]["changes"], found["size"]
-    groups = list(dict.fromkeys(item["channel"] for item in changes))
-    kinds = list(dict.fromkeys(item["change"] for item in changes))
-    by = {(item["channel"], item["change"]): item for item in changes}
+    changes, size = found.changes, found.info.size
+    groups = list(dict.fromkeys(item.channel for item in changes))
+    kinds = list(dict.fromkeys(item.change for item in changes))
+    by = {(item.channel, item.change): item for item in changes}
+    name = Path(found.info.path).name
     return DotChart(
-        title=f"{Path(found['path']).name}: what each channel is worth, beside it the share of the bytes that it saves",
+        title=f"{name}: what each channel is worth, beside it the share of the bytes that it saves",
         y_label="modelled drop, dB",
         groups=groups,
-        dots={kind: [by[g, kind]["modelled_drop"] if (g, kind) in by else None for g in groups] for kind in kinds},
+        dots={kind: [by[g, kind].modelled_drop if (g, kind) in by else None for g in groups] for kind in kinds},
         words={
-            kind: [f"{100 * by[g, kind]['bytes_saved'] / size:.1f} %" if (g, kind) in by else "" for g in groups]
+            kind: [f"{100 * by[g, kind].bytes_saved / size:.1f} %" if (g, kind) in by else "" for g in groups]
             for kind in kinds
         },
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from flexgs_edge.io.model_folder import Companions, find_companions
 LOG = logging.getLogger("flexgs_edge")
 
 
-def companions_of(path: str | Path) -> Companions:
+def companions_of(path: str | os.PathLike[str]) -> Companions:
     """What lies beside the scene at `path`; logged, so that nobody wonders where cameras came from."""
     found = find_companions(path)
     if found.cameras is None:

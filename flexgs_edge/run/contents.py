@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flexgs_edge._version import __version__
 from flexgs_edge.codec.open_fgs import read_header
 from flexgs_edge.codec.sections import ChunkEntry
 from flexgs_edge.codec.v1.header import Header
@@ -19,10 +19,11 @@ from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.codec.v2.walk import ChunkCodes
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.packed.quantize import array_bytes
+from flexgs_edge.report.info_result import InfoResult
 from flexgs_edge.scene.fields import FIELDS
 
 
-def contents(path: str | Path) -> dict[str, Any]:
+def contents(path: str | Path) -> InfoResult:
     """`info` of a `.fgs`.
 
     The header is read; of version 2 a file that was cut is decoded, since entropy coding shares the bytes out.
@@ -32,7 +33,7 @@ def contents(path: str | Path) -> dict[str, Any]:
     return _packed_info(place, header) if isinstance(header, Header) else _grid_info(place)
 
 
-def _packed_info(path: Path, header: Header) -> dict[str, Any]:
+def _packed_info(path: Path, header: Header) -> InfoResult:
     """A file of version 1: bit-packed arrays, whose bytes follow from the header."""
     channels: dict[str, dict[str, Any]] = {}
     for field in FIELDS:
@@ -49,10 +50,10 @@ def _packed_info(path: Path, header: Header) -> dict[str, Any]:
             "bytes": total,
             "bytes_per_channel": total // width if width else 0,
         }
-    return _fgs_record(path, header, 1, header.sh_count, channels)
+    return _fgs_result(path, header, 1, header.sh_count, channels)
 
 
-def _grid_info(path: Path) -> dict[str, Any]:
+def _grid_info(path: Path) -> InfoResult:
     """A file of version 2: what each channel takes stands in its header, or is known once its symbols have been decoded."""
     container = GridContainer(path)
     header = container.header
@@ -71,13 +72,13 @@ def _grid_info(path: Path) -> dict[str, Any]:
             "bits_per_row": round(8 * total / rows, 3) if rows else None,
             "bits_per_gaussian": round(8 * total / header.count, 3) if header.count else None,
         }
-    return {
-        **_fgs_record(path, header, 2, known.rows[0] if known.rows else 0, channels),
-        "chroma": header.steps["chroma"],
-        "model_bytes": header.model.length,
-        "layers": layers,
-        "cut_from": header.cut_from,
-    }
+    return replace(
+        _fgs_result(path, header, 2, known.rows[0] if known.rows else 0, channels),
+        chroma=header.steps["chroma"],
+        model_bytes=header.model.length,
+        layers=tuple(layers),
+        cut_from=header.cut_from,
+    )
 
 
 def _decoded_channels(path: Path, header: GridHeader) -> Channels:
@@ -92,31 +93,24 @@ def _decoded_channels(path: Path, header: GridHeader) -> Channels:
     return Channels.of(taken, rows.tolist())
 
 
-def _fgs_record(
+def _fgs_result(
     path: Path, header: Header | GridHeader, version: int, sh_count: int, channels: dict[str, dict[str, Any]]
-) -> dict[str, Any]:
+) -> InfoResult:
     """What files of both versions tell."""
-    size = os.stat(path).st_size
     settings = dict(header.settings)
     count, degree = settings.get("source_count"), settings.get("source_sh_degree")
     known = isinstance(count, int) and isinstance(degree, int) and 0 <= degree <= 4
     ply = count * inria_dtype(degree).itemsize if known and count is not None and degree is not None else None
-    return {
-        "program": f"flexgs-edge {__version__}",
-        "command": "info",
-        "path": os.fspath(path),
-        "format": "fgs",
-        "version": version,
-        "size": size,
-        "count": header.count,
-        "sh_count": sh_count,
-        "sh_degree": header.sh_degree,
-        "origin": list(header.origin),
-        "bits_per_gaussian": round(8 * size / header.count, 3) if header.count else None,
-        "source_ply_bytes": ply,
-        "ratio": round(ply / size, 4) if ply else None,
-        "channels": channels,
-        "overhead_bytes": size - sum(channel["bytes"] for channel in channels.values()),
-        "settings": settings,
-        "notes": [],
-    }
+    return InfoResult(
+        path=os.fspath(path),
+        format="fgs",
+        size=os.stat(path).st_size,
+        count=header.count,
+        sh_count=sh_count,
+        sh_degree=header.sh_degree,
+        origin=tuple(header.origin),
+        source_ply_bytes=ply,
+        version=version,
+        channels=channels,
+        settings=settings,
+    )

@@ -23,13 +23,13 @@ LOG = logging.getLogger("flexgs_edge")
 
 
 @dataclass(frozen=True)
-class Scene:
+class CheckedScene:
     """A checked scene and what its file says about drawing it.
 
     Parameters
     ----------
-    path : Path
-        As given.
+    path : Path or None
+        As given; `None` for a scene from memory, beside which nothing lies.
     source : SceneSource
         Finite, not empty.
     input_count : int
@@ -38,7 +38,7 @@ class Scene:
         Of a `.fgs`; of other files what they say about drawing (`antialiased` in a `.spz`), mostly nothing.
     """
 
-    path: Path
+    path: Path | None
     source: SceneSource
     input_count: int
     settings: dict[str, Any]
@@ -54,19 +54,30 @@ class Scene:
         return self.ply_bytes - 12 * self.input_count
 
 
-def read_scene(path: str | Path, drop_invalid: bool = False) -> SceneSource:
+ScenePlace = str | os.PathLike[str] | CheckedScene
+"""Where a scene is: a file, a model folder, or one that is open already."""
+
+
+def read_scene(path: str | os.PathLike[str], drop_invalid: bool = False) -> SceneSource:
     """A checked scene from a scene file or a model folder: finite values, at least one Gaussian; read lazily."""
     return load_scene(path, drop_invalid).source
 
 
-def load_scene(path: str | Path, drop_invalid: bool = False) -> Scene:
-    """Open a scene and check every value of it once (raises `InputError` for what cannot be used)."""
-    opened = open_scene(path)
+def load_scene(path: ScenePlace, drop_invalid: bool = False) -> CheckedScene:
+    """Open a scene and check every value of it once (raises `InputError` for what cannot be used).
+
+    A scene that is open already is handed back.
+    """
+    return path if isinstance(path, CheckedScene) else checked_scene(open_scene(path), Path(path), drop_invalid)
+
+
+def checked_scene(opened: SceneSource, path: Path | None = None, drop_invalid: bool = False) -> CheckedScene:
+    """Check every value of a scene once."""
     settings = dict(getattr(opened, "settings", {}))
-    return Scene(Path(path), check_scene(opened, drop_invalid), opened.count, settings)
+    return CheckedScene(path, check_scene(opened, drop_invalid), opened.count, settings)
 
 
-def resolve_drawing(options: Options, scene: Scene, companions: Companions) -> Options:
+def resolve_drawing(options: Options, scene: CheckedScene, companions: Companions) -> Options:
     """Options with all that drawing needs filled in: as given, else as the files say, else the defaults."""
     stored = scene.settings
     background = options.background
@@ -93,10 +104,10 @@ def _background(value: object, default: tuple[float, float, float]) -> tuple[flo
     return default
 
 
-def scene_info(scene: Scene) -> SceneInfo:
+def scene_info(scene: CheckedScene) -> SceneInfo:
     """The record of a scene."""
     return SceneInfo(
-        path=os.fspath(scene.path),
+        path=scene.source.name if scene.path is None else os.fspath(scene.path),
         count=scene.source.count,
         sh_degree=scene.source.sh_degree,
         ply_bytes=scene.ply_bytes,

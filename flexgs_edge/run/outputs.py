@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from flexgs_edge.errors import InputError
@@ -11,7 +12,7 @@ from flexgs_edge.io.formats import FORMATS, Format, format_of
 from flexgs_edge.run.options import CompressOptions
 
 
-def check_outputs(output: str | Path | None, options: CompressOptions) -> Path | None:
+def check_outputs(output: str | os.PathLike[str] | None, options: CompressOptions) -> Path | None:
     """The file to write (None in a dry run); raises `InputError` for what cannot be written."""
     if options.save_scores is not None:
         check_writable(options.save_scores, options.force)
@@ -31,7 +32,7 @@ FORMAT_BITS = ("bits", "groups")
 """Options that say what the format itself has settled."""
 
 
-def foreign_format(output: str | Path | None, options: CompressOptions) -> Format | None:
+def foreign_format(output: str | os.PathLike[str] | None, options: CompressOptions) -> Format | None:
     """The format that `-o` asks for, checked against the options before any work; None for `.fgs`."""
     format = None if output is None else format_of(output)
     if format is None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.target import Figure, Target
-from flexgs_edge.run.inputs import Scene
+from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.view_set import WITHOUT_VIEWS, ViewSet
 
@@ -30,7 +30,7 @@ class Plan:
     computes_scores: bool
 
     @classmethod
-    def make(cls, options: CompressOptions, scene: Scene, views: ViewSet | None) -> Plan:
+    def make(cls, options: CompressOptions, scene: CheckedScene, views: ViewSet | None) -> Plan:
         fixed = options.fixed
         needs_scores = fixed != EVERYTHING and options.method == "paper"
         computes = needs_scores and options.score in ("gs", "meson")

@@ -23,7 +23,7 @@ from flexgs_edge.report.pages import compress_page, evaluate_page
 from flexgs_edge.report.results import CompressResult, EvaluateResult
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.contents import contents
-from flexgs_edge.run.inputs import Scene
+from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.pictures import draw_shots, rig_of, shots_bytes
 from flexgs_edge.run.view_set import ViewSet
@@ -93,7 +93,7 @@ class Reporter:
     def read_contents(self, path: str | Path) -> None:
         """What the channels of a finished `.fgs` take (other formats have none that `info` knows)."""
         if Path(path).suffix.lower() == ".fgs":
-            self._contents = contents(Path(path))
+            self._contents = contents(Path(path)).to_json()
 
     def read_contents_of(self, write: Callable[[Path], object]) -> None:
         """The same in a dry run: `write` makes the file, which is gone afterwards."""
@@ -102,7 +102,7 @@ class Reporter:
             write(place)
             self.read_contents(place)
 
-    def see_cameras(self, views: ViewSet, scene: Scene) -> None:
+    def see_cameras(self, views: ViewSet, scene: CheckedScene) -> None:
         """Take down where the cameras stand."""
         self._rig = rig_of(views, scene.source)
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from flexgs_edge.cameras.auto import automatic_rig
 from flexgs_edge.cameras.camera import Camera, limit_width, split_views
@@ -18,6 +20,8 @@ from flexgs_edge.run.inputs import LOG
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOptions
 from flexgs_edge.scene.source import SceneSource
 
+MEMORY = "memory"
+"""Stands for a path where something came from memory."""
 WITHOUT_VIEWS = f"--cameras {NO_CAMERAS} leaves no views: leave it out for automatic ones, or give --cameras PATH"
 
 
@@ -54,38 +58,87 @@ class ViewSet:
         return [self.cameras[i] for i in indices]
 
 
+@dataclass(frozen=True)
+class GivenViews:
+    """Cameras and photos from memory, in place of files.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera, optional
+        Default: those that the options name, or that lie beside the scene.
+    images : sequence of np.ndarray, optional
+        [H, W, 3] or [H, W, 4] u8, one a camera, in the order of `cameras` (of cameras from a file: in order of name).
+    cameras_from : str
+        Where the cameras were read, where that is known: photos beside them are found then.
+    """
+
+    cameras: Sequence[Camera] | None = None
+    images: Sequence[np.ndarray] | None = None
+    cameras_from: str = MEMORY
+
+    def in_order_of_name(self) -> GivenViews:
+        """The same with cameras, and their photos, in order of name."""
+        cameras, images = self.cameras or (), self.images
+        if not cameras:
+            raise InputError("cameras: expected at least one camera, found none")
+        order = sorted(range(len(cameras)), key=lambda i: cameras[i].name)
+        for i, j in zip(order, order[1:]):
+            if cameras[i].name == cameras[j].name:
+                raise InputError(f"cameras: {i} and {j} are both called {cameras[i].name!r}; names must differ")
+        if images is not None and len(images) == len(order):  # another number is refused where they are opened
+            images = [images[i] for i in order]
+        return replace(self, cameras=[cameras[i] for i in order], images=images)
+
+
 def find_views(
-    options: ViewOptions, companions: Companions, source: SceneSource, with_photos: bool = True
+    options: ViewOptions,
+    companions: Companions,
+    source: SceneSource,
+    with_photos: bool = True,
+    given: GivenViews | None = None,
 ) -> ViewSet | None:
     """The views that the options or the files beside the scene give, else an automatic rig; `None` for `--cameras none`.
 
-    `options` must have its background filled in (photos with an alpha channel are put on it).
+    `options` must have its background filled in (photos with an alpha channel are put on it). What is `given` comes first.
     """
+    given = given or GivenViews()
     place = options.cameras or companions.cameras or AUTO_CAMERAS
-    if place in (NO_CAMERAS, AUTO_CAMERAS):
-        if options.images not in (None, NO_PHOTOS):
+    cameras: Sequence[Camera]
+    if given.cameras is not None:
+        given = given.in_order_of_name()
+        place, cameras = given.cameras_from, given.cameras or ()
+    elif place in (NO_CAMERAS, AUTO_CAMERAS):
+        if given.images is not None or options.images not in (None, NO_PHOTOS):
+            words = "images" if given.images is not None else f"--images {options.images}"
             raise InputError(
-                f"--images {options.images}: photos need the cameras that took them: give --cameras PATH "
+                f"{words}: photos need the cameras that took them: give --cameras PATH "
                 "(INRIA's cameras.json, a transforms.json or a COLMAP model)"
             )
         return None if place == NO_CAMERAS else _automatic_views(options, source)
-    cameras = read_cameras(place, options.ignore_distortion)
-    images = _images(options, companions) if with_photos else None
+    else:
+        cameras = read_cameras(place, options.ignore_distortion)
+    arrays = given.images if with_photos else None
+    images = _images(options, companions, place) if with_photos and arrays is None else None
     bent = sum(camera.distortion is not None for camera in cameras)
     notes: tuple[str, ...] = ()
     if bent:
         notes = (f"lens distortion of {bent} cameras ignored: only their poses are used",)
         if options.images is None:
             images = None
+    background = options.background or (0.0, 0.0, 0.0)
     photos: Photos | None = None
-    if images is None:
+    if arrays is not None:
+        photos = Photos.of_arrays(arrays, cameras, background, options.resolution)
+        images = Path(MEMORY)
+    elif images is not None:
+        photos = Photos.open(images, cameras, background, options.resolution)
+    if photos is None:
         cameras, note = limit_width(cameras, options.resolution)
         notes += () if note is None else (note,)
     else:
-        photos = Photos.open(images, cameras, options.background or (0.0, 0.0, 0.0), options.resolution)
         cameras, notes = photos.cameras, notes + photos.notes
     train, held_out = split_views(len(cameras), options.holdout)
-    return ViewSet(cameras, photos, train, held_out, os.fspath(place), images, notes)
+    return ViewSet(list(cameras), photos, train, held_out, os.fspath(place), images, notes)
 
 
 def _automatic_views(options: ViewOptions, source: SceneSource) -> ViewSet:
@@ -96,14 +149,16 @@ def _automatic_views(options: ViewOptions, source: SceneSource) -> ViewSet:
     return ViewSet(cameras, None, train, held_out, AUTO_CAMERAS, None, (how,) if note is None else (how, note))
 
 
-def _images(options: ViewOptions, companions: Companions) -> Path | None:
+def _images(options: ViewOptions, companions: Companions, place: str | Path) -> Path | None:
     if options.images == NO_PHOTOS:
         return None
     if options.images is not None:
         return Path(options.images)
+    if place == MEMORY:
+        return None
     # Cameras from elsewhere need not be the ones that the photos beside the scene belong to.
-    given, beside = options.cameras, companions.cameras
-    if given is not None and beside is not None and Path(given).resolve() != beside.resolve():
+    beside = companions.cameras
+    if beside is not None and Path(place).resolve() != beside.resolve():
         return None
     return companions.images
 

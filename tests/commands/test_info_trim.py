@@ -14,9 +14,9 @@ from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v2.channels import Channels
 from flexgs_edge.codec.v2.container import channel_bytes, write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
-from flexgs_edge.commands.info import info, info_text
-from flexgs_edge.commands.trim import trim, trim_text
-from flexgs_edge.commands.verify import verify, verify_json, verify_text
+from flexgs_edge.commands.info import info
+from flexgs_edge.commands.trim import trim
+from flexgs_edge.commands.verify import verify
 from flexgs_edge.errors import FormatError, InputError, TargetError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import from_grid
@@ -42,7 +42,7 @@ def run(*arguments: object) -> int:
 
 def test_info_of_version_2_shares_every_byte_out(tmp_path: Path) -> None:
     path, grid = written(tmp_path)
-    found = json.loads(json.dumps(info(path), allow_nan=False))
+    found = json.loads(json.dumps(info(path).to_json(), allow_nan=False))
     assert (found["version"], found["count"], found["sh_count"]) == (2, 900, grid.sh_count)
     assert found["size"] == path.stat().st_size
     channels = found["channels"]
@@ -64,7 +64,9 @@ def test_info_of_version_2_shares_every_byte_out(tmp_path: Path) -> None:
     assert found["cut_from"] is None and found["chroma"] == grid.steps.chroma
     assert [layer["rows"] for layer in found["layers"]] == np.bincount(grid.layer).tolist()
     chunks = sum(
-        section.length for section in verify(path) if section.name.startswith("chunk ") and "table" not in section.name
+        section.length
+        for section in verify(path).sections
+        if section.name.startswith("chunk ") and "table" not in section.name
     )
     assert sum(layer["bytes"] for layer in found["layers"]) == chunks
     assert found["ratio"] == pytest.approx(4000 * 4 * (3 + 3 + 3 + 24 + 1 + 3 + 4) / found["size"], rel=1e-3)
@@ -73,11 +75,11 @@ def test_info_of_version_2_shares_every_byte_out(tmp_path: Path) -> None:
 def test_text_of_version_2_comes_from_the_record(tmp_path: Path) -> None:
     path, _ = written(tmp_path)
     found = info(path)
-    text = info_text(found)
+    text = found.summary()
     for word in ("fgs version 2", "sh degree", "bits a Gaussian", "layers:      3", "target: drop <= 1 dB", "chroma"):
         assert word in text
     rows = {line.split("  ")[0]: line.split() for line in text.splitlines()}
-    for name, channel in found["channels"].items():
+    for name, channel in found.channels.items():
         assert rows[name][-1] == str(channel["bytes"])
 
 
@@ -85,9 +87,9 @@ def test_text_of_version_2_comes_from_the_record(tmp_path: Path) -> None:
 def test_info_of_small_scenes(tmp_path: Path, count: int, degree: int) -> None:
     path, grid = written(tmp_path, count, degree, layers=1)
     found = info(path)
-    assert found["count"] == count and found["sh_count"] == grid.sh_count
-    assert sum(channel["bytes"] for channel in found["channels"].values()) + found["overhead_bytes"] == found["size"]
-    assert "layers:" not in info_text(found) and "cut from:" not in info_text(found)
+    assert found.count == count and found.sh_count == grid.sh_count
+    assert sum(channel["bytes"] for channel in found.channels.values()) + found.overhead_bytes == found.size
+    assert "layers:" not in found.summary() and "cut from:" not in found.summary()
 
 
 def test_info_of_version_1_reads_the_header_only(tmp_path: Path) -> None:
@@ -97,20 +99,21 @@ def test_info_of_version_1_reads_the_header_only(tmp_path: Path) -> None:
     data[-100] ^= 1
     path.write_bytes(data)
     found = info(path)
-    assert found["version"] == 1 and "layers" not in found and found["channels"]["rest"]["bits"] == 4
-    assert "fgs version 1" in info_text(found)
+    assert found.version == 1 and "layers" not in found.to_json() and found.channels["rest"]["bits"] == 4
+    assert "fgs version 1" in found.summary()
 
 
 def test_verify_of_version_2_names_the_damaged_part(tmp_path: Path) -> None:
     path, _ = written(tmp_path)
-    sections = verify(path)
-    assert verify_json(path, sections)["ok"] and "every checksum holds" in verify_text(path, sections)
+    found = verify(path)
+    sections = found.sections
+    assert found.ok and found.to_json()["ok"] and "every checksum holds" in found.summary()
     assert sum(section.length for section in sections) == path.stat().st_size
     for damaged in sections[2:]:
         data = bytearray(path.read_bytes())
         data[damaged.offset + damaged.length // 2] ^= 4
         (tmp_path / "b.fgs").write_bytes(data)
-        bad = [section.name for section in verify(tmp_path / "b.fgs") if not section.ok]
+        bad = list(verify(tmp_path / "b.fgs").damaged)
         assert bad == ([damaged.name] if damaged.name != "chunk table" else ["chunks", "chunk table"])
 
 
@@ -118,16 +121,16 @@ def test_info_decodes_files_that_were_cut_alone(tmp_path: Path) -> None:
     path, _ = written(tmp_path)
     told = info(path)
     cut = tmp_path / "cut.fgs"
-    trim(path, cut, told["layers"][0]["bytes"] + told["overhead_bytes"] + 2000)
+    trim(path, cut, told.layers[0]["bytes"] + told.overhead_bytes + 2000)
     assert read_header(cut).channels is None
-    assert info(cut)["channels"]["position"]["bytes"] < told["channels"]["position"]["bytes"]
+    assert info(cut).channels["position"]["bytes"] < told.channels["position"]["bytes"]
     # A chunk that nobody looks at may be damaged: verify finds it, and so does info where it has to decode.
     data = bytearray(path.read_bytes())
-    data[verify(path)[3].offset] ^= 4
+    data[verify(path).sections[3].offset] ^= 4
     path.write_bytes(data)
     assert info(path) == told
     data = bytearray(cut.read_bytes())
-    data[verify(cut)[3].offset] ^= 4
+    data[verify(cut).sections[3].offset] ^= 4
     cut.write_bytes(data)
     with pytest.raises(FormatError, match="checksum"):
         info(cut)
@@ -141,25 +144,25 @@ def test_the_header_agrees_with_the_symbols(tmp_path: Path) -> None:
 
 def test_trim_keeps_whole_layers(tmp_path: Path) -> None:
     path, grid = written(tmp_path)
-    first, second, _ = info(path)["layers"]
+    first, second, _ = info(path).layers
     most = path.stat().st_size
     sizes = []
     for layers in (3, 2, 1):
         out = tmp_path / f"{layers}.fgs"
         found = trim(path, out, most)
-        assert (found["layers"], found["size"]) == (layers, out.stat().st_size) and found["size"] <= most
-        assert f"kept  {layers} of 3 layers, {found['count']} of 900" in trim_text(found)
+        assert (found.layers, found.size) == (layers, out.stat().st_size) and found.size <= most
+        assert f"kept  {layers} of 3 layers, {found.count} of 900" in found.summary()
         source = open_scene(out)
         expected = from_grid(grid.take(grid.layer < layers), fields=("means", "sh_dc"))
         got = source.read(slice(0, source.count), ["means", "sh_dc"])
         for name, plane in expected.items():
             np.testing.assert_array_equal(got[name], plane)
-        sizes.append(found["size"])
-        most = found["size"] - 1
+        sizes.append(found.size)
+        most = found.size - 1
     assert path.read_bytes() == (tmp_path / "3.fgs").read_bytes()
     cut = info(tmp_path / "1.fgs")
-    assert cut["cut_from"] == {"bytes": path.stat().st_size, "count": 900, "layers": 3}
-    assert f"cut from:    {path.stat().st_size} bytes, 900 Gaussians in 3 layers" in info_text(cut)
+    assert cut.cut_from == {"bytes": path.stat().st_size, "count": 900, "layers": 3}
+    assert f"cut from:    {path.stat().st_size} bytes, 900 Gaussians in 3 layers" in cut.summary()
     # A cut file that is cut again remembers the first one.
     trim(tmp_path / "2.fgs", tmp_path / "again.fgs", sizes[1] - 1)
     assert (tmp_path / "again.fgs").read_bytes() == (tmp_path / "1.fgs").read_bytes()
@@ -191,9 +194,7 @@ def test_trim_refuses(tmp_path: Path) -> None:
 
 def test_trim_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, _ = written(tmp_path)
-    least = trim(path, tmp_path / "least.fgs", info(path)["layers"][0]["bytes"] + info(path)["overhead_bytes"] + 64)[
-        "size"
-    ]
+    least = trim(path, tmp_path / "least.fgs", info(path).layers[0]["bytes"] + info(path).overhead_bytes + 64).size
     assert run("trim", path, "-o", tmp_path / "b.fgs", "--max-size", least, "--json", "-", "-q") == 0
     out = capsys.readouterr()
     record = json.loads(out.out)

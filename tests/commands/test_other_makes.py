@@ -13,7 +13,7 @@ from PIL import Image
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.decompress import ANTIALIASED_NOTE, decompress
 from flexgs_edge.commands.evaluate import evaluate
-from flexgs_edge.commands.info import info, info_text
+from flexgs_edge.commands.info import info
 from flexgs_edge.commands.render import render_views
 from flexgs_edge.commands.score import score_gaussians
 from flexgs_edge.errors import FormatError
@@ -58,14 +58,14 @@ def test_every_sh_degree_through_the_whole_pipeline(tmp_path: Path, method: str,
     assert result.reached and result.size == file.stat().st_size and result.quality is not None
 
     found = info(file)
-    assert (found["settings"]["background"], found["settings"]["antialiased"]) == (WHITE, True)
-    assert found["settings"]["source_sh_degree"] == degree and found["sh_degree"] <= degree
-    assert "antialiased: True" in info_text(found)
+    assert (found.settings["background"], found.settings["antialiased"]) == (WHITE, True)
+    assert found.settings["source_sh_degree"] == degree and found.sh_degree <= degree
+    assert "antialiased: True" in found.summary()
     if degree == 0 or (zeros and method == "paper"):
-        assert found["sh_count"] == found["sh_degree"] == 0
+        assert found.sh_count == found.sh_degree == 0
 
     assert ANTIALIASED_NOTE in decompress(file, plain).notes
-    assert (PlySource(plain).count, PlySource(plain).sh_degree) == (result.count, found["sh_degree"])
+    assert (PlySource(plain).count, PlySource(plain).sh_degree) == (result.count, found.sh_degree)
     # Neither the .fgs nor its PLY has a cfg_args beside it: the one says how it is drawn, the other's original does.
     bare = tmp_path / "model" / "point_cloud" / "iteration_30000" / "point_cloud.ply"
     for judged, against in ((file, bare), (plain, model)):
@@ -115,10 +115,10 @@ def test_scores_are_those_of_the_way_of_drawing(model: Path, tmp_path: Path) -> 
 
 
 def test_info_says_that_a_model_is_antialiased(model: Path, tmp_path: Path) -> None:
-    assert "antialiased: yes" in info_text(info(model))
+    assert "antialiased: yes" in info(model).summary()
     (tmp_path / "cfg_args").write_text("Namespace(antialiasing='yes')")
     shutil.copy(model / "point_cloud" / "iteration_30000" / "point_cloud.ply", tmp_path / "a.ply")
-    assert info(tmp_path / "a.ply")["antialiased"] is None
+    assert info(tmp_path / "a.ply").antialiased is None
     (tmp_path / "cfg_args").write_text("antialiasing=True")
     with pytest.raises(FormatError, match="cfg_args"):
         info(tmp_path / "a.ply")
@@ -146,6 +146,6 @@ def test_the_3d_filter_of_mip_splatting(tmp_path: Path) -> None:
     np.testing.assert_allclose(read["log_scales"][:, 7], plain["log_scales"][:, 7], rtol=1e-6)
     assert all(np.array_equal(read[name], plain[name]) for name in ("means", "quats", "sh_dc", "sh_rest"))
     assert scene.settings == {"antialiased": True} and "filter_3D applied" in scene.source.notes[0]
-    assert "antialiased: yes" in info_text(info(tmp_path / "mip.ply"))
+    assert "antialiased: yes" in info(tmp_path / "mip.ply").summary()
     picked = scene.source.select(np.array([3, 40])).read(slice(0, 2), ["opacity_logits"])["opacity_logits"]
     assert np.array_equal(picked, read["opacity_logits"][:, [3, 40]])

@@ -13,7 +13,7 @@ import pytest
 import flexgs_edge.commands.synth as synth_module
 from camera_files import write_inria, write_transforms
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.commands.synth import synth, synth_text, tile_shifts, tiled_cameras
+from flexgs_edge.commands.synth import synth, tile_shifts, tiled_cameras
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.io.ply import PlySource, write_ply
 from flexgs_edge.kernels.open_backend import open_backend
@@ -190,17 +190,17 @@ def test_a_scene_and_its_cameras(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out" / "big.ply"
     found = synth(out, scene, 1000)
     made = PlySource(out)
-    assert made.count == found["count"] == 1000 and out.stat().st_size == found["size"]
-    assert (found["tiles"], found["parts"], found["views"]) == (1, [3, 4], 3)
+    assert made.count == found.count == 1000 and out.stat().st_size == found.size
+    assert (found.tiles, found.parts, found.views) == (1, (3, 4), 3)
     before, after = read_cameras(scene.parent), read_cameras(out.parent)
     for one, other in zip(before, after, strict=True):
         assert one.name == other.name and (one.width, one.fx, one.fy) == (other.width, other.fx, other.fy)
         assert np.allclose(one.center, other.center) and np.allclose(one.rotation, other.rotation)
-    text = synth_text(found)
+    text = found.summary()
     assert "1000 Gaussians" in text and "3 or 4 parts" in text and "3 views" in text
     many = 300 * MOST_PARTS * 4 - 5
     found = synth(out, scene, many, force=True)
-    assert found["tiles"] == 4 and PlySource(out).count == many and "in 4 copies side by side" in synth_text(found)
+    assert found.tiles == 4 and PlySource(out).count == many and "in 4 copies side by side" in found.summary()
     assert len(read_cameras(out.parent)) == 4
 
 
@@ -221,16 +221,16 @@ def test_the_memory_limit_does_not_show_in_the_bytes(
 def test_a_scene_without_cameras_gets_none(scene: Path, tmp_path: Path) -> None:
     (scene.parent / "cameras.json").unlink()
     found = synth(tmp_path / "out" / "big.ply", scene, 600)
-    assert found["cameras"] is None and [path.name for path in (tmp_path / "out").iterdir()] == ["big.ply"]
-    assert "views" not in synth_text(found)
+    assert found.cameras is None and [path.name for path in (tmp_path / "out").iterdir()] == ["big.ply"]
+    assert "views" not in found.summary()
 
 
 def test_what_the_cameras_lose_is_said(scene: Path, tmp_path: Path) -> None:
     (scene.parent / "cameras.json").unlink()
     write_transforms(scene.parent / "transforms.json", [make_camera(name="a.png", centre=(10.0, 14.5))], k1=0.1)
     found = synth(tmp_path / "out" / "big.ply", scene, 600)
-    assert found["views"] == 1
-    assert "lens distortion left out" in synth_text(found) and "up to 9.5 pixels off the middle" in synth_text(found)
+    assert found.views == 1
+    assert "lens distortion left out" in found.summary() and "up to 9.5 pixels off the middle" in found.summary()
 
 
 def test_errors(scene: Path, tmp_path: Path) -> None:

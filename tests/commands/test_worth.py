@@ -18,7 +18,7 @@ from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
 from flexgs_edge.commands.reduced import DROPPED, ONE_LESS, reduced_scenes
-from flexgs_edge.commands.worth import worth, worth_text
+from flexgs_edge.commands.worth import worth
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
@@ -51,7 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(folder: Path) -> dict[str, dict[str, Any]]:
-    return {name: worth(folder / name, **VIEWS) for name in ("1.fgs", "2.fgs")}
+    return {name: worth(folder / name, **VIEWS).to_json() for name in ("1.fgs", "2.fgs")}
 
 
 def read(source: SceneSource) -> dict[str, np.ndarray]:
@@ -131,9 +131,10 @@ def test_on_the_command_line(
     assert run(*command, "--picture", tmp_path / "a.svg", "--json", tmp_path / "a.json") == 0
     record = json.loads((tmp_path / "a.json").read_text())
     text = capsys.readouterr().out
-    assert text.endswith(worth_text(record)) and "on 1 held-out view of" in text
+    assert text == worth(folder / "1.fgs", **VIEWS).summary() and "on 1 held-out view of" in text
     assert record == json.loads(json.dumps(found["1.fgs"]))
-    assert {name: record[name] for name in info(folder / "1.fgs")} == json.loads(json.dumps(info(folder / "1.fgs")))
+    plain = json.loads(json.dumps(info(folder / "1.fgs").to_json()))
+    assert {name: record[name] for name in plain} == plain
     assert b"<svg" in (tmp_path / "a.svg").read_bytes()
     for wrong, words in (
         (["--picture", tmp_path / "a.gif"], ".png or .svg"),

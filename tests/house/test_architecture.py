@@ -53,6 +53,7 @@ def copy(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("layers", "errors.py", "import flexgs_edge.cli"),
         ("layers", "scene/fields.py", "from flexgs_edge.cameras.camera import Camera"),
         ("layers", "kernels/cl_sources.py", "from flexgs_edge.render import renderer"),
+        ("layers", "commands/trim.py", "import flexgs_edge.api.fgs_file"),
         ("layers", "attic.py", "A_MODULE = 'that nobody gave a floor'"),
         ("methods", "methods/best/keep.py", "import flexgs_edge.methods.paper.scores"),
         ("codec", "codec/v1/header.py", "import flexgs_edge.codec.v2.header"),

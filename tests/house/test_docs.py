@@ -78,7 +78,7 @@ def test_links_and_anchors_lead_somewhere(repository: Path) -> None:
 def test_paths_that_pages_name_exist(repository: Path) -> None:
     roots = (
         repository,
-        *(repository / name for name in ("flexgs_edge", "benchmarks", "cl_kernels", "tests", "deploy")),
+        *(repository / name for name in ("flexgs_edge", "benchmarks", "cl_kernels", "tests", "deploy", "docs")),
     )
     known = {path.name for root in roots[1:] for path in root.rglob("*.*")}
     missing = set()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -52,7 +54,9 @@ def kernel_files(repository: Path) -> set[str]:
 
 
 def python_files(repository: Path) -> set[str]:
-    return {str(path.relative_to(repository)) for path in (repository / "flexgs_edge").rglob("*.py")}
+    """Modules, the stub of the face, and the mark that says that types are shipped."""
+    modules = {str(path.relative_to(repository)) for path in (repository / "flexgs_edge").rglob("*.py")}
+    return modules | {"flexgs_edge/__init__.pyi", "flexgs_edge/py.typed"}
 
 
 def template_files(repository: Path) -> set[str]:
@@ -138,6 +142,61 @@ def test_an_installed_wheel_finds_its_kernels_and_templates(
     assert set(files) == {name for name in kernel_files(repository) if name.endswith(".cl")}
     found = run_in(tmp_path, FIND_TEMPLATES, PYTHONPATH=str(target))
     assert found == sorted(Path(name).name for name in template_files(repository))
+
+
+USERS_SCRIPT = """
+import numpy as np
+from numpy.typing import NDArray
+
+import flexgs_edge
+
+cameras = flexgs_edge.Cameras.open("cameras.json")
+photos: list[NDArray[np.uint8]] = [np.zeros((camera.height, camera.width, 3), np.uint8) for camera in cameras]
+scene = flexgs_edge.Scene.from_arrays(**flexgs_edge.Scene.open("point_cloud.ply").arrays())
+data, result = flexgs_edge.encode(scene, cameras=cameras, images=photos, max_drop=0.5, effort="fast")
+size: int = result.size if result.reached else 0
+image: NDArray[np.float32] = flexgs_edge.decode(data).render(cameras[0], background=(1.0, 1.0, 1.0))
+layers: list[int] = [layer.bytes for layer in flexgs_edge.open("scene.fgs").layers]
+"""
+WRONG_SCRIPT = """
+import flexgs_edge
+
+flexgs_edge.compress("point_cloud.ply", "scene.fgs", max_dorp=0.5)
+flexgs_edge.Scene.open("point_cloud.ply").cuont
+"""
+
+
+@pytest.mark.parametrize("checker", ["mypy", "pyright"])
+def test_a_users_script_type_checks(checker: str, archives: tuple[Path, Path], tmp_path: Path) -> None:
+    """Against the installed wheel: the stub, its types and its mark are there."""
+    pytest.importorskip(checker, reason=f"{checker} is not installed")
+    if checker == "pyright" and shutil.which("node") is None:
+        pytest.skip("pyright needs Node.js")
+    site, empty = tmp_path / "site", tmp_path / "empty"
+    zipfile.ZipFile(archives[1]).extractall(site)
+    empty.mkdir()
+    (tmp_path / "right.py").write_text(USERS_SCRIPT)
+    (tmp_path / "wrong.py").write_text(WRONG_SCRIPT)
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps({"extraPaths": [str(site)]}))
+    arguments = ["--strict", "--cache-dir", str(empty)] if checker == "mypy" else ["--pythonpath", sys.executable]
+    variables = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+
+    def check(script: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", checker, *arguments, script],
+            cwd=tmp_path,
+            env={**variables, "PYTHONPATH": str(site)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    found = check("right.py")
+    if checker == "pyright" and "npm" in found.stderr:
+        pytest.skip("pyright could not be fetched")
+    assert found.returncode == 0, found.stdout + found.stderr
+    found = check("wrong.py")
+    assert found.returncode == 1 and "max_dorp" in found.stdout and "cuont" in found.stdout, found.stdout + found.stderr
 
 
 def test_an_editable_install_finds_the_kernels_of_the_checkout(repository: Path, tmp_path: Path) -> None:

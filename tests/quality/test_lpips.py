@@ -18,7 +18,6 @@ from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import Progress, T
 from flexgs_edge.quality.lpips import BACKBONE, LPIPS_SIDE, Lpips
-from flexgs_edge.report.summary import evaluate_text
 from tiny_project import make_project, write_photos
 
 TORCH = """
@@ -173,13 +172,13 @@ def test_evaluate_reports_every_pair(fake: Path, tmp_path: Path, photos: bool) -
     for key in ("lpips_fidelity", "lpips", "original_lpips"):
         values = [view[key] for view in record["views"]]
         assert record[key] == (None if values[0] is None else pytest.approx(sum(values) / 2, abs=2e-5))
-    text = evaluate_text(result)
+    text = result.summary()
     assert ("LPIPS to ref." in text) and f"LPIPS {record['lpips_fidelity']:.3f}" in text
     assert ("->" in text.split("LPIPS", 1)[1].split("\n")[0]) == photos
     # Not asked for: not measured, not mentioned.
     plain = evaluate(second, first, **options)
     assert len(calls()) == len(pairs) and plain.to_json()["quality"]["lpips_fidelity"] is None
-    assert "LPIPS" not in evaluate_text(plain)
+    assert "LPIPS" not in plain.summary()
 
 
 class Undrawn(Progress):

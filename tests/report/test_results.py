@@ -8,9 +8,9 @@ import pytest
 
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.as_json import quality_json
-from flexgs_edge.report.results import EvaluateResult, RenderResult
+from flexgs_edge.report.file_results import RenderResult
+from flexgs_edge.report.results import EvaluateResult
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
-from flexgs_edge.report.summary import evaluate_text, render_text
 
 RUN = RunInfo(1.25, {"open": 0.25, "device": 0.5}, 0.5, 0.125, 2**30, 2**28, {"backend": "numpy", "numpy": "2"})
 SCENE = SceneInfo("a.ply", 10, 3, 2480, 2360, ("2 of 12 Gaussians left out as invalid",))
@@ -28,7 +28,7 @@ def test_identical_and_missing_figures_are_null() -> None:
 
 def test_evaluate_text_has_a_row_a_view_and_says_identical() -> None:
     quality = Quality((ViewQuality("a", 0.0, 1e-3, 1e-3), ViewQuality("b", 1e-4, 2e-3, 1e-3)))
-    text = evaluate_text(EvaluateResult(SCENE, SCENE, VIEWS, quality, "held-out", RUN))
+    text = EvaluateResult(SCENE, SCENE, VIEWS, quality, "held-out", RUN).summary()
     rows = [line.split() for line in text.splitlines()]
     assert ["a", "identical", "-", "0.000", "30.000", "30.000", "-", "-"] in rows
     assert ["b", "40.000", "-", "3.010", "26.990", "30.000", "-", "-"] in rows
@@ -43,7 +43,7 @@ def test_evaluate_text_has_a_row_a_view_and_says_identical() -> None:
 
 
 def test_without_photos_no_drop_is_claimed() -> None:
-    text = evaluate_text(EvaluateResult(SCENE, SCENE, VIEWS, Quality((ViewQuality("b", 1e-4),)), "training", RUN))
+    text = EvaluateResult(SCENE, SCENE, VIEWS, Quality((ViewQuality("b", 1e-4),)), "training", RUN).summary()
     assert "against the photos" not in text and "modelled drop" in text and "worst view:  b: fidelity 40.000 dB" in text
 
 
@@ -55,4 +55,4 @@ def test_time_of_a_view_is_the_median_without_start_up(seconds: tuple[float, ...
     record = result.to_json()
     assert record["ms_per_view"] == pytest.approx(median)
     assert (record["startup_ms"], record["compile_ms"], record["warm_up_ms"]) == (500.0, 125.0, 9000.0)
-    assert f"{median:.1f} ms a view" in render_text(result) and "NumPy twins" in render_text(result)
+    assert f"{median:.1f} ms a view" in result.summary() and "NumPy twins" in result.summary()

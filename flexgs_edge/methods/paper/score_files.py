@@ -27,20 +27,23 @@ def load_scores(path: str | Path, count: int) -> np.ndarray:
         The message names what was found.
     """
     path = Path(path)
+    names: list[str] | None = None
     try:
         # We open the file, because np.load would leave a broken archive open.
         with open(path, "rb") as file:
             loaded = np.load(file, allow_pickle=False)
             if isinstance(loaded, np.lib.npyio.NpzFile):
                 with loaded as archive:
-                    if len(archive.files) != 1:
-                        names = ", ".join(archive.files)
-                        raise InputError(f"{path}: expected one array, found {len(archive.files)}: {names}")
-                    loaded = archive[archive.files[0]]
+                    names = archive.files
+                    if len(names) == 1:
+                        loaded = archive[names[0]]
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such score file (.npy or .npz)") from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: not a NumPy file of scores: {error}") from error
+    # Outside the `try`: an InputError is a ValueError too.
+    if names is not None and len(names) != 1:
+        raise InputError(f"{path}: expected one array, found {len(names)}: {', '.join(names)}")
     if loaded.shape != (count,) or loaded.dtype.kind not in "fiu":
         raise InputError(
             f"{path}: expected {count} numbers, one a Gaussian of the scene; found shape {loaded.shape}, dtype {loaded.dtype}"

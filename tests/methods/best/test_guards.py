@@ -26,7 +26,6 @@ from flexgs_edge.quality.psnr import psnr
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.report.summary import compress_text
 from flexgs_edge.run.doubts import FIT_GAP, FIT_STEP, FIT_VIEWS, NEEDED_VIEWS, TrainingPoses, doubts
 from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.open_scene import open_scene
@@ -269,7 +268,7 @@ def test_doubts_are_told(project: Path, plain: CompressResult) -> None:
     assert plain.to_json()["warnings"] == [fitted, few]
     page = (project.parent / "page" / "index.html").read_text()
     for words in (fitted, few):
-        assert f"warning:     {words}" in compress_text(plain) and words in page
+        assert f"warning:     {words}" in plain.summary() and words in page
 
 
 def test_fidelity_on_training_poses(project: Path, plain: CompressResult) -> None:

@@ -27,7 +27,6 @@ from flexgs_edge.methods.best.grid_coder import SETTINGS_MOST, GridCoder, bit_mo
 from flexgs_edge.methods.best.method import alive
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.report.summary import compress_text
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
@@ -83,8 +82,8 @@ def test_the_sample_reads_back(sample: tuple[Path, CompressResult]) -> None:
     assert result.steps is not None and result.steps == source.container.header.steps
     assert source.settings["method"] == "best" and source.settings["reached"] is True
     found = info(path)
-    assert (found["count"], found["sh_count"], found["size"]) == (result.count, result.sh_count, result.size)
-    assert sum(channel["bytes"] for channel in found["channels"].values()) + found["overhead_bytes"] == result.size
+    assert (found.count, found.sh_count, found.size) == (result.count, result.sh_count, result.size)
+    assert sum(channel["bytes"] for channel in found.channels.values()) + found.overhead_bytes == result.size
 
 
 def test_same_command_same_bytes_whatever_the_memory(
@@ -118,7 +117,7 @@ def test_the_tiny_scene_holds_its_drop(project: Path, tiny: tuple[Path, Compress
     record = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert record["method"] == "best" and record["score"] is None and record["steps"]["position"] > 0
     assert record["search"] and all(step["phase"] == "multiplier" for step in record["search"])
-    text = compress_text(result)
+    text = result.summary()
     assert f"{result.size} bytes" in text and "drop" in text
 
 
@@ -144,7 +143,7 @@ def test_size_targets_are_respected(project: Path, tmp_path: Path) -> None:
 
 def test_the_closest_point_is_written_when_asked(project: Path, tmp_path: Path) -> None:
     closest = compress(project / "point_cloud.ply", tmp_path / "c.fgs", max_size=300, best_effort=True, **TINY)
-    assert closest.reached is False and closest.size > 300 and info(tmp_path / "c.fgs")["settings"]["reached"] is False
+    assert closest.reached is False and closest.size > 300 and info(tmp_path / "c.fgs").settings["reached"] is False
 
 
 def test_fidelity_and_modelled_drop_decide_without_photos(project: Path, tmp_path: Path) -> None:
@@ -258,7 +257,7 @@ def test_layers_are_the_same_scene_and_worth_most_first(project: Path, tmp_path:
     layered = compress(project / "point_cloud.ply", tmp_path / "layered.fgs", layers=3, **words)
     assert plain.quality is not None and layered.quality is not None
     assert plain.count == layered.count and abs(plain.quality.fidelity - layered.quality.fidelity) < 1e-3  # type: ignore[operator]
-    rows = [layer["rows"] for layer in info(tmp_path / "layered.fgs")["layers"]]
+    rows = [layer["rows"] for layer in info(tmp_path / "layered.fgs").layers]
     assert len(rows) == 3 and all(rows)
     trim(tmp_path / "layered.fgs", tmp_path / "half.fgs", layered.size - 1)
     half = open_scene(tmp_path / "half.fgs")

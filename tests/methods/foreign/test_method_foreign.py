@@ -24,7 +24,6 @@ from flexgs_edge.io.spz import SH_STEP, refine_sh, sh_codes
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.foreign.lower_sh import TrimmedSource
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.report.summary import compress_text
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
@@ -81,9 +80,9 @@ def test_the_record_says_what_was_written(done: tuple[Path, CompressResult]) -> 
     record = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert record["format"] == path.name[2:] and record["bits"] == {} and record["steps"] is None
     assert record["search"] and all(step["phase"] in ("line", "multiplier") for step in record["search"])
-    text = compress_text(result)
+    text = result.summary()
     assert f"{result.size} bytes" in text and f".{record['format']}, SH degree {result.file_sh_degree}" in text
-    assert info(path)["format"] == record["format"] and info(path)["count"] == result.count
+    assert info(path).format == record["format"] and info(path).count == result.count
 
 
 def test_same_command_same_bytes(project: Path, done: tuple[Path, CompressResult], tmp_path: Path) -> None:
@@ -111,7 +110,7 @@ def test_out_of_reach(project: Path, tmp_path: Path) -> None:
         compress(project / "point_cloud.ply", tmp_path / "a.spz", **words)
     assert list(tmp_path.iterdir()) == []
     closest = compress(project / "point_cloud.ply", tmp_path / "a.spz", best_effort=True, **words)
-    assert closest.reached is False and closest.count == COUNT and "NOT reached" in compress_text(closest)
+    assert closest.reached is False and closest.count == COUNT and "NOT reached" in closest.summary()
 
 
 def test_without_writing(project: Path, tmp_path: Path, own_temporary_folder: Path) -> None:

@@ -16,7 +16,6 @@ from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.io.ply import PlySource, write_ply
-from flexgs_edge.report.summary import compress_text
 from flexgs_edge.run.fingerprint import fingerprint
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
@@ -41,7 +40,7 @@ def first(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the scores kept by a first run, and its file."""
     folder = tmp_path_factory.mktemp("first")
     result = run(project, folder)
-    assert not result.scores_reused and "made anew" in compress_text(result) and "score" in result.run.stages
+    assert not result.scores_reused and "made anew" in result.summary() and "score" in result.run.stages
     return folder
 
 
@@ -63,7 +62,7 @@ def test_the_second_run_scores_nothing_and_writes_the_same_bytes(copy: tuple[Pat
     kept = (folder / "s.npz").read_bytes()
     result = run(project, folder)
     assert result.scores_reused and "score" not in result.run.stages
-    assert f"reused from {folder / 's.npz'}" in compress_text(result)
+    assert f"reused from {folder / 's.npz'}" in result.summary()
     assert result.to_json()["scores_reused"] is True and result.to_json()["score_cache"] == str(folder / "s.npz")
     assert (folder / "a.fgs").read_bytes() == (first / "a.fgs").read_bytes()
     assert (folder / "s.npz").read_bytes() == kept

@@ -1,0 +1,127 @@
+"""Scenes to files and bytes, and back."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import weakref
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexgs_edge.api.cameras import Cameras
+from flexgs_edge.api.scene import Scene
+from flexgs_edge.api.words import CompressWords, StrPath
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.codec.open_fgs import open_fgs
+from flexgs_edge.commands import compress as command
+from flexgs_edge.errors import InputError
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.report.results import CompressResult
+from flexgs_edge.run.inputs import checked_scene
+from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.view_set import MEMORY, GivenViews
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+def compress(
+    scene: Scene | StrPath,
+    output: StrPath | None,
+    options: CompressOptions | None = None,
+    progress: Progress = SILENT,
+    *,
+    cameras: Sequence[Camera] | StrPath | None = None,
+    images: StrPath | Sequence[NDArray[np.uint8]] | None = None,
+    **words: Unpack[CompressWords],
+) -> CompressResult:
+    """Compress a scene to the fewest bytes that hold a target.
+
+    Parameters
+    ----------
+    scene : Scene or path
+        A scene, a scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`), or INRIA's model folder.
+    output : path or None
+        The `.fgs`, `.spz`, `.sog` or `.compressed.ply` to write (None, for a `.fgs`, only in a dry run).
+    options : CompressOptions, optional
+        What the command line would say.
+    progress : Progress, optional
+        Bars on long work.
+    cameras : Cameras or path, optional
+        Cameras, a file of them, `auto` or `none`. Default: what lies beside the scene, else `auto`.
+    images : path or sequence of np.ndarray, optional
+        Folder of photos, `none`, or arrays [H, W, 3] (or 4, with alpha), one a camera in the order of `cameras`; of cameras
+        from a file in order of name. Default: the photos beside the scene, if its own cameras are used.
+    **words
+        Single options by the names of `CompressOptions`, such as `max_drop=0.5`.
+
+    Returns
+    -------
+    CompressResult
+        Sizes, quality of the decoded file, every step of the search, times.
+
+    Raises
+    ------
+    FlexGSError
+        `InputError`, `TargetError`, `DeviceError` or `BudgetError`; nothing is left behind then.
+    """
+    opened = scene.checked if isinstance(scene, Scene) else scene
+    named: dict[str, Any] = {}
+    given = GivenViews()
+    if isinstance(cameras, (str, os.PathLike)):
+        named["cameras"] = os.fspath(cameras)
+    elif cameras is not None:
+        path = cameras.path if isinstance(cameras, Cameras) else None
+        given = replace(given, cameras=cameras, cameras_from=path or MEMORY)
+    if isinstance(images, (str, os.PathLike)):
+        named["images"] = os.fspath(images)
+    elif images is not None:
+        given = replace(given, images=images)
+    return command.compress(opened, output, options, progress, given, **named, **words)
+
+
+def encode(
+    scene: Scene | StrPath,
+    options: CompressOptions | None = None,
+    progress: Progress = SILENT,
+    *,
+    cameras: Sequence[Camera] | StrPath | None = None,
+    images: StrPath | Sequence[NDArray[np.uint8]] | None = None,
+    **words: Unpack[CompressWords],
+) -> tuple[bytes, CompressResult]:
+    """`compress` to the bytes of a `.fgs`, the very ones that it writes; needs room for them where TMPDIR says."""
+    if words.get("dry_run") or (options is not None and options.dry_run):
+        raise InputError("dry_run: encode hands back what would be written; leave it out, or call compress")
+    with tempfile.TemporaryDirectory(prefix="flexgs-") as folder:
+        place = Path(folder) / "scene.fgs"
+        result = compress(scene, place, options, progress, cameras=cameras, images=images, **words)
+        return place.read_bytes(), replace(result, output=MEMORY)
+
+
+def decode(file: bytes | bytearray | memoryview | StrPath) -> Scene:
+    """The scene of a `.fgs`: its bytes, or a path. It is decoded when values are asked for.
+
+    Raises
+    ------
+    FormatError
+        When the bytes differ from the format.
+    """
+    if isinstance(file, (str, os.PathLike)):
+        return Scene(checked_scene(open_fgs(file), Path(file)))
+    # A container opens its file for each read, so the bytes lie in one as long as the source lives.
+    folder = tempfile.TemporaryDirectory(prefix="flexgs-")
+    try:
+        place = Path(folder.name) / "scene.fgs"
+        place.write_bytes(file)
+        source = open_fgs(place)
+        weakref.finalize(source, folder.cleanup)
+        source.name = MEMORY
+        return Scene(checked_scene(source))
+    except BaseException:
+        folder.cleanup()
+        raise

@@ -1,0 +1,221 @@
+"""A scene in Python: from a file or from arrays; read, written and drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexgs_edge.api.words import Arrays, Floats, Numbers, StrPath
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.commands.decompress import decompress
+from flexgs_edge.errors import InputError
+from flexgs_edge.io.ply import choose_origin, origin_rows
+from flexgs_edge.run.companions import companions_of
+from flexgs_edge.run.inputs import CheckedScene, checked_scene, load_scene
+from flexgs_edge.run.open_bench import open_bench
+from flexgs_edge.run.options import NO_CAMERAS, ViewOptions
+from flexgs_edge.run.run import open_run
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import REST_WIDTHS, MemorySource, Planes, SceneSource
+
+
+class Scene:
+    """N Gaussians, checked: finite values, at least one of them. Files are read when values are asked for.
+
+    Made by `Scene.open`, `Scene.from_arrays`, `decode` and `FgsFile`.
+
+    Parameters
+    ----------
+    checked : CheckedScene
+        The scene, and what its file says about drawing it.
+    """
+
+    def __init__(self, checked: CheckedScene) -> None:
+        self.checked = checked
+
+    @classmethod
+    def open(cls, path: StrPath, *, drop_invalid: bool = False) -> Scene:
+        """Open a scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`) or a model folder.
+
+        Parameters
+        ----------
+        path : path
+            Cameras and photos beside it are found by `compress`, as on the command line.
+        drop_invalid : bool
+            Leave out Gaussians with NaN, infinity or zero quaternions, instead of raising `InputError`.
+        """
+        return cls(load_scene(path, drop_invalid))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        *,
+        means: Numbers,
+        log_scales: Numbers,
+        quats: Numbers,
+        opacity_logits: Numbers,
+        sh_dc: Numbers,
+        sh_rest: Numbers | None = None,
+        antialiased: bool = False,
+        drop_invalid: bool = False,
+    ) -> Scene:
+        """A scene of the values that training stores, before exp, sigmoid and normalisation. They are copied.
+
+        Parameters
+        ----------
+        means : np.ndarray
+            [N, 3], world. All values become float32; of float64 positions far from zero no digits are lost.
+        log_scales : np.ndarray
+            [N, 3], natural logarithms of the standard deviations.
+        quats : np.ndarray
+            [N, 4], w x y z, any norm.
+        opacity_logits : np.ndarray
+            [N].
+        sh_dc : np.ndarray
+            [N, 3], SH of degree 0.
+        sh_rest : np.ndarray, optional
+            [N, K, 3], SH above degree 0: K is 3, 8, 15 or 24. Default: none.
+        antialiased : bool
+            The scene was trained with opacities compensated for the dilation.
+        drop_invalid : bool
+            See `open`.
+
+        Raises
+        ------
+        InputError
+            Naming the argument, what was expected and what was found.
+        """
+        first = np.asarray(means)
+        count = len(first) if first.ndim else 0
+        rest = np.zeros((count, 0, 3), np.float32) if sh_rest is None else np.asarray(sh_rest)
+        places = _array("means", first, count, (3,)).T
+        planes: Planes = {
+            "log_scales": _plane(_array("log_scales", log_scales, count, (3,)).T),
+            "quats": _plane(_array("quats", quats, count, (4,)).T),
+            "opacity_logits": _plane(_array("opacity_logits", opacity_logits, count, ())[None]),
+            "sh_dc": _plane(_array("sh_dc", sh_dc, count, (3,)).T),
+            # Channel by channel: all of red, all of green, all of blue.
+            "sh_rest": _plane(_rest(rest, count).transpose(2, 1, 0).reshape(3 * rest.shape[1], count)),
+        }
+        origin = choose_origin(places[:, origin_rows(count)].T.astype(np.float64)) if count else np.zeros(3)
+        planes["means"] = _plane(places.astype(np.float64) - origin[:, None] if origin.any() else places)
+        source = MemorySource(planes, origin=origin)
+        checked = checked_scene(source, drop_invalid=drop_invalid)
+        return cls(CheckedScene(None, checked.source, count, {"antialiased": True} if antialiased else {}))
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return self.source.count
+
+    @property
+    def sh_degree(self) -> int:
+        """0 to 4."""
+        return self.source.sh_degree
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the scene is drawn antialiased, as its file or its model folder says."""
+        path, stored = self.checked.path, self.checked.settings
+        if "antialiased" in stored:
+            return stored["antialiased"] is True
+        return path is not None and companions_of(path).antialiased is True
+
+    @property
+    def source(self) -> SceneSource:
+        """The values as planes [width, n], by row range: what other functions of the package read."""
+        return self.checked.source
+
+    def arrays(self, rows: slice | Sequence[int] | NDArray[np.integer] | None = None) -> Arrays:
+        """The stored values of some Gaussians, in the shapes of `from_arrays`; new arrays at each call.
+
+        Parameters
+        ----------
+        rows : slice or integers, optional
+            Default: all of them.
+        """
+        source = self.source
+        if isinstance(rows, slice):
+            span = range(*rows.indices(source.count))
+            if span.step == 1:
+                planes = source.read(slice(span.start, max(span.start, span.stop)), list(FIELD))
+                return _arrays(planes, source.origin)
+            rows = list(span)
+        if rows is not None:
+            source = source.select(np.asarray(rows, np.int64 if len(rows) == 0 else None))
+        return _arrays(source.read(slice(0, source.count), list(FIELD)), source.origin)
+
+    def save(self, path: StrPath, *, force: bool = False) -> None:
+        """Write a `.ply`, `.spz`, `.sog` or `.compressed.ply`, as `decompress` does; a `.fgs` is made by `compress`."""
+        decompress(self.checked, path, force)
+
+    def render(
+        self,
+        camera: Camera,
+        *,
+        device: str | None = None,
+        memory_limit: int | None = None,
+        near: float | None = None,
+        background: tuple[float, float, float] | None = None,
+    ) -> Floats:
+        """Draw one view: [H, W, 3], not clamped. `render_views` draws many, and opens the device once for all of them.
+
+        Parameters
+        ----------
+        camera : Camera
+            World coordinates.
+        device : str, optional
+            OpenCL device (number, part of its name, `cpu`, `gpu`) or `numpy`.
+        memory_limit : int, optional
+            Bytes for the whole process.
+        near, background : optional
+            Default: what the file says, else 0.2 scene units and black.
+        """
+        options = ViewOptions(
+            cameras=NO_CAMERAS, device=device, memory_limit=memory_limit, near=near, background=background
+        )
+        run = open_run(self.checked, options, photos=False)
+        with open_bench(run) as bench, bench.renderer.load(run.source) as loaded:
+            return np.ascontiguousarray(bench.renderer.render(loaded, camera), np.float32)
+
+    def __repr__(self) -> str:
+        return f"Scene({self.source.name!r}: {self.count} Gaussians, SH degree {self.sh_degree})"
+
+
+def _array(name: str, values: Numbers, count: int, inner: tuple[int, ...]) -> np.ndarray:
+    """[N, *inner] numbers."""
+    array = np.asarray(values)
+    shape = ("N" if name == "means" else count, *inner)
+    if array.shape != (count, *inner):
+        raise InputError(f"{name}: expected shape [{', '.join(map(str, shape))}], found {list(array.shape)}")
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{name}: expected float32 numbers, found {array.dtype}")
+    return array
+
+
+def _rest(values: np.ndarray, count: int) -> np.ndarray:
+    """[N, K, 3] numbers with a K that is a whole SH degree."""
+    if values.ndim == 3 and 3 * values.shape[1] in REST_WIDTHS:
+        return _array("sh_rest", values, count, (values.shape[1], 3))
+    raise InputError(f"sh_rest: expected shape [{count}, K, 3] with K of 0, 3, 8, 15 or 24, found {list(values.shape)}")
+
+
+def _plane(values: np.ndarray) -> np.ndarray:
+    """[width, N] f32, a copy of its own."""
+    with np.errstate(over="ignore"):  # infinity is reported by the check of the scene
+        return np.array(values, np.float32, order="C")
+
+
+def _arrays(planes: Planes, origin: np.ndarray) -> Arrays:
+    means, rest = planes["means"].T, planes["sh_rest"]
+    count = len(means)
+    return {
+        "means": np.ascontiguousarray(means) if not origin.any() else means.astype(np.float64) + origin,
+        "log_scales": np.ascontiguousarray(planes["log_scales"].T),
+        "quats": np.ascontiguousarray(planes["quats"].T),
+        "opacity_logits": planes["opacity_logits"].reshape(count),
+        "sh_dc": np.ascontiguousarray(planes["sh_dc"].T),
+        "sh_rest": np.ascontiguousarray(rest.reshape(3, len(rest) // 3, count).transpose(2, 1, 0)),
+    }

@@ -1,0 +1,322 @@
+"""Records of the jobs that judge nothing: `decompress`, `render`, `score`, `verify`, `trim`, `synth` and `devices`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from flexgs_edge._version import __version__
+from flexgs_edge.codec.header import Section
+from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.summary import line, run_lines, scene_lines, text, view_lines
+from flexgs_edge.units import format_mib, format_size
+
+if TYPE_CHECKING:
+    from flexgs_edge.kernels.choose_device import DeviceInfo
+
+
+@dataclass(frozen=True)
+class DecompressResult:
+    """What `decompress` wrote."""
+
+    scene: SceneInfo
+    output: str
+    size: int
+    run: RunInfo
+    notes: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {
+            "program": f"flexgs-edge {__version__}",
+            "command": "decompress",
+            "input": self.scene.to_json(),
+            "output": self.output,
+            "size": self.size,
+            "notes": list(self.notes),
+            "run": self.run.to_json(),
+        }
+
+    def summary(self) -> str:
+        """What the command prints."""
+        lines = scene_lines("scene", self.scene)
+        lines.append(line("wrote", f"{self.output}, {self.size} bytes ({format_size(self.size)})"))
+        lines += [line("note", note) for note in self.notes]
+        return text([*lines, *run_lines(self.run)])
+
+
+@dataclass(frozen=True)
+class RenderResult:
+    """What `render` drew; start-up and kernel compilation are in `run`, apart from the views."""
+
+    scene: SceneInfo
+    views: ViewsInfo
+    files: tuple[str, ...]
+    view_seconds: tuple[float, ...]
+    warm_up_seconds: float
+    run: RunInfo
+
+    @property
+    def ms_per_view(self) -> float:
+        """Median time of a view in milliseconds, drawing only: no loading, compiling or file writing."""
+        times = sorted(self.view_seconds)
+        return 1000 * (times[(len(times) - 1) // 2] + times[len(times) // 2]) / 2 if times else 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        run = self.run.to_json()
+        return {
+            "program": f"flexgs-edge {__version__}",
+            "command": "render",
+            "input": self.scene.to_json(),
+            "views": self.views.to_json(),
+            "files": list(self.files),
+            "ms_per_view": round(self.ms_per_view, 3),
+            "view_ms": [round(1000 * seconds, 3) for seconds in self.view_seconds],
+            "startup_ms": run["startup_ms"],
+            "compile_ms": run["compile_ms"],
+            "warm_up_ms": round(1000 * self.warm_up_seconds, 1),
+            "run": run,
+        }
+
+    def summary(self) -> str:
+        """What the command prints."""
+        lines = [*scene_lines("scene", self.scene), *view_lines(self.views)]
+        first = self.files[0] if self.files else "no files"
+        last = f" ... {self.files[-1]}" if len(self.files) > 1 else ""
+        lines.append(line("wrote", f"{len(self.files)} PNG files: {first}{last}"))
+        lines.append(
+            line(
+                "time",
+                f"{self.ms_per_view:.1f} ms a view (median); start-up {1000 * self.run.startup_seconds:.0f} ms and "
+                f"kernel compilation {1000 * self.run.compile_seconds:.0f} ms apart",
+            )
+        )
+        return text([*lines, *run_lines(self.run)])
+
+
+@dataclass(frozen=True)
+class ScoreResult:
+    """What `score` wrote."""
+
+    scene: SceneInfo
+    views: ViewsInfo
+    output: str
+    score: str
+    scored_views: int
+    unseen: int
+    run: RunInfo
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {
+            "program": f"flexgs-edge {__version__}",
+            "command": "score",
+            "input": self.scene.to_json(),
+            "views": self.views.to_json(),
+            "output": self.output,
+            "score": self.score,
+            "scored_views": self.scored_views,
+            "unseen": self.unseen,
+            "run": self.run.to_json(),
+        }
+
+    def summary(self) -> str:
+        """What the command prints."""
+        lines = [*scene_lines("scene", self.scene), *view_lines(self.views)]
+        unseen = f"; {self.unseen} Gaussians are in none of them" if self.unseen else ""
+        lines.append(line("scored", f"{self.score}, over {self.scored_views} training poses{unseen}"))
+        lines.append(line("wrote", self.output))
+        return text([*lines, *run_lines(self.run)])
+
+
+@dataclass(frozen=True)
+class VerifyResult:
+    """What `verify` found.
+
+    Parameters
+    ----------
+    path : str
+        The file.
+    sections : tuple of Section
+        Name, offset, bytes and verdict of every part, in the order of the file.
+    """
+
+    path: str
+    sections: tuple[Section, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every checksum holds."""
+        return not self.damaged
+
+    @property
+    def damaged(self) -> tuple[str, ...]:
+        """Names of the parts whose checksums do not hold."""
+        return tuple(section.name for section in self.sections if not section.ok)
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {
+            "program": f"flexgs-edge {__version__}",
+            "command": "verify",
+            "path": self.path,
+            "ok": self.ok,
+            "sections": [asdict(section) for section in self.sections],
+        }
+
+    def summary(self) -> str:
+        """What the command prints: a line a part."""
+        parts, bad = self.sections, len(self.damaged)
+        lines = [f"{s.name:<12} {s.length:>12} bytes at {s.offset:>12}  {'ok' if s.ok else 'DAMAGED'}" for s in parts]
+        verdict = f"{bad} of {len(parts)} parts DAMAGED" if bad else "every checksum holds"
+        lines.append(f"{self.path}: {sum(section.length for section in parts)} bytes, {verdict}")
+        return "\n".join(lines) + "\n"
+
+
+@dataclass(frozen=True)
+class TrimResult:
+    """What `trim` kept of a file: sizes in bytes, Gaussians, layers."""
+
+    input: str
+    input_size: int
+    input_count: int
+    input_layers: int
+    output: str
+    size: int
+    count: int
+    layers: int
+    max_size: int
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {"program": f"flexgs-edge {__version__}", "command": "trim", **asdict(self)}
+
+    def summary(self) -> str:
+        """What the command prints."""
+        lines = [
+            f"{self.input}: {self.input_size} bytes ({format_size(self.input_size)}), "
+            f"{self.input_count} Gaussians in {self.input_layers} layers",
+            f"wrote {self.output}, {self.size} bytes ({format_size(self.size)}, {self.max_size} allowed)",
+            f"kept  {self.layers} of {self.input_layers} layers, {self.count} of {self.input_count} Gaussians",
+        ]
+        return "\n".join(lines) + "\n"
+
+
+@dataclass(frozen=True)
+class SynthResult:
+    """What `synth` made.
+
+    Parameters
+    ----------
+    input, input_count, sh_degree : str, int, int
+        The scene that it was made from.
+    output, count, size : str, int, int
+        The scene written, its Gaussians and bytes.
+    seed : int
+        As asked for.
+    tiles : int
+        Copies side by side.
+    parts : tuple of int
+        Fewest and most parts of a Gaussian.
+    cameras, views : str or None, int
+        The cameras written beside it.
+    notes : tuple of str
+        What was left out or changed.
+    run : RunInfo
+        Times and memory.
+    """
+
+    input: str
+    input_count: int
+    sh_degree: int
+    output: str
+    count: int
+    size: int
+    seed: int
+    tiles: int
+    parts: tuple[int, int]
+    cameras: str | None
+    views: int
+    notes: tuple[str, ...]
+    run: RunInfo
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {
+            "program": f"flexgs-edge {__version__}",
+            "command": "synth",
+            "input": self.input,
+            "input_count": self.input_count,
+            "sh_degree": self.sh_degree,
+            "output": self.output,
+            "count": self.count,
+            "size": self.size,
+            "seed": self.seed,
+            "tiles": self.tiles,
+            "parts": list(self.parts),
+            "cameras": self.cameras,
+            "views": self.views,
+            "notes": list(self.notes),
+            "seconds": self.run.seconds,
+            "memory_limit": self.run.memory_limit,
+            "peak_memory": self.run.peak_memory,
+        }
+
+    def summary(self) -> str:
+        """What the command prints."""
+        few, many = self.parts
+        parts = f"{few}" if few == many else f"{few} or {many}"
+        tiles = "" if self.tiles == 1 else f", in {self.tiles} copies side by side"
+        lines = [
+            f"{self.input}: {self.input_count} Gaussians of SH degree {self.sh_degree}",
+            f"wrote {self.output}, {self.count} Gaussians, {self.size} bytes ({format_size(self.size)})",
+            f"made    each Gaussian in {parts} part{'' if many == 1 else 's'}{tiles}; seed {self.seed}",
+        ]
+        if self.cameras is not None:
+            lines.append(f"cameras {self.cameras}, {self.views} views")
+        lines += [f"note    {note}" for note in self.notes]
+        memory = f"peak memory {format_mib(self.run.peak_memory)} of {format_mib(self.run.memory_limit)}"
+        lines.append(f"run     {self.run.seconds:.1f} s, {memory}")
+        return "\n".join(lines) + "\n"
+
+
+@dataclass(frozen=True)
+class DevicesResult:
+    """The OpenCL devices, and which of them is used.
+
+    Parameters
+    ----------
+    devices : tuple of DeviceInfo
+        Each with its limits and its verdict.
+    chosen : int or None
+        Index of the one that is used; `None` where none works, or not the one asked for.
+    reason : str
+        Why it was chosen, or why none was.
+    """
+
+    devices: tuple[DeviceInfo, ...]
+    chosen: int | None
+    reason: str
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        return {"devices": [info.to_json() for info in self.devices], "chosen": self.chosen, "reason": self.reason}
+
+    def summary(self) -> str:
+        """What the command prints: a few lines a device."""
+        lines = [line for info in self.devices for line in _device_lines(info)]
+        if self.chosen is not None:
+            lines.append(f"chosen: [{self.chosen}] ({self.reason})")
+        return "".join(line + "\n" for line in lines)
+
+
+def _device_lines(info: DeviceInfo) -> list[str]:
+    return [
+        f"[{info.index}] {info.name}",
+        f"    {info.type}, {info.platform}, driver {info.driver}, {info.opencl_c}",
+        f"    {info.compute_units} compute units, native float vectors of {info.native_width}, work-groups up to "
+        f"{info.max_work_group}, local memory {info.local_bytes // 1024} KiB, global memory {format_mib(info.global_bytes)}, "
+        f"buffers up to {format_mib(info.max_alloc_bytes)}",
+        f"    self-test: {info.self_test}",
+    ]

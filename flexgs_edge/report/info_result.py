@@ -1,0 +1,209 @@
+"""The record of `info`: what a scene file holds, as values, as JSON and as text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from flexgs_edge._version import __version__
+from flexgs_edge.units import format_size
+
+
+@dataclass(frozen=True)
+class InfoResult:
+    """What a scene file holds.
+
+    Parameters
+    ----------
+    path : str
+        The file; of a model folder its latest scene.
+    format : str
+        `fgs`, `ply`, `spz`, `sog` or `compressed.ply`.
+    size : int
+        Bytes of the file.
+    count, sh_count, sh_degree : int
+        Gaussians, how many of them may have SH above degree 0, and the degree.
+    origin : tuple of float
+        What was taken from the positions, world.
+    source_ply_bytes : int or None
+        Bytes of the scene as a PLY (of a `.fgs`: of the original, where the file knows it).
+    notes : tuple of str
+        What the reader left out or changed.
+    version : int or None
+        Of the `.fgs` format; `None` for other formats, which have none of the fields up to `cut_from` either.
+    channels : dict
+        Rows, precision and bytes of every channel, by its name.
+    settings : dict
+        How the file was made.
+    chroma : float or None
+        Grid step of chroma, in steps of luma (version 2).
+    model_bytes : int or None
+        Bytes of the coder's tables (version 2).
+    layers : tuple of dict or None
+        Rows and bytes of every layer (version 2).
+    cut_from : dict or None
+        What the file was before `trim` (version 2).
+    cameras, images : str or None
+        What lies beside a file of another format.
+    antialiased : bool or None
+        What a file of another format, or its model folder, says about drawing.
+    """
+
+    path: str
+    format: str
+    size: int
+    count: int
+    sh_count: int
+    sh_degree: int
+    origin: tuple[float, ...]
+    source_ply_bytes: int | None
+    notes: tuple[str, ...] = ()
+    version: int | None = None
+    channels: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    chroma: float | None = None
+    model_bytes: int | None = None
+    layers: tuple[Mapping[str, int], ...] | None = None
+    cut_from: Mapping[str, int] | None = None
+    cameras: str | None = None
+    images: str | None = None
+    antialiased: bool | None = None
+
+    @property
+    def ratio(self) -> float | None:
+        """Bytes of the original's PLY for each byte of a `.fgs`, to four digits."""
+        return round(self.source_ply_bytes / self.size, 4) if self.version and self.source_ply_bytes else None
+
+    @property
+    def bits_per_gaussian(self) -> float | None:
+        """Bits of a `.fgs` for each Gaussian in it, to three digits."""
+        return round(8 * self.size / self.count, 3) if self.version and self.count else None
+
+    @property
+    def overhead_bytes(self) -> int:
+        """Bytes of a `.fgs` that belong to no channel."""
+        return self.size - sum(int(channel["bytes"]) for channel in self.channels.values())
+
+    def to_json(self) -> dict[str, Any]:
+        """The record for machines."""
+        record: dict[str, Any] = {
+            "program": f"flexgs-edge {__version__}",
+            "command": "info",
+            "path": self.path,
+            "format": self.format,
+            **({} if self.version is None else {"version": self.version}),
+            "size": self.size,
+            "count": self.count,
+            "sh_count": self.sh_count,
+            "sh_degree": self.sh_degree,
+            "origin": list(self.origin),
+        }
+        if self.version is None:
+            return record | {
+                "source_ply_bytes": self.source_ply_bytes,
+                "cameras": self.cameras,
+                "images": self.images,
+                "antialiased": self.antialiased,
+                "notes": list(self.notes),
+            }
+        record |= {
+            "bits_per_gaussian": self.bits_per_gaussian,
+            "source_ply_bytes": self.source_ply_bytes,
+            "ratio": self.ratio,
+            "channels": {name: dict(channel) for name, channel in self.channels.items()},
+            "overhead_bytes": self.overhead_bytes,
+            "settings": dict(self.settings),
+            "notes": list(self.notes),
+        }
+        if self.layers is not None:
+            record |= {
+                "chroma": self.chroma,
+                "model_bytes": self.model_bytes,
+                "layers": [dict(layer) for layer in self.layers],
+                "cut_from": None if self.cut_from is None else dict(self.cut_from),
+            }
+        return record
+
+    def summary(self) -> str:
+        """What the command prints."""
+        version = "" if self.version is None else f" version {self.version}"
+        lines = [f"{self.path}: {self.format}{version}, {self.size} bytes ({format_size(self.size)})"]
+        with_sh = "" if self.version is None else f", {self.sh_count} of them with SH"
+        lines.append(f"Gaussians:   {self.count}{with_sh}, SH degree {self.sh_degree}")
+        if self.ratio and self.source_ply_bytes is not None:
+            each = "" if self.bits_per_gaussian is None else f"; {self.bits_per_gaussian:.1f} bits a Gaussian kept"
+            lines.append(
+                f"ratio:       {self.ratio:.2f}x of the original's PLY, {format_size(self.source_ply_bytes)}{each}"
+            )
+        if any(self.origin):
+            lines.append("origin:      " + ", ".join(f"{value:g}" for value in self.origin))
+        if self.version is None:
+            for word, beside in (("cameras:", self.cameras), ("images:", self.images)):
+                lines.append(f"{word:<12} {beside or 'none beside it'}")
+            if self.antialiased:
+                lines.append("antialiased: yes")
+        lines += [f"note:        {note}" for note in self.notes]
+        if self.layers is not None:
+            lines += _layer_lines(self.layers, self.cut_from)
+        if self.version is not None:
+            lines += ["", *_channel_table(self.channels, self.version)]
+            if self.chroma is not None:
+                lines.append(f"steps of dc and sh are those of luma; of chroma, {self.chroma:g} times as much")
+            model = "" if self.model_bytes is None else f" (of these the coder's tables: {self.model_bytes})"
+            lines.append(f"headers and checksums: {self.overhead_bytes} bytes{model}")
+            lines += ["", "settings:", *_settings_lines(self.settings)]
+        return "\n".join(lines) + "\n"
+
+
+def _layer_lines(layers: Sequence[Mapping[str, int]], cut: Mapping[str, int] | None) -> list[str]:
+    lines = []
+    if len(layers) > 1:
+        parts = (f"{layer['rows']} in {layer['bytes']} bytes" for layer in layers)
+        lines.append(f"layers:      {len(layers)} (Gaussians: {', '.join(parts)}); see flexgs-edge trim")
+    if cut:
+        lines.append(f"cut from:    {cut['bytes']} bytes, {cut['count']} Gaussians in {cut['layers']} layers")
+    return lines
+
+
+_PACKED_COLUMNS = {
+    "channels": "channels",
+    "rows": "rows",
+    "bits": "bits",
+    "groups": "groups",
+    "bytes a channel": "bytes_per_channel",
+    "ranges": "range_bytes",
+    "bytes": "bytes",
+}
+_GRID_COLUMNS = {
+    "rows": "rows",
+    "step": "step",
+    "bits a row": "bits_per_row",
+    "bits a Gaussian": "bits_per_gaussian",
+    "bytes": "bytes",
+}
+
+
+def _channel_table(channels: Mapping[str, Mapping[str, Any]], version: int) -> list[str]:
+    columns = _PACKED_COLUMNS if version == 1 else _GRID_COLUMNS
+    rows = [("attribute", *columns)]
+    for name, item in channels.items():
+        rows.append((name, *(_cell(item[word]) for word in columns.values())))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return [
+        "  ".join([row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))])
+        for row in rows
+    ]
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _settings_lines(settings: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            value = ", ".join(f"{key} {'none' if item is None else item}" for key, item in value.items())
+        lines.append(f"  {name.replace('_', ' ')}: {'none' if value is None else value}")
+    return lines
