@@ -140,7 +140,7 @@ def test_info_loads_nothing_heavy(repository: Path) -> None:
         loaded = set(result.stderr.split())
         assert {name.partition(".")[0] for name in loaded}.isdisjoint(HEAVY)
         rooms = ("cameras", "render", "kernels", "goals", "methods", "studies", "io.exchange")
-        assert loaded.isdisjoint(f"flexgs_edge.{storage}" for storage in rooms)
+        assert loaded.isdisjoint(f"flexgs_edge.{room}" for room in rooms)
 
 
 def test_modules_stay_short(repository: Path) -> None:

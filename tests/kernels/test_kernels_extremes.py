@@ -89,10 +89,10 @@ def sums_of(backend: Backend, name: str, source: MemorySource) -> np.ndarray:
     """[6, N] i64: weights, residuals of three channels against the halved image, costs of removal, squared weights."""
     extreme = EXTREMES[name]
     renderer = Renderer(backend, large_budget(), background=(0.2, 0.5, 1.0), antialiased=extreme.antialiased)
-    with renderer.load(source) as scene, References() as targets:
-        targets.add(0, renderer.render_planes(scene, extreme.camera) / 2)
+    with renderer.load(source) as scene, References() as references:
+        references.add(0, renderer.render_planes(scene, extreme.camera) / 2)
         sums = renderer.read_sums(
-            renderer.residual_and_removal_sums(scene, extreme.camera, targets[0]), 6, source.count
+            renderer.residual_and_removal_sums(scene, extreme.camera, references[0]), 6, source.count
         )
     renderer.release()
     return sums
@@ -138,10 +138,10 @@ def test_a_row_at_the_camera_leaves_no_trace(form: str) -> None:
     arrays["means"][:, 3] = 0
     source, cameras = MemorySource(arrays, 2), [make_camera(33, 20)] * 2
     renderer = Renderer(PairedBackend(open_form(form), 3), large_budget())
-    with renderer.load(source) as scene, References.of(renderer, scene, cameras) as targets:
+    with renderer.load(source) as scene, References.of(renderer, scene, cameras) as references:
         costs = measure_costs(Bench(renderer), scene, cameras)
         planes = {**arrays, "sh_dc": arrays["sh_dc"] / 2}
-        mended = refit_colours(Bench(renderer), planes, np.full(16, 2), np.zeros(3), cameras, targets, rounds=2)
+        mended = refit_colours(Bench(renderer), planes, np.full(16, 2), np.zeros(3), cameras, references, rounds=2)
     renderer.release()
     assert costs.weight2[3] == 0 and not costs.sh[:, 3].any() and not costs.sh_mean[:, :, 3].any()
     assert (costs.weight2 > 0).sum() > 5
@@ -195,11 +195,11 @@ def test_any_rows(
     camera = make_camera(*size, rotation=rotation, translation=translation)
     paired = PairedBackend(open_form(form), 3)
     renderer = Renderer(paired, large_budget(), antialiased=antialiased)
-    with renderer.load(source) as scene, References() as targets:
+    with renderer.load(source) as scene, References() as references:
         image = renderer.render_planes(scene, camera)
         assert np.isfinite(image).all() and image.min() >= 0
-        targets.add(0, image[:, ::-1] / 3)
-        sums = renderer.residual_and_removal_sums(scene, camera, targets[0])
+        references.add(0, image[:, ::-1] / 3)
+        sums = renderer.residual_and_removal_sums(scene, camera, references[0])
         assert (renderer.read_sums(sums, 6, source.count)[[0, 4, 5]] >= 0).all()
         costs = measure_costs(Bench(renderer), scene, [camera] * 2)
     renderer.release()

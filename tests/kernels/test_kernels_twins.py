@@ -198,8 +198,8 @@ def test_moments_of_sh(form: str, degree: int, rows: int, monkeypatch: pytest.Mo
         costs = measure_costs(Bench(renderer), scene, views)
     assert costs.sh.shape == (degree, rows) and costs.sh.any()
     planes = source.read(slice(0, rows), list(FIELD))
-    targets = [padded_target(camera, degree) for camera in views]
-    refit_colours(Bench(renderer), planes, np.full(rows, degree), np.zeros(3), views, targets, rounds=1)  # type: ignore[arg-type]
+    references = [padded_target(camera, degree) for camera in views]
+    refit_colours(Bench(renderer), planes, np.full(rows, degree), np.zeros(3), views, references, rounds=1)  # type: ignore[arg-type]
     renderer.release()
     assert paired.launched["sh_costs"] and paired.launched["sh_residual"]
 

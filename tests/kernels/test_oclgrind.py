@@ -104,16 +104,18 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
         costs = measure_costs(Bench(drawer), scene, [camera])
         yield costs.removal
         yield costs.sh
-        targets: Any = [drawer.render_planes(scene, camera).astype(np.float16) + np.float16(0.1)]
-        sums = drawer.residual_and_removal_sums(scene, camera, targets[0])
+        references: Any = [drawer.render_planes(scene, camera).astype(np.float16) + np.float16(0.1)]
+        sums = drawer.residual_and_removal_sums(scene, camera, references[0])
         yield drawer.read_sums(sums, 6, source.count)
     planes = source.read(slice(0, source.count), list(FIELD))
-    planes = refit_colours(Bench(drawer), planes, np.full(source.count, 4), source.origin, [camera], targets, rounds=1)
+    planes = refit_colours(
+        Bench(drawer), planes, np.full(source.count, 4), source.origin, [camera], references, rounds=1
+    )
     yield planes["sh_dc"]
     yield planes["sh_rest"]
     with Descent(drawer, planes, np.full(source.count, 4), source.origin, camera) as descent:
         descent.put_on(StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04,) * 4))
-        descent.step(camera, targets[0], {"means": 1e-2, **FIELD_RATES})
+        descent.step(camera, references[0], {"means": 1e-2, **FIELD_RATES})
         yield from descent.planes().values()
 
 

@@ -67,7 +67,7 @@ def studied(project: Path) -> Iterator[StudyScene]:
 def study(project: Path, studied: StudyScene, tmp_path_factory: pytest.TempPathFactory) -> tuple[PaperStudy, Path]:
     out = tmp_path_factory.mktemp("written") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        # The bench of the other tests, which has measured most points: a second one would double their time.
+        # The study scene of the other tests, which has measured most points: a second one would double their time.
         patch.setattr("flexgs_edge.studies.paper.study.open_study_scene", lambda *words, **more: nullcontext(studied))
         return study_paper([project / "point_cloud.ply"], out, OPTIONS), out
 

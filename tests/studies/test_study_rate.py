@@ -201,12 +201,12 @@ def test_ranks_decide_who_goes_and_costs_how_many(studied: StudyScene) -> None:
     def walk(make: object) -> PruneRounds:
         cameras = studied.views.of(studied.views.train)
         run = replace(studied.run, options=OPTIONS)
-        with open_rounds(run, studied.bench, cameras, make=make) as path:  # type: ignore[arg-type]
-            path.descend(0.8)
-        return path
+        with open_rounds(run, studied.bench, cameras, make=make) as rounds:  # type: ignore[arg-type]
+            rounds.descend(0.8)
+        return rounds
 
-    path = walk(PruneRounds)
-    measured, ranks = path.snapshots, ranks_from_order(order)[path.rows]
+    rounds = walk(PruneRounds)
+    measured, ranks = rounds.snapshots, ranks_from_order(order)[rounds.rows]
     ranked = walk(lambda *w, **m: ablations.RankedPath(*w, order=order, **m)).snapshots
     seen = measured[0].costs.weight2 > 0
     assert np.array_equal(np.sort(ranked[0].costs.removal[seen]), np.sort(measured[0].costs.removal[seen]))

@@ -68,15 +68,15 @@ def found_by(form: str, storage: ScratchStorage | None) -> dict[str, np.ndarray]
             drawer.add_statistics(scene, camera, statistics)
         assert (scene.shown is not None) == (storage is not None)
     found |= {"hits": statistics.hits, "weights": statistics.weights}
-    with drawer.load(SCENE, 100) as scene, References() as targets:
+    with drawer.load(SCENE, 100) as scene, References() as references:
         costs = measure_costs(Bench(drawer), scene, cameras())
         found |= {name: getattr(costs, name) for name in ("removal", "weight2", "sh", "sh_mean")}
         planes = SCENE.read(slice(0, SCENE.count), list(FIELD))
         for view, camera in enumerate(cameras()):
-            targets.add(view, drawer.render_planes(scene, camera))
+            references.add(view, drawer.render_planes(scene, camera))
         planes["sh_dc"] = planes["sh_dc"] + np.float32(0.1)
         degrees = np.arange(SCENE.count) % 3
-        moved = refit_colours(Bench(drawer), planes, degrees, SCENE.origin, cameras(), targets, 2, subsets=2)
+        moved = refit_colours(Bench(drawer), planes, degrees, SCENE.origin, cameras(), references, 2, subsets=2)
     drawer.release()
     return {**found, "moved": moved["sh_dc"], "rest": moved["sh_rest"]}
 
@@ -112,17 +112,17 @@ def test_sums_of_a_chunk_take_the_place_of_a_view(
     budget = large_budget()
     drawer = Renderer(TwinBackend(budget), budget)
     drawer.storage, held = ScratchStorage(tmp_path), budget.used
-    with References() as targets:
+    with References() as references:
         with drawer.load(SCENE) as scene:
             for view, camera in enumerate(views):
-                targets.add(view, drawer.render_planes(scene, camera))
+                references.add(view, drawer.render_planes(scene, camera))
         drawer.release()
         for limit in range(250_000, 750_000, 20_011):
             budget.limit = held + limit
             try:
                 with drawer.load(SCENE, sum_row_bytes(SCENE.sh_degree), view_sums=2) as scene:
                     measure_costs(Bench(drawer), scene, views)
-                refit_colours(Bench(drawer), planes, degrees, SCENE.origin, views, targets, 1)
+                refit_colours(Bench(drawer), planes, degrees, SCENE.origin, views, references, 1)
                 drawn.append(limit)
             except BudgetError as error:
                 assert not drawn and "a view" in str(error)

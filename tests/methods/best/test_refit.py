@@ -29,7 +29,7 @@ OPENED: list[References] = []
 
 
 @pytest.fixture(autouse=True)
-def _closed_targets() -> Iterator[None]:
+def _closed_references() -> Iterator[None]:
     yield
     while OPENED:
         OPENED.pop().close()
@@ -67,8 +67,8 @@ class Workshop:
         self.renderer, self.cameras = Renderer(open_form(form), large_budget()), poses(views)
         self.original = self.images(planes)
         with self.renderer.load(MemorySource(planes)) as scene:
-            self.targets = References.of(self.renderer, scene, self.cameras)
-        OPENED.append(self.targets)
+            self.references = References.of(self.renderer, scene, self.cameras)
+        OPENED.append(self.references)
 
     def images(self, planes: Planes) -> list[np.ndarray]:
         with self.renderer.load(MemorySource(planes)) as scene:
@@ -87,7 +87,7 @@ class Workshop:
         count = planes["means"].shape[1]
         degrees = np.broadcast_to(np.asarray(degrees, np.uint8), count)
         return refit_colours(
-            Bench(self.renderer), planes, degrees, np.zeros(3), self.cameras, self.targets, rounds, bands, subsets
+            Bench(self.renderer), planes, degrees, np.zeros(3), self.cameras, self.references, rounds, bands, subsets
         )
 
 
@@ -143,7 +143,7 @@ def test_nothing_moves_at_the_optimum(degree: int) -> None:
     planes = bright_planes(degree)
     workshop = Workshop(planes)
     again = workshop.refit(planes, degree, 3)
-    # The targets are in half precision: 2^-11 of a colour near 1.
+    # The references are in half precision: 2^-11 of a colour near 1.
     assert np.abs(again["sh_dc"] - planes["sh_dc"]).max() < 5e-3
     assert np.abs(again["sh_rest"] - planes["sh_rest"]).max(initial=0) < 5e-3
     assert workshop.fidelity(again) > 65
@@ -226,21 +226,21 @@ def test_few_rows(count: int) -> None:
     assert found["sh_dc"].shape == (3, count) and found["sh_rest"].shape == (9, count)
 
 
-def test_targets_are_the_renders_in_half_precision(tmp_path: Path) -> None:
+def test_references_are_the_renders_in_half_precision(tmp_path: Path) -> None:
     planes = bright_planes(1)
     renderer, cameras = Renderer(open_form("w16"), large_budget(), background=(0.2, 0.4, 0.6)), poses(2)
     cameras += [make_camera(17, 33), make_camera(64, 16)]
     with renderer.load(MemorySource(planes)) as scene:
-        with References.of(renderer, scene, cameras, tmp_path) as targets:
+        with References.of(renderer, scene, cameras, tmp_path) as references:
             for view in (3, 0, 2, 1, 0):
-                camera, target = cameras[view], targets[view]
+                camera, target = cameras[view], references[view]
                 assert target.dtype == np.float16 and target.shape[0] == 3
                 assert target.shape[1] % 16 == target.shape[2] % 16 == 0
                 image = renderer.render(scene, camera).transpose(2, 0, 1)
                 assert same_bits(target[:, : camera.height, : camera.width], image.astype(np.float16))
-        assert targets._file.closed
+        assert references._file.closed
         with pytest.raises(ValueError, match="closed"):
-            _ = targets[0]
+            _ = references[0]
     assert list(tmp_path.iterdir()) == []
 
 
