@@ -37,6 +37,7 @@ from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
 
 STEPS = (0.002, 0.2, 0.04, 0.3, 0.06)
@@ -111,7 +112,12 @@ def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str |
         degrees = np.full(source.count, source.sh_degree, np.uint8)
         with targets:
             mended = refit_colours(
-                Bench(renderer), start, degrees, source.origin, cameras, targets, ROUNDS, False, SUBSETS, progress
+                start,
+                degrees,
+                Original(Bench(renderer), source.origin, cameras, targets, (), progress),
+                ROUNDS,
+                False,
+                SUBSETS,
             )
         write_grid(output, recolour(grid, mended["sh_dc"], exact["sh_rest"]), {}, force=True)
         decoded = GridSource(output)

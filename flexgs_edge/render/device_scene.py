@@ -46,7 +46,7 @@ class DeviceScene:
         Draw with antialiasing; `cov` of the chunks then holds the factor of the covariance.
     sum_bytes : int
         Bytes a row that sums over views will take on the backend, to be left free.
-    targets : bool
+    references : bool
         Views will be compared with targets on the backend; their room is taken with the view's buffers.
     view_sums : int
         Most planes of sums that a view has.
@@ -61,7 +61,7 @@ class DeviceScene:
         budget: MemoryBudget,
         antialiased: bool = False,
         sum_bytes: int = SUM_BYTES,
-        targets: bool = False,
+        references: bool = False,
         view_sums: int = MOST_SUMS,
         fit: Fit | None = None,
     ) -> None:
@@ -72,7 +72,7 @@ class DeviceScene:
         self.antialiased = antialiased
         self.statistics: list[Any] = []
         self.resident, self._streamed = False, False
-        self.targets = targets
+        self.references = references
         self.sum_bytes = sum_bytes
         self.view_sums = view_sums
         self.fit = fit or fit_module.DEFAULT

@@ -26,7 +26,7 @@ MOST_SUMS = 6
 """Largest number of sum planes of a view (`Renderer.residual_and_removal_sums`)."""
 SORT_DIGIT_BITS = 11
 SORT_DIGITS = 1 << SORT_DIGIT_BITS
-TARGET_BYTES = 6
+REFERENCE_BYTES = 6
 """Bytes a pixel and channel of a target (f16) and of the residual against it (f32)."""
 PAIR_BYTES = 20
 """Bytes of a pair in a tile list (8) and of its draft (12)."""
@@ -130,7 +130,7 @@ class SceneSize(Protocol):
 
     count: int
     sum_bytes: int
-    targets: bool
+    references: bool
 
     @property
     def later_bytes(self) -> int:
@@ -223,9 +223,9 @@ def view_bytes(size: ViewSize, count: int) -> int:
     return shapes_bytes(view_shapes(size, count)) + PAIR_BYTES * size.tiles
 
 
-def target_bytes(size: ViewSize) -> int:
+def reference_bytes(size: ViewSize) -> int:
     """Bytes of a view's target and of the residual against it."""
-    return TARGET_BYTES * 3 * size.pixels
+    return REFERENCE_BYTES * 3 * size.pixels
 
 
 def saves_bytes(scene: SceneSize, size: ViewSize, shown: int) -> bool:
@@ -244,7 +244,7 @@ def fits_whole(scene: SceneSize, size: ViewSize, free: int, spills: bool) -> boo
 
     If large arrays lie in files (`spills`), half of the memory is left for the kernel's cache of their pages.
     """
-    view = view_bytes(size, scene.count) + scene.targets * target_bytes(size) + scene.later_bytes
+    view = view_bytes(size, scene.count) + scene.references * reference_bytes(size) + scene.later_bytes
     free += scene.held_bytes
     if spills:
         # Without cached pages, a run under a tight limit reads the same rows again and again.

@@ -136,7 +136,7 @@ class Renderer:
         return self._buffers.records
 
     def load(
-        self, source: SceneSource, sum_bytes: int = SUM_BYTES, targets: bool = False, view_sums: int = MOST_SUMS
+        self, source: SceneSource, sum_bytes: int = SUM_BYTES, references: bool = False, view_sums: int = MOST_SUMS
     ) -> DeviceScene:
         """Bring a scene to the backend: all of it, or chunk by chunk for each view if it does not fit.
 
@@ -145,14 +145,16 @@ class Renderer:
         source : SceneSource
         sum_bytes : int
             Bytes a row to leave free for sums over views.
-        targets : bool
+        references : bool
             Leave room to compare views with targets.
         view_sums : int
             Most planes of sums that a view has.
         """
         self.release()
         planes = SourcePlanes(self.backend, source)
-        return DeviceScene(self.backend, planes, self.budget, self.antialiased, sum_bytes, targets, view_sums, self.fit)
+        return DeviceScene(
+            self.backend, planes, self.budget, self.antialiased, sum_bytes, references, view_sums, self.fit
+        )
 
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
         """Bring a quantized scene to the backend, where each chunk is dequantized."""
@@ -268,7 +270,7 @@ class Renderer:
         return sums
 
     def _residual(self, view: _View, target: np.ndarray) -> Any:
-        half, residual = view.buffers.target_arrays()
+        half, residual = view.buffers.reference_arrays()
         self.backend.write(half, target.reshape(-1))
         self.backend.launch("residual", (residual.shape[0],), residual.shape[0], half, view.buffers.image, residual)
         return residual

@@ -16,8 +16,8 @@ from flexgs_edge.render.fit import (
     PAIR_SHARE,
     ViewSize,
     chunk_shapes,
+    reference_bytes,
     shapes_bytes,
-    target_bytes,
     view_shapes,
 )
 
@@ -49,13 +49,16 @@ class ViewBuffers:
         self.tiles_x, self.tiles = self.size.tiles_x, self.size.tiles
         self.arrays: list[Any] = []
         self._backend = backend
-        self._targets: tuple[Any, Any] | None = None
+        self._references: tuple[Any, Any] | None = None
         shapes = view_shapes(self.size, count)
         size = shapes_bytes(shapes)
         # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the
         # sums need is checked here too, so that one error message names a limit that is large enough.
         later = (
-            PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + scene.targets * target_bytes(self.size)
+            PAIR_BYTES * self.tiles
+            + scene.later_bytes
+            + scene.least_bytes
+            + scene.references * reference_bytes(self.size)
         )
         what = (
             f"a view of {count} Gaussians" if rows is None else f"a view that shows {count} of {scene.count} Gaussians"
@@ -67,9 +70,9 @@ class ViewBuffers:
         budget.require(f"{what} at {width}x{height}", size + later)
         try:
             made = {name: self._array(shape, dtype) for name, (shape, dtype) in shapes.items()}
-            if scene.targets:
-                self.target_arrays()
-                later -= target_bytes(self.size)
+            if scene.references:
+                self.reference_arrays()
+                later -= reference_bytes(self.size)
             share, most = PAIR_SHARE, max(scene.fit.pairs, self.tiles)
             if rows is not None:
                 share = COMPACT_PAIR_SHARE
@@ -94,16 +97,16 @@ class ViewBuffers:
         self.arrays.append(made)
         return made
 
-    def target_arrays(self) -> tuple[Any, Any]:
+    def reference_arrays(self) -> tuple[Any, Any]:
         """The target image (f16) and the residual against it (f32), allocated at the first call."""
-        if self._targets is None:
+        if self._references is None:
             pixels = 3 * self.size.pixels
-            self._targets = (self._array((pixels,), np.float16), self._array((pixels,), np.float32))
-        return self._targets
+            self._references = (self._array((pixels,), np.float16), self._array((pixels,), np.float32))
+        return self._references
 
     def release(self) -> None:
         """Free all buffers."""
         for array in self.arrays:
             array.release()
         self.arrays = []
-        self._targets = None
+        self._references = None

@@ -44,7 +44,7 @@ class TrainingPoses:
         count = min(FIT_VIEWS, len(cameras))
         self._renderer = renderer
         self._cameras = [cameras[i * len(cameras) // count].every(FIT_STEP) for i in range(count)]
-        self._targets = References.of(renderer, original, self._cameras, progress=progress)
+        self._references = References.of(renderer, original, self._cameras, progress=progress)
 
     def fidelity(self, scene: DeviceScene) -> float | None:
         """Fidelity of `scene`, mean over the poses; `None` when all are identical."""
@@ -52,12 +52,12 @@ class TrainingPoses:
         for view, camera in enumerate(self._renderer.in_turn(scene, self._cameras)):
             inside = (slice(None), slice(camera.height), slice(camera.width))
             planes = self._renderer.render_planes(scene, camera)
-            found.append(psnr(mse(planes[inside], self._targets[view][inside])))
+            found.append(psnr(mse(planes[inside], self._references[view][inside])))
         return mean_psnr(found)
 
     def close(self) -> None:
         """Remove what the original looked like."""
-        self._targets.close()
+        self._references.close()
 
 
 def doubts(

@@ -153,13 +153,13 @@ class Cluster:
         source: SceneSource,
         kind: str,
         cameras: Sequence[Camera],
-        targets: Callable[[int], np.ndarray] | None,
+        references: Callable[[int], np.ndarray] | None,
         pictures: bool,
     ) -> Iterator[Drawn]:
         """Draw each view and yield its sums, in their order; see `ViewSums.draw`."""
 
         def words(view: int) -> tuple[Any, ...]:
-            return kind, cameras[view], None if targets is None else targets(view), pictures
+            return kind, cameras[view], None if references is None else references(view), pictures
 
         return self._drawn(draw_sums, source, [partial(words, view) for view in range(len(cameras))])
 

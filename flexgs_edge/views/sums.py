@@ -57,7 +57,7 @@ class ViewSums:
         self,
         kind: str,
         cameras: Sequence[Camera],
-        targets: Callable[[int], np.ndarray] | None = None,
+        references: Callable[[int], np.ndarray] | None = None,
         pictures: bool = False,
     ) -> Iterator[Callable[[], np.ndarray]]:
         """Draw views and add their sums, one view for each step of the iterator, in order, here or on the cluster.
@@ -66,7 +66,7 @@ class ViewSums:
         ----------
         kind : str
             Name of the method of `Renderer` that gives a view's sums.
-        targets : callable, optional
+        references : callable, optional
             Gives the target of a view by its place among `cameras`, if that method takes one.
         pictures : bool
             Whether the caller will use the yielded callables.
@@ -79,10 +79,10 @@ class ViewSums:
         renderer, scene, cluster = self._renderer, self._scene, self._bench.ready_cluster
         if cluster is None or scene.source is None:
             for view, camera in enumerate(renderer.in_turn(scene, cameras)):
-                self.add_view(view_sums(renderer, scene, kind, camera, targets and targets(view)), camera)
+                self.add_view(view_sums(renderer, scene, kind, camera, references and references(view)), camera)
                 yield renderer.drawn_planes
             return
-        found = cluster.sums(scene.source, kind, cameras, targets, pictures)
+        found = cluster.sums(scene.source, kind, cameras, references, pictures)
         for camera, drawn in zip(cameras, found, strict=True):
             self._add_drawn(drawn.parts, camera)
             yield partial(_picture, drawn)

@@ -21,6 +21,7 @@ from flexgs_edge.scene.check import SH_LARGEST, check_scene
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
 from kernel_fixtures import ALL_FORMS, FORMS, PairedBackend, count, draw, large_budget, open_form, same_bits
 from reference_renderer import Reference
@@ -141,7 +142,9 @@ def test_a_row_at_the_camera_leaves_no_trace(form: str) -> None:
     with renderer.load(source) as scene, References.of(renderer, scene, cameras) as references:
         costs = measure_costs(Bench(renderer), scene, cameras)
         planes = {**arrays, "sh_dc": arrays["sh_dc"] / 2}
-        mended = refit_colours(Bench(renderer), planes, np.full(16, 2), np.zeros(3), cameras, references, rounds=2)
+        mended = refit_colours(
+            planes, np.full(16, 2), Original(Bench(renderer), np.zeros(3), cameras, references), rounds=2
+        )
     renderer.release()
     assert costs.weight2[3] == 0 and not costs.sh[:, 3].any() and not costs.sh_mean[:, :, 3].any()
     assert (costs.weight2 > 0).sum() > 5

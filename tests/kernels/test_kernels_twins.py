@@ -18,6 +18,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.original import Original
 from kernel_fixtures import (
     FORMS,
     PairedBackend,
@@ -199,7 +200,8 @@ def test_moments_of_sh(form: str, degree: int, rows: int, monkeypatch: pytest.Mo
     assert costs.sh.shape == (degree, rows) and costs.sh.any()
     planes = source.read(slice(0, rows), list(FIELD))
     references = [padded_target(camera, degree) for camera in views]
-    refit_colours(Bench(renderer), planes, np.full(rows, degree), np.zeros(3), views, references, rounds=1)  # type: ignore[arg-type]
+    original = Original(Bench(renderer), np.zeros(3), views, references)  # type: ignore[arg-type]
+    refit_colours(planes, np.full(rows, degree), original, rounds=1)
     renderer.release()
     assert paired.launched["sh_costs"] and paired.launched["sh_residual"]
 

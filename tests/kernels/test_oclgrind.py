@@ -36,6 +36,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.original import Original
 from grid_scenes import STEPS, make_grid
 from kernel_fixtures import default_device, large_budget, same_bits
 from quantized_scenes import quantize_all
@@ -109,7 +110,10 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
         yield drawer.read_sums(sums, 6, source.count)
     planes = source.read(slice(0, source.count), list(FIELD))
     planes = refit_colours(
-        Bench(drawer), planes, np.full(source.count, 4), source.origin, [camera], references, rounds=1
+        planes,
+        np.full(source.count, 4),
+        Original(Bench(drawer), source.origin, [camera], references),
+        rounds=1,
     )
     yield planes["sh_dc"]
     yield planes["sh_rest"]

@@ -118,40 +118,20 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _to_grid(
         self, planes: Planes, degrees: np.ndarray, steps: StepSizes, storage: Storage = IN_MEMORY
     ) -> tuple[GridScene, np.ndarray]:
-        return to_grid(planes, degrees, steps, self.rounds.origin, storage=storage)
+        return to_grid(planes, degrees, steps, self.rounds.original.origin, storage=storage)
 
     def _probe_slopes(self, snapshot: Snapshot) -> Slopes:
-        rounds = self.rounds
-        return probe_slopes(rounds.renderer, snapshot.planes, rounds.origin, rounds.cameras, self.effort.probed)
+        original = self.rounds.original
+        renderer, planes = original.bench.renderer, snapshot.planes
+        return probe_slopes(renderer, planes, original.origin, original.cameras, self.effort.probed)
 
     def _distil(self, kept: Kept, schedule: Schedule, steps: StepSizes) -> Planes:
-        rounds = self.rounds
-        return distil(
-            rounds.renderer,
-            kept.planes,
-            kept.degrees,
-            rounds.origin,
-            [*rounds.cameras, *rounds.between],
-            rounds.targets,
-            schedule,
-            steps,
-            progress=rounds.progress,
-        )
+        return distil(kept.planes, kept.degrees, self.rounds.original, schedule, steps)
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
-        rounds = self.rounds
-        return refit_colours(
-            rounds.bench,
-            planes,
-            degrees,
-            rounds.origin,
-            rounds.cameras,
-            rounds.targets,
-            rounds=times,
-            bands=bands,
-            subsets=self.effort.subsets_of(len(rounds.cameras)),
-            progress=rounds.progress,
-        )
+        original = self.rounds.original
+        subsets = self.effort.subsets_of(len(original.cameras))
+        return refit_colours(planes, degrees, original, rounds=times, bands=bands, subsets=subsets)
 
     def _probe(self, multiplier: float, target: Target) -> float:
         """Excess of a probe: the grid of a multiplier, without a refit of its own."""

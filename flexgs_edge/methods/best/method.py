@@ -50,6 +50,7 @@ from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.source import MemorySource, read_all
 from flexgs_edge.units import format_size
 from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
 
 LOG = logging.getLogger("flexgs_edge")
@@ -151,7 +152,7 @@ def grid_search(
     plan = EFFORTS[options.effort]
 
     def make(rounds: PruneRounds, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
-        steps = distil_steps(options, len(rounds.cameras))
+        steps = distil_steps(options, len(rounds.original.cameras))
         return search(rounds, size_of, measure, plan, options.refit, report, steps)
 
     return make
@@ -234,17 +235,13 @@ def open_rounds(
                 rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
                 # Neighbours in space become neighbours in memory, so views are drawn faster.
                 rows = storage.take(rows, near_rows(storage.take(planes["means"], rows), storage))
+                between = poses_between(scored) if steps else ()
                 rounds = make(
-                    bench,
+                    Original(bench, source.origin, scored, references, between, run.progress),
                     planes,
                     rows,
-                    source.origin,
-                    scored,
-                    references,
                     refit=options.refit,
                     unseen=options.unseen_share,
-                    progress=run.progress,
-                    between=poses_between(scored) if steps else (),
                     **({} if checkpoint is None else {"checkpoint": checkpoint}),
                 )
             del planes  # the rounds have copies of their own
@@ -261,7 +258,7 @@ def search_rounds(
     on_step: Callable[[Step], None] | None = None,
 ) -> tuple[Product, SearchResult]:
     """Search as `search_best` does, from rounds that are open already."""
-    renderer, source = rounds.bench.renderer, run.source
+    renderer, source = rounds.original.bench.renderer, run.source
 
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=source.origin)) as kept_scene:

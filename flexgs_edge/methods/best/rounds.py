@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.checkpoint import Checkpoint
 from flexgs_edge.methods.best.costs import (
@@ -25,13 +24,11 @@ from flexgs_edge.methods.best.costs import (
 )
 from flexgs_edge.methods.best.effort import LEAST_VIEWS
 from flexgs_edge.methods.best.refit.colour import normal_bytes, normal_sums, step_colours
-from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.bench import Bench
-from flexgs_edge.views.references import References
+from flexgs_edge.views.original import Original
 from flexgs_edge.views.sums import ViewSums
 
 PARTS = 2
@@ -87,50 +84,34 @@ class PruneRounds:
 
     Parameters
     ----------
-    bench : Bench
-        Draws the views.
+    original : Original
+        Scored poses and those between them. If colours are refitted, the original's renders are put into its references,
+        which are empty at first.
     planes : dict
         Stored planes of the whole scene ([width, N] f32 by field).
     rows : np.ndarray
         [n] i64, rows of the scene to start from, without dead splats. The rounds keep their order.
-    origin : np.ndarray
-        [3] f64, as in `SceneSource`.
-    cameras : sequence of Camera
-        Scored poses.
-    targets : References
-        Empty. If colours are refitted, the renders of the original from these poses are put into it.
     refit : bool
         Refit colours in each round (default).
     unseen : float
         Share of the Gaussians that no pose sees to keep, 0 to 1 (default: all). Those that are largest and most opaque
         stay first.
-    progress : Progress
-        Told of each view.
     checkpoint : Checkpoint, optional
         Keeps every round. Rounds that it holds already are read instead of computed.
-    between : sequence of Camera
-        Further poses to draw the original from (references from `len(cameras)` on). A descent that knew only the scored
-        poses would fit these, and get worse between them.
     """
 
     def __init__(
         self,
-        bench: Bench,
+        original: Original,
         planes: dict[str, np.ndarray],
         rows: np.ndarray,
-        origin: np.ndarray,
-        cameras: Sequence[Camera],
-        targets: References,
         refit: bool = True,
         unseen: float = 1.0,
-        progress: Progress = SILENT,
         checkpoint: Checkpoint | None = None,
-        between: Sequence[Camera] = (),
     ) -> None:
-        self.checkpoint = checkpoint
-        self.bench, self.renderer, self.origin, self.refit = bench, bench.renderer, origin, refit
-        self.cameras, self.targets, self.progress = cameras, targets, progress
-        self.storage, self.rows, self.between = bench.renderer.storage, rows, between
+        self.original, self.rows, self.refit, self.checkpoint = original, rows, refit, checkpoint
+        self.storage = original.bench.renderer.storage
+        cameras = original.cameras
         count = max(min(PARTS, len(cameras) // LEAST_VIEWS), 1)
         self._views = [range(first, len(cameras), count) for first in range(count)]
         self._parts: list[CostParts] = []
@@ -143,13 +124,15 @@ class PruneRounds:
 
     def _begin(self, planes: dict[str, np.ndarray], unseen: float) -> None:
         """Measure costs on the whole scene, and draw the references."""
-        storage, start = self.storage, take_rows(planes, self.rows, self.storage)
-        source = MemorySource(start, origin=self.origin)
+        original, renderer, storage = self.original, self.original.bench.renderer, self.storage
+        start = take_rows(planes, self.rows, storage)
+        source = MemorySource(start, origin=original.origin)
         sum_bytes_a_row = sum_bytes(2) + moment_bytes(source.sh_degree)
-        with self.renderer.load(source, sum_bytes_a_row, view_sums=2) as scene:
+        with renderer.load(source, sum_bytes_a_row, view_sums=2) as scene:
             self._parts = [self._measure(scene, some, keep=True) for some in self._views]
-            for view, camera in enumerate(self.renderer.in_turn(scene, self.between), start=len(self.cameras)):
-                self.targets.add(view, self.renderer.render_planes(scene, camera))
+            in_turn = renderer.in_turn(scene, original.between)
+            for view, camera in enumerate(in_turn, start=len(original.cameras)):
+                original.references.add(view, renderer.render_planes(scene, camera))
         costs = RemovalCosts.of(self._parts, storage)
         rows = storage.copy(np.arange(len(self.rows)))
         keep = np.flatnonzero(~_hidden(start, costs.weight2, unseen))
@@ -174,8 +157,8 @@ class PruneRounds:
         last = self.snapshots[-1]
         keep = np.flatnonzero(last.cheapest(last.count - round(last.count * share)))
         planes = take_rows(last.planes, keep, self.storage)
-        source = MemorySource(planes, origin=self.origin)
-        with self.renderer.load(source, sum_row_bytes(source.sh_degree), targets=self.refit) as scene:
+        source = MemorySource(planes, origin=self.original.origin)
+        with self.original.bench.renderer.load(source, sum_row_bytes(source.sh_degree), references=self.refit) as scene:
             turn = (len(self.snapshots) - 1) % len(self._parts)
             views = self._views[turn]
             measured = self._measure_and_mend(scene, planes, views) if self.refit else self._measure(scene, views)
@@ -193,9 +176,7 @@ class PruneRounds:
             for number, part in enumerate(self._parts):
                 arrays += [(f"part-{number}-{name}", getattr(part, name)) for name in PART_NAMES]
             if keep_views and self.refit:
-                arrays += [
-                    (f"view-{view}", self.targets[view]) for view in range(len(self.cameras) + len(self.between))
-                ]
+                arrays += [(f"view-{view}", self.original.references[view]) for view in range(len(self.original.poses))]
             self.checkpoint.save(len(self.snapshots) - 1, arrays)
         return snapshot
 
@@ -211,18 +192,20 @@ class PruneRounds:
         ]
         self.snapshots.append(Snapshot(arrays["rows"], planes, RemovalCosts.of(self._parts, self.storage)))
         if number == 0 and self.refit:
-            for view in range(len(self.cameras) + len(self.between)):
-                self.targets.add(view, arrays[f"view-{view}"])
+            for view in range(len(self.original.poses)):
+                self.original.references.add(view, arrays[f"view-{view}"])
         return True
 
     def _measure(self, scene: DeviceScene, views: Sequence[int], keep: bool = False) -> CostParts:
-        costs = ViewSums(self.bench, scene, [cost_sums(self.renderer, scene.sh_degree)])
+        costs = ViewSums(self.original.bench, scene, [cost_sums(self.original.bench.renderer, scene.sh_degree)])
         try:
             keep = keep and self.refit
-            drawn = costs.draw("removal_sums", [self.cameras[view] for view in views], pictures=keep)
-            for view, picture in zip(self.progress.track(views, "measuring costs", len(views)), drawn, strict=True):
+            drawn = costs.draw("removal_sums", [self.original.cameras[view] for view in views], pictures=keep)
+            for view, picture in zip(
+                self.original.progress.track(views, "measuring costs", len(views)), drawn, strict=True
+            ):
                 if keep:
-                    self.targets.add(view, picture())
+                    self.original.references.add(view, picture())
             found = cost_parts(scene.sh_degree, scene.count, self.storage)
             for rows, (sums,) in costs.parts():
                 put_costs(found, rows, sums)
@@ -231,14 +214,19 @@ class PruneRounds:
             costs.release()
 
     def _measure_and_mend(self, scene: DeviceScene, planes: dict[str, np.ndarray], views: Sequence[int]) -> CostParts:
-        makers = [cost_sums(self.renderer, scene.sh_degree, first=4), normal_sums(self.renderer)]
-        both = ViewSums(self.bench, scene, makers)
+        makers = [
+            cost_sums(self.original.bench.renderer, scene.sh_degree, first=4),
+            normal_sums(self.original.bench.renderer),
+        ]
+        both = ViewSums(self.original.bench, scene, makers)
         # The rounds drop no SH: only a multiplier does, later.
         degrees = np.full(scene.count, 4, np.uint8)
         try:
-            cameras = [self.cameras[view] for view in views]
-            drawn = both.draw("residual_and_removal_sums", cameras, lambda place: self.targets[views[place]])
-            for _ in self.progress.track(drawn, "measuring costs", len(views)):
+            cameras = [self.original.cameras[view] for view in views]
+            drawn = both.draw(
+                "residual_and_removal_sums", cameras, lambda place: self.original.references[views[place]]
+            )
+            for _ in self.original.progress.track(drawn, "measuring costs", len(views)):
                 pass
             found = cost_parts(scene.sh_degree, scene.count, self.storage)
             for rows, (costs, normal) in both.parts():

@@ -23,10 +23,10 @@ from flexgs_edge.render.fit import (
     chunk_shapes,
     padded,
     plane_bytes,
+    reference_bytes,
     shapes_bytes,
     streamed_bytes,
     sum_bytes,
-    target_bytes,
     view_bytes,
 )
 from flexgs_edge.render.renderer import Renderer
@@ -130,14 +130,14 @@ def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> i
     fit, size = renderer.fit, view_size(renderer.backend, largest)
     rows, shown = padded(min(fit.compact_rows, source.count)), -(-source.count // fit.first_share)
     chunk = rows * streamed_bytes(source.sh_degree) + shapes_bytes(chunk_shapes(rows))
-    return view_bytes(size, shown) + target_bytes(size) + sum_bytes(MOST_SUMS) * shown + chunk
+    return view_bytes(size, shown) + reference_bytes(size) + sum_bytes(MOST_SUMS) * shown + chunk
 
 
 def _least_bytes(renderer: Renderer, source: SceneSource, camera: Camera, sum_bytes: int) -> int:
     """Least bytes that a view of `source` needs, with its reference and sums of `sum_bytes` a row; nothing is loaded yet."""
     chunk = padded(min(renderer.fit.least_rows, source.count)) * streamed_bytes(source.sh_degree)
     size = view_size(renderer.backend, camera)
-    return view_bytes(size, source.count) + target_bytes(size) + sum_bytes * source.count + chunk
+    return view_bytes(size, source.count) + reference_bytes(size) + sum_bytes * source.count + chunk
 
 
 def stored_bytes(sh_degree: int) -> int:

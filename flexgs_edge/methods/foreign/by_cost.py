@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -77,7 +78,7 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         kept = self.kept(multiplier)
         planes, degrees = kept.planes, kept.degrees
         planes["sh_rest"] = lower_degree(planes["sh_rest"], int(degrees.max(initial=0)))
-        order = near_order(MemorySource(planes, origin=self.rounds.origin))
+        order = near_order(MemorySource(planes, origin=self.rounds.original.origin))
         file = self._finish(take_rows(planes, order), degrees[order])
         assert file.measurement is not None
         excess = target.excess(file.size, file.measurement)
@@ -86,37 +87,26 @@ class FileSearch(MultiplierSearch[WrittenFile]):
 
     def _finish(self, planes: dict[str, np.ndarray], degrees: np.ndarray) -> WrittenFile:
         """Refit all colours to the decoded geometry, then the constant to the decoded SH. Geometry is written as it was."""
-        rounds = self.rounds
+        original = self.rounds.original
+        source = MemorySource(planes, origin=original.origin)
         if not self.refit:
-            return self.files.make(MemorySource(planes, origin=rounds.origin))
-        found, rows = self.files.geometry(MemorySource(planes, origin=rounds.origin))
-        shared = (degrees[rows], found.origin, rounds.cameras, rounds.targets)
+            return self.files.make(source)
+        found, rows = self.files.geometry(source)
+        shared = degrees[rows], replace(original, origin=found.origin)
+        subsets = self.effort.subsets_of(len(original.cameras))
         geometry = found.read(slice(0, found.count), list(FIELD))
         colours = {name: np.ascontiguousarray(planes[name][:, rows]) for name in ("sh_dc", "sh_rest")}
-        moved = refit_colours(
-            rounds.bench,
-            {**geometry, **colours},
-            *shared,
-            rounds=self.effort.refit_rounds,
-            subsets=self.effort.subsets_of(len(rounds.cameras)),
-            progress=rounds.progress,
-        )
+        moved = refit_colours({**geometry, **colours}, *shared, rounds=self.effort.refit_rounds, subsets=subsets)
         planes = {**planes, "sh_dc": _put(moved["sh_dc"], rows), "sh_rest": _put(moved["sh_rest"], rows)}
         if len(planes["sh_rest"]):
-            place, coded = self.files.write(MemorySource(planes, origin=rounds.origin))
+            place, coded = self.files.write(MemorySource(planes, origin=original.origin))
             decoded = coded.read(slice(0, coded.count), list(FIELD))
             place.unlink()
             mended = refit_colours(
-                rounds.bench,
-                {**decoded, "sh_dc": moved["sh_dc"]},
-                *shared,
-                rounds=1,
-                bands=False,
-                subsets=self.effort.subsets_of(len(rounds.cameras)),
-                progress=rounds.progress,
+                {**decoded, "sh_dc": moved["sh_dc"]}, *shared, rounds=1, bands=False, subsets=subsets
             )
             planes["sh_dc"] = _put(mended["sh_dc"], rows)
-        return self.files.make(MemorySource(planes, origin=rounds.origin))
+        return self.files.make(MemorySource(planes, origin=original.origin))
 
 
 def _put(values: np.ndarray, rows: np.ndarray) -> np.ndarray:

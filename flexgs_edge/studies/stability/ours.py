@@ -83,13 +83,13 @@ def walked(
 
 def scored_pixels(rounds: PruneRounds) -> int:
     """Number of scored pixels in all poses of the rounds."""
-    return sum(camera.width * camera.height for camera in rounds.cameras)
+    return sum(camera.width * camera.height for camera in rounds.original.cameras)
 
 
 def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: Judge | None = None) -> Whole:
     """Search for a target; the closest candidate if none meets it."""
     judge = judge or studied.judge
-    made = _search(studied, rounds, judge, rounds.renderer)
+    made = _search(studied, rounds, judge, rounds.original.bench.renderer)
     with studied.run.clock.stage("search"):
         found = made.run(target, best_effort=True)
     multiplier = found.chosen.multiplier
@@ -98,7 +98,7 @@ def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: Judg
 
 def whole_at(studied: StudyScene, rounds: PruneRounds, judge: Judge, multiplier: float) -> Whole:
     """The candidate at a multiplier, without a search."""
-    made = _search(studied, rounds, judge, rounds.renderer)
+    made = _search(studied, rounds, judge, rounds.original.bench.renderer)
     with studied.run.clock.stage("search"):
         grid = made.at(multiplier)
     return _whole(made, grid, multiplier, True)
@@ -106,7 +106,7 @@ def whole_at(studied: StudyScene, rounds: PruneRounds, judge: Judge, multiplier:
 
 def _search(studied: StudyScene, rounds: PruneRounds, judge: Judge, renderer: Renderer) -> FixedSearch:
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
-        with renderer.load(MemorySource(planes, origin=rounds.origin)) as scene:
+        with renderer.load(MemorySource(planes, origin=rounds.original.origin)) as scene:
             return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))
 
     options = replace(studied.run.options, refit=True)

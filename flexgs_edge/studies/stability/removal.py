@@ -99,7 +99,7 @@ def _path_rows(studied: StudyScene, path: PruneRounds, most: int) -> list[dict[s
         share = 1 - snapshot.count / count
         size = studied.size(Setting(Choice(min(round(1000 * share), 999), 0), FINE))
         planes = snapshot.planes
-        found = of_source(studied, lambda: (size, MemorySource(planes, origin=path.origin)))  # noqa: B023
+        found = of_source(studied, lambda: (size, MemorySource(planes, origin=path.original.origin)))  # noqa: B023
         rows.append({"method": BEST, "share": round(share, 4), **found.cells(studied)})
     return rows
 

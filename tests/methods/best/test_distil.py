@@ -26,6 +26,7 @@ from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
 from kernel_fixtures import large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
@@ -56,7 +57,7 @@ class Workshop:
         self.renderer = Renderer(open_form(form), large_budget())
         self.cameras = [view(seed) for seed in range(SEEN)]
         with self.renderer.load(MemorySource(whole)) as scene:
-            self.targets = References.of(self.renderer, scene, self.cameras)
+            self.references = References.of(self.renderer, scene, self.cameras)
             self.original = [self.renderer.render(scene, camera) for camera in self.cameras]
 
     def _without_higher(self, rest: np.ndarray) -> np.ndarray:
@@ -73,14 +74,17 @@ class Workshop:
         return float(-10 * np.log10(np.mean(errors)))
 
     def distil(self, steps: int, grid: StepSizes | None = None, **words: Any) -> Planes:
-        shared = (self.degrees, np.zeros(3), self.cameras, self.targets)
-        return distil(self.renderer, self.kept, *shared, Schedule(steps, **words), grid, rates=RATES)
+        return distil(self.kept, self.degrees, self.seen, Schedule(steps, **words), grid, rates=RATES)
+
+    @property
+    def seen(self) -> Original:
+        return Original(Bench(self.renderer), np.zeros(3), self.cameras, self.references)
 
     def rounded(self, planes: Planes) -> Planes:
         return from_grid(to_grid(planes, self.degrees, STEPS, np.zeros(3))[0])
 
     def close(self) -> None:
-        self.targets.close()
+        self.references.close()
         self.renderer.release()
 
 
@@ -92,8 +96,7 @@ def workshop() -> Iterator[Workshop]:
 
 
 def test_a_descent_gets_closer_than_a_refit_of_colours(workshop: Workshop) -> None:
-    shared = (workshop.degrees, np.zeros(3), workshop.cameras, workshop.targets)
-    refitted = refit_colours(Bench(workshop.renderer), workshop.kept, *shared, rounds=4, subsets=2)
+    refitted = refit_colours(workshop.kept, workshop.degrees, workshop.seen, rounds=4, subsets=2)
     before, refit, short, long = map(
         workshop.fidelity, (workshop.kept, refitted, workshop.distil(12), workshop.distil(360))
     )
@@ -150,13 +153,13 @@ def test_too_little_memory_is_said_and_leaves_nothing_taken(
 ) -> None:
     use_fit(monkeypatch, pairs=1 << 10)
     use_fit(monkeypatch, least_rows=16)
-    shared = (workshop.degrees, np.zeros(3), workshop.cameras, workshop.targets)
     refused = []
     for limit in range(200_000, 4_000_000, 50_000):
         budget = MemoryBudget(limit)
         renderer = Renderer(TwinBackend(budget), budget)
         try:
-            distil(renderer, workshop.kept, *shared, Schedule(1))
+            original = Original(Bench(renderer), np.zeros(3), workshop.cameras, workshop.references)
+            distil(workshop.kept, workshop.degrees, original, Schedule(1))
         except BudgetError as error:
             refused.append(str(error))
         else:

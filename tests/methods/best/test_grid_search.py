@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -38,8 +39,6 @@ BYTES = 4000
 class FakeRounds:
     """A path whose costs are known: descending removes the cheapest and changes no cost."""
 
-    renderer = origin = targets = None
-    cameras: tuple[object, ...] = ()
     storage = IN_MEMORY
 
     def __init__(self, count: int = 600, degree: int = 1, unseen: int = 0, scale: float = 1.0) -> None:
@@ -49,7 +48,7 @@ class FakeRounds:
         removal = rng.lognormal(math.log(scale * AT * 50), 3, count) * (weight2 > 0)
         sh = rng.lognormal(math.log(scale * AT * 10), 2, (degree, count)) * (weight2 > 0)
         costs = RemovalCosts(removal, weight2, sh, np.zeros((degree, 3, count), np.float32))
-        self.origin = np.zeros(3)
+        self.original = SimpleNamespace(origin=np.zeros(3), cameras=(), bench=SimpleNamespace(renderer=None))
         self.snapshots = [Snapshot(np.arange(count), planes, costs)]
         self.shares: list[float] = []
 
@@ -301,7 +300,6 @@ def test_descents_go_on_from_each_other(found: float) -> None:
 
     world = Blurred(lambda m: found / DISTILLED * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
     rounds = FakeRounds()
-    rounds.cameras, rounds.between, rounds.progress, rounds.bench = [], [], None, None  # type: ignore[attr-defined]
     result = search(world, MaxDrop(1.0), rounds, kind=Descending, refit=True, steps=100)
     assert result.reached and len(seen) == len(result.steps)
     tried: list[float] = []

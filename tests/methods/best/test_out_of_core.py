@@ -36,6 +36,7 @@ from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
 from kernel_fixtures import FORMS, large_budget, open_form
 from synthetic import NotedSource, joined, look_from, make_camera, random_scene
@@ -76,7 +77,9 @@ def found_by(form: str, storage: ScratchStorage | None) -> dict[str, np.ndarray]
             references.add(view, drawer.render_planes(scene, camera))
         planes["sh_dc"] = planes["sh_dc"] + np.float32(0.1)
         degrees = np.arange(SCENE.count) % 3
-        moved = refit_colours(Bench(drawer), planes, degrees, SCENE.origin, cameras(), references, 2, subsets=2)
+        moved = refit_colours(
+            planes, degrees, Original(Bench(drawer), SCENE.origin, cameras(), references), 2, subsets=2
+        )
     drawer.release()
     return {**found, "moved": moved["sh_dc"], "rest": moved["sh_rest"]}
 
@@ -122,7 +125,7 @@ def test_sums_of_a_chunk_take_the_place_of_a_view(
             try:
                 with drawer.load(SCENE, sum_row_bytes(SCENE.sh_degree), view_sums=2) as scene:
                     measure_costs(Bench(drawer), scene, views)
-                refit_colours(Bench(drawer), planes, degrees, SCENE.origin, views, references, 1)
+                refit_colours(planes, degrees, Original(Bench(drawer), SCENE.origin, views, references), 1)
                 drawn.append(limit)
             except BudgetError as error:
                 assert not drawn and "a view" in str(error)

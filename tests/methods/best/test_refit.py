@@ -19,6 +19,7 @@ from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
 from kernel_fixtures import large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
@@ -86,9 +87,8 @@ class Workshop:
     ) -> Planes:
         count = planes["means"].shape[1]
         degrees = np.broadcast_to(np.asarray(degrees, np.uint8), count)
-        return refit_colours(
-            Bench(self.renderer), planes, degrees, np.zeros(3), self.cameras, self.references, rounds, bands, subsets
-        )
+        original = Original(Bench(self.renderer), np.zeros(3), self.cameras, self.references)
+        return refit_colours(planes, degrees, original, rounds, bands, subsets)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])

@@ -5,23 +5,19 @@ Each round back-projects the residual images to the Gaussians' colours (SIRT). G
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.memory.rows import copy_rows, put_rows, read_rows
-from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.bench import Bench
-from flexgs_edge.views.references import References
+from flexgs_edge.views.original import Original
 from flexgs_edge.views.sums import Maker, ViewSums
 
 RELAX_DC = 1.0
@@ -32,16 +28,12 @@ diverge: docs/results/tuning.md#relax_sh"""
 
 
 def refit_colours(
-    bench: Bench,
     planes: dict[str, np.ndarray],
     degrees: np.ndarray,
-    origin: np.ndarray,
-    cameras: Sequence[Camera],
-    targets: References,
+    original: Original,
     rounds: int,
     bands: bool = True,
     subsets: int = 1,
-    progress: Progress = SILENT,
 ) -> dict[str, np.ndarray]:
     """Move colours towards the original's renders, all at once, for a fixed number of rounds.
 
@@ -50,44 +42,37 @@ def refit_colours(
 
     Parameters
     ----------
-    bench : Bench
-        Draws the views.
     planes : dict
         Stored planes of the kept Gaussians ([width, n] f32 by field); not changed.
     degrees : np.ndarray
         [n] u8, SH degree kept for each row. Coefficients above it stay zero.
-    origin : np.ndarray
-        [3] f64, as in `SceneSource`.
-    cameras : sequence of Camera
-        The scored poses.
-    targets : References
-        Renders of the original from `cameras`.
+    original : Original
+        The scored poses and the original's renders.
     rounds : int
         How often we look at every pose. Each round takes about as long as rendering all poses.
     bands : bool
         Refit the SH above degree 0 too (default). Otherwise only the constant moves.
     subsets : int
         Steps of a round, each from an interleaved part of the poses (ordered subsets: Hudson & Larkin 1994). Default: 1.
-    progress : Progress
-        Told of each step.
 
     Returns
     -------
     dict
         The planes, with new `sh_dc` and `sh_rest`.
     """
+    bench, cameras = original.bench, original.cameras
     renderer, storage = bench.renderer, bench.renderer.storage
     planes = {**planes, "sh_dc": storage.copy(planes["sh_dc"]), "sh_rest": storage.copy(planes["sh_rest"])}
     subsets = max(min(subsets, len(cameras)), 1)
     parts = [range(first, len(cameras), subsets) for _ in range(rounds) for first in range(subsets)]
-    source = MemorySource(planes, origin=origin)
+    source = MemorySource(planes, origin=original.origin)
     sum_bytes_a_row = sum_bytes(4) + normal_bytes(source.sh_degree)
-    with renderer.load(source, sum_bytes_a_row, targets=True, view_sums=4) as scene:
-        for part in progress.track(parts, "refitting colours", len(parts)):
+    with renderer.load(source, sum_bytes_a_row, references=True, view_sums=4) as scene:
+        for part in original.progress.track(parts, "refitting colours", len(parts)):
             normal = ViewSums(bench, scene, [normal_sums(renderer)])
             try:
                 for camera, view in zip(renderer.in_turn(scene, [cameras[view] for view in part]), part, strict=True):
-                    normal.add_view(renderer.residual_sums(scene, camera, targets[view]), camera)
+                    normal.add_view(renderer.residual_sums(scene, camera, original.references[view]), camera)
                 for rows, (sums,) in normal.parts():
                     step_colours(planes, degrees, rows, sums.values(), bands)
             finally:

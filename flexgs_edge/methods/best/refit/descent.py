@@ -82,7 +82,7 @@ class Descent:
         self._arrays: list[Any] = []
         # Planes of the last chunk with SH and of the last without are padded.
         size = descent_bytes(source.sh_degree) * (self.count + 2 * LANES)
-        self._scene = renderer.load(source, -(-size // max(self.count, 1)), targets=True)
+        self._scene = renderer.load(source, -(-size // max(self.count, 1)), references=True)
         try:
             renderer.render_planes(self._scene, camera)
             if not self._scene.resident:

@@ -13,10 +13,8 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.methods.best.refit.descent import Descent
-from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.rotations import canonical_axes
-from flexgs_edge.views.references import References
+from flexgs_edge.views.original import Original
 
 MEANS_RATE = 1.6e-4
 """Largest change of a position in a step, as a share of the cameras' extent. The reference program begins with it too."""
@@ -78,39 +76,27 @@ def rates_for(cameras: Sequence[Camera]) -> dict[str, float]:
 
 
 def distil(
-    renderer: Renderer,
     planes: dict[str, np.ndarray],
     degrees: np.ndarray,
-    origin: np.ndarray,
-    cameras: Sequence[Camera],
-    targets: References,
+    original: Original,
     schedule: Schedule,
-    steps: StepSizes | None = None,
-    progress: Progress = SILENT,
+    step_sizes: StepSizes | None = None,
     rates: dict[str, float] | None = None,
 ) -> dict[str, np.ndarray]:
     """Move all values of a scene towards the original's renders.
 
     Parameters
     ----------
-    renderer : Renderer
-        With nothing loaded.
     planes : dict
         Stored planes of the kept Gaussians ([width, n] f32 by field); not changed.
     degrees : np.ndarray
         [n] u8, SH degree kept for each row. Coefficients above it stay zero.
-    origin : np.ndarray
-        [3] f64, as in `SceneSource`.
-    cameras : sequence of Camera
-        The scored poses, and those between them.
-    targets : References
-        Renders of the original from `cameras`.
+    original : Original
+        The scored poses and those between them, with the original's renders. Its renderer has nothing loaded.
     schedule : Schedule
         Number of steps, and when the grid comes in.
-    steps : StepSizes, optional
-        Step sizes of the grid that the values will be put on. The last steps then compensate for its rounding.
-    progress : Progress
-        Told of each step.
+    step_sizes : StepSizes, optional
+        Of the grid that the values will be put on. The last steps then compensate for its rounding.
     rates : dict, optional
         Rates by field, in place of those of `rates_for`.
 
@@ -124,6 +110,7 @@ def distil(
     BudgetError
         When the scene, its gradients and their running means do not fit into memory.
     """
+    cameras = original.poses
     rates = {**rates_for(cameras), **(rates or {})}
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     # Quaternions get the form that the grid has. Rows with SH come first, so that the other chunks are drawn without SH.
@@ -131,19 +118,19 @@ def distil(
     ordered = {**planes, "quats": quats.astype(np.float32), "log_scales": log_scales}
     rows = np.argsort(degrees == 0, kind="stable")
     ordered = {name: np.ascontiguousarray(values[:, rows]) for name, values in ordered.items()}
-    with Descent(renderer, ordered, degrees[rows], origin, largest) as descent:
+    with Descent(original.bench.renderer, ordered, degrees[rows], original.origin, largest) as descent:
         order = schedule.order(len(cameras))
-        parts = schedule.parts(steps is not None)
+        parts = schedule.parts(step_sizes is not None)
         for place, part in enumerate(parts):
             held = HELD if place == 2 else ()
             # Rates fall while geometry moves, and fall again while it is held.
             falling = part if held else range(parts[1].stop)
             if place and len(part):
-                descent.put_on(steps)
-            for k in progress.track(part, f"distilling{' on the grid' if place else ''}", len(part)):
+                descent.put_on(step_sizes)
+            for k in original.progress.track(part, f"distilling{' on the grid' if place else ''}", len(part)):
                 now = schedule.rate * LAST ** ((k - falling.start) / len(falling))
                 moving = {name: 0.0 if name in held else now * rate for name, rate in rates.items()}
-                descent.step(cameras[order[k]], targets[order[k]], moving)
+                descent.step(cameras[order[k]], original.references[order[k]], moving)
         moved = descent.planes()
     back = np.empty_like(rows)
     back[rows] = np.arange(len(rows))

@@ -1,0 +1,46 @@
+"""The original scene as refits and descents see it: its renders from some poses, and what draws the scene beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.references import References
+
+
+@dataclass(frozen=True)
+class Original:
+    """The original from some poses.
+
+    Parameters
+    ----------
+    bench : Bench
+        Draws the views.
+    origin : np.ndarray
+        [3] f64, as in `SceneSource`.
+    cameras : sequence of Camera
+        Scored poses.
+    references : References
+        Renders of the original from `cameras`, then from `between`.
+    between : sequence of Camera
+        Further poses. A descent that knew only the scored poses would fit these, and get worse between them.
+    progress : Progress
+        Told of each view.
+    """
+
+    bench: Bench
+    origin: np.ndarray
+    cameras: Sequence[Camera]
+    references: References
+    between: Sequence[Camera] = ()
+    progress: Progress = SILENT
+
+    @property
+    def poses(self) -> list[Camera]:
+        """All poses, in the order of their references."""
+        return [*self.cameras, *self.between]
