@@ -6,12 +6,8 @@ import logging
 import os
 from contextlib import ExitStack
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from flexgs_edge.io.formats import Format
 from flexgs_edge.methods.best import method as best
 from flexgs_edge.methods.best.spill import prepare_memory
 from flexgs_edge.methods.foreign import method as foreign
@@ -23,9 +19,7 @@ from flexgs_edge.run.inputs import ScenePlace, scene_info
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.run.outputs import check_outputs, foreign_format
-from flexgs_edge.run.reporter import Reporter
-from flexgs_edge.run.run import Run, open_planned
+from flexgs_edge.run.run import Run, open_compression
 from flexgs_edge.run.view_set import GivenViews, views_info
 from flexgs_edge.views.bench import Bench
 
@@ -68,38 +62,28 @@ def compress(
         `InputError`, `TargetError`, `DeviceError` or `BudgetError`; nothing is left behind then.
     """
     options = replace(options or CompressOptions(), **words)
-    format = foreign_format(output, options)
-    place = check_outputs(output, options)
-    reporter = Reporter.maybe(options.report, options.force)
-    scores: list[np.ndarray | None] = []
-
-    def check(run: Run[CompressOptions]) -> None:
+    run = open_compression(input, output, options, progress, given)
+    with run.clock.stage("open"):
         prepare_memory(run)
-        scores.append(paper.given_scores(run))
-
-    run = open_planned(input, options, progress, reporter, check, given)
+        scores = paper.given_scores(run)
     with ExitStack() as stack:
         bench = None if run.views is None else stack.enter_context(open_bench(run, options.cluster))
-        if reporter is not None and run.views is not None and run.plan is not None:
-            reporter.reserve(run.budget, run.views, run.plan.report)
-        if format is not None:
-            made = foreign.compress(run, bench, place, format, scores[0])
+        if run.output.format is not None:
+            made = foreign.compress(run, bench, scores)
         elif options.method == "paper":
-            made = paper.compress(run, bench, place, scores[0])
+            made = paper.compress(run, bench, scores)
         else:
             assert bench is not None  # the plan has refused such runs without views
-            made = best.compress(run, bench, place)
-        result = _result(run, bench, place, format, made)
-    if reporter is not None:
-        if place is not None and format is None:
-            reporter.read_contents(place)
-        reporter.write(result, None if run.plan is None else run.plan.target)
+            made = best.compress(run, bench)
+        result = _result(run, bench, made)
+    if run.reporter is not None:
+        if run.output.path is not None:
+            run.reporter.read_contents(run.output.path)
+        run.reporter.write(result, None if run.plan is None else run.plan.target)
     return result
 
 
-def _result(
-    run: Run[CompressOptions], bench: Bench | None, output: Path | None, format: Format | None, made: Made
-) -> CompressResult:
+def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> CompressResult:
     """The record of a run; its warnings are logged."""
     options, plan, views, search = run.options, run.plan, run.views, made.search
     assert plan is not None
@@ -111,7 +95,7 @@ def _result(
     return CompressResult(
         scene=scene_info(run.scene),
         views=views_info(views) if views else None,
-        output=None if output is None else os.fspath(output),
+        output=None if run.output.path is None else os.fspath(run.output.path),
         size=made.size,
         count=made.count,
         sh_count=made.sh_count,
@@ -135,7 +119,7 @@ def _result(
         score_cache=options.score_cache if plan.computes_scores else None,
         scores_reused=made.scores_reused,
         run=bench_info(run, bench),
-        format=format.suffix[1:] if format else "fgs",
+        format=run.output.format.suffix[1:] if run.output.format else "fgs",
         file_sh_degree=made.sh_degree,
         scored=scored,
         training_fidelity=made.trained,

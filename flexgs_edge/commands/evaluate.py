@@ -58,16 +58,11 @@ def evaluate(
         raise InputError(f"--base-psnr {base_psnr:g}: expected decibels between 0 and 200")
     reporter = Reporter.maybe(report, force)
     # Both are drawn alike; a compressed scene knows how its original was.
-    run = open_run(against, options, progress, reporter, drawn_as=input)
-    views, scene, clock, budget = run.seen, run.made or run.scene, run.clock, run.budget
+    run = open_run(against, options, progress, reporter, judged_path=input)
+    views, scene, clock, budget = run.seen, run.judged or run.scene, run.clock, run.budget
     indices = views.held_out or views.train
-    if reporter is not None:
-        with clock.stage("open"):
-            reporter.see_cameras(views, run.scene)
     with ExitStack() as stack:
         bench = stack.enter_context(open_bench(run))
-        if reporter is not None:
-            reporter.reserve(budget, views, indices)
         renderer = bench.renderer
         distance: Lpips | None = None
         if lpips:  # before any drawing: packages or weights may be missing

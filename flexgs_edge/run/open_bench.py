@@ -36,9 +36,15 @@ def open_bench(run: Run[Any], cluster: str | None = None) -> Bench:
     drawing = options.near, options.background, options.extent, options.antialiased
     backend = counted_backend(options.device, run.budget, run.clock)
     bench = Bench(Renderer(backend, run.budget, *drawing))
-    if cluster is not None:
-        with run.clock.stage("cluster"):
-            bench.cluster = Cluster(cluster, Drawing(options.device, options.memory_limit, *drawing))
+    try:
+        if cluster is not None:
+            with run.clock.stage("cluster"):
+                bench.cluster = Cluster(cluster, Drawing(options.device, options.memory_limit, *drawing))
+        if run.reporter is not None and run.views is not None:
+            run.reporter.reserve(run.budget, run.views)
+    except BaseException:
+        bench.close()
+        raise
     return bench
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 from flexgs_edge.errors import InputError
@@ -12,28 +13,49 @@ from flexgs_edge.io.formats import FORMATS, Format, format_of
 from flexgs_edge.run.options import CompressOptions
 
 
-def check_outputs(output: str | os.PathLike[str] | None, options: CompressOptions) -> Path | None:
-    """The file to write (None in a dry run); raises `InputError` for what cannot be written."""
+@dataclass(frozen=True)
+class Output:
+    """Where a compressed scene goes.
+
+    Parameters
+    ----------
+    path : Path or None
+        The file to write; `None` in a dry run.
+    format : Format or None
+        Another program's format; `None` for a `.fgs`.
+    """
+
+    path: Path | None = None
+    format: Format | None = None
+
+
+NO_OUTPUT = Output()
+"""Of commands that write no scene."""
+
+
+def check_output(output: str | os.PathLike[str] | None, options: CompressOptions) -> Output:
+    """Check every file that a run writes, before any work; raises `InputError` for what cannot be written."""
+    format = _foreign_format(output, options)
     if options.save_scores is not None:
         check_writable(options.save_scores, options.force)
     if options.score_cache is not None:
         check_writable(options.score_cache, force=True)
     if options.dry_run:
-        return None
+        return Output(None, format)
     if output is None:
         raise InputError("-o OUT.fgs is missing: give the file to write, or --dry-run")
-    if Path(output).suffix.lower() != ".fgs" and foreign_format(output, options) is None:
+    if Path(output).suffix.lower() != ".fgs" and format is None:
         raise InputError(f"-o {output}: expected a name that ends in .fgs, {', '.join(FORMATS)}")
     check_writable(output, options.force)
-    return Path(output)
+    return Output(Path(output), format)
 
 
 FORMAT_BITS = ("bits", "groups")
-"""Options that say what the format itself has settled."""
+"""Options for precisions that other formats have settled."""
 
 
-def foreign_format(output: str | os.PathLike[str] | None, options: CompressOptions) -> Format | None:
-    """The format that `-o` asks for, checked against the options before any work; None for `.fgs`."""
+def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOptions) -> Format | None:
+    """The format that `-o` asks for, if the options fit it; `None` for `.fgs`."""
     format = None if output is None else format_of(output)
     if format is None:
         return None

@@ -79,9 +79,9 @@ class Reporter:
             for name in (PAGE, RECORD):
                 check_writable(folder / name, self.force)
 
-    def reserve(self, budget: MemoryBudget, views: ViewSet, indices: list[int]) -> None:
+    def reserve(self, budget: MemoryBudget, views: ViewSet) -> None:
         """Take the pictures' memory before any work, so that a limit that is too small is named at once."""
-        budget.take("pictures of the report", shots_bytes(views.of(indices)))
+        budget.take("pictures of the report", shots_bytes(views.of(views.held_out or views.train)))
 
     def look(
         self, judge: Judge, scene: DeviceScene, quality: Quality, clock: Stopwatch, progress: Progress = SILENT

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
 from dataclasses import dataclass, replace
 from typing import Generic
 
@@ -15,6 +15,7 @@ from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.companions import companions_of, merge_companions
 from flexgs_edge.run.inputs import CheckedScene, Options, ScenePlace, load_scene, resolve_drawing
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.outputs import NO_OUTPUT, Output, check_output
 from flexgs_edge.run.plan import Plan
 from flexgs_edge.run.reporter import Reporter
 from flexgs_edge.run.view_set import WITHOUT_VIEWS, GivenViews, ViewSet, find_views
@@ -43,8 +44,10 @@ class Run(Generic[Options]):
         Bars on long work.
     reporter : Reporter or None
         Gathers the pages of `--report`.
-    made : CheckedScene or None
-        A scene made from this one, where that is what a command looks at.
+    output : Output
+        The file that `compress` writes.
+    judged : CheckedScene or None
+        The scene that is compared with this one (`evaluate`).
     """
 
     options: Options
@@ -55,7 +58,8 @@ class Run(Generic[Options]):
     clock: Stopwatch
     progress: Progress = SILENT
     reporter: Reporter | None = None
-    made: CheckedScene | None = None
+    output: Output = NO_OUTPUT
+    judged: CheckedScene | None = None
 
     @property
     def source(self) -> SceneSource:
@@ -91,7 +95,7 @@ def open_run(
     progress: Progress = SILENT,
     reporter: Reporter | None = None,
     photos: bool = True,
-    drawn_as: ScenePlace | None = None,
+    judged_path: ScenePlace | None = None,
     given: GivenViews | None = None,
 ) -> Run[Options]:
     """Open a scene with its views (stage `open`).
@@ -102,8 +106,9 @@ def open_run(
         A scene file or a model folder, or a scene that is open.
     photos : bool
         Look for photos as well as for cameras.
-    drawn_as : path or CheckedScene, optional
-        A scene made from this one: it is drawn as its file says, and cameras beside it are used where this one has none.
+    judged_path : path or CheckedScene, optional
+        A scene made from this one, which it is compared with. Both are drawn as its file says, and cameras beside it are
+        used where this one has none.
     given : GivenViews, optional
         Cameras and photos from memory, instead of those that the options name.
 
@@ -116,35 +121,45 @@ def open_run(
     budget = MemoryBudget.from_limit(options.memory_limit)
     with clock.stage("open"):
         companions = _beside(path)
-        if drawn_as is not None:
-            companions = merge_companions(companions, _beside(drawn_as))
+        if judged_path is not None:
+            companions = merge_companions(companions, _beside(judged_path))
         scene = load_scene(path, options.drop_invalid)
-        made = None if drawn_as is None else load_scene(drawn_as, options.drop_invalid)
-        options = resolve_drawing(options, made if made is not None and made.settings else scene, companions)
+        judged = None if judged_path is None else load_scene(judged_path, options.drop_invalid)
+        options = resolve_drawing(options, judged if judged is not None and judged.settings else scene, companions)
         views = find_views(options, companions, scene.source, photos, given)
-    return Run(options, scene, views, None, budget, clock, progress, reporter, made)
+        if reporter is not None and views is not None:
+            reporter.see_cameras(views, scene)
+    return Run(options, scene, views, None, budget, clock, progress, reporter, judged=judged)
 
 
-def open_planned(
+def planned(run: Run[CompressOptions]) -> Run[CompressOptions]:
+    """A run that compresses: raises `InputError` where options, scores and views do not fit together."""
+    with run.clock.stage("open"):
+        return replace(run, plan=Plan.make(run.options, run.scene, run.views))
+
+
+def open_compression(
     path: ScenePlace,
+    output: str | os.PathLike[str] | None,
     options: CompressOptions,
     progress: Progress = SILENT,
-    reporter: Reporter | None = None,
-    check: Callable[[Run[CompressOptions]], object] | None = None,
     given: GivenViews | None = None,
 ) -> Run[CompressOptions]:
-    """`open_run` for what compresses: the words of the options, the scores and the views must fit together.
+    """Open what `compress` needs: check its files, open the scene and its views, and plan.
 
-    `check` is called in stage `open`, before any work.
+    Parameters
+    ----------
+    output : path or None
+        The file to write; `None` in a dry run.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be written or read, or the options do not fit together.
     """
-    run = open_run(path, options, progress, reporter, given=given)
-    with run.clock.stage("open"):
-        run = replace(run, plan=Plan.make(run.options, run.scene, run.views))
-        if check is not None:
-            check(run)
-        if reporter is not None and run.views is not None:
-            reporter.see_cameras(run.views, run.scene)
-    return run
+    place = check_output(output, options)
+    reporter = Reporter.maybe(options.report, options.force)
+    return replace(planned(open_run(path, options, progress, reporter, given=given)), output=place)
 
 
 def _beside(place: ScenePlace) -> Companions:

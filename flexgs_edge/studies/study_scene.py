@@ -27,7 +27,7 @@ from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.open_bench import open_bench
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.plan import EVERYTHING, Plan
-from flexgs_edge.run.run import Run, open_planned
+from flexgs_edge.run.run import Run, open_run, planned
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.studies.result_tables import Cell
 from flexgs_edge.views.bench import Bench
@@ -219,7 +219,7 @@ def open_study_scene(
         As `compress`.
     """
     # Planning refuses scenes without cameras, and splits without training poses, as `compress` does.
-    run = open_planned(path, options, progress)
+    run = planned(open_run(path, options, progress))
     source, views, plan, clock = run.source, run.seen, run.plan, run.clock
     assert plan is not None
     with clock.stage("open"):

@@ -307,11 +307,12 @@ def test_pictures_are_taken_from_the_budget(project: Path) -> None:
     source = open_scene(project / "point_cloud.ply")
     views = find_views(ViewOptions(background=(0.0, 0.0, 0.0)), companions_of(project), source)
     assert views is not None
+    views = replace(views, held_out=[])
     budget = MemoryBudget(WIDTH * HEIGHT * 4 * 5)
-    Reporter(project / "page", False).reserve(budget, views, views.train)
+    Reporter(project / "page", False).reserve(budget, views)
     assert budget.free == 0
     with pytest.raises(BudgetError, match="pictures of the report"):
-        Reporter(project / "page", False).reserve(budget, views, views.train)
+        Reporter(project / "page", False).reserve(budget, views)
 
 
 def test_the_command_line_takes_a_report(project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -59,7 +59,7 @@ Report = Callable[[Candidate], None]
 SearchMaker = Callable[[PruneRounds, Measure, Report], MultiplierSearch[Product]]
 
 
-def compress(run: Run[CompressOptions], bench: Bench, output: Path | None) -> Made:
+def compress(run: Run[CompressOptions], bench: Bench) -> Made:
     """Compress a scene into a `.fgs` of version 2.
 
     Parameters
@@ -68,8 +68,6 @@ def compress(run: Run[CompressOptions], bench: Bench, output: Path | None) -> Ma
         Planned, with views and a target.
     bench : Bench
         Draws the views. Its renderer gets the storage that the search needs.
-    output : Path or None
-        The file to write; `None` in a dry run.
 
     Raises
     ------
@@ -78,6 +76,7 @@ def compress(run: Run[CompressOptions], bench: Bench, output: Path | None) -> Ma
     BudgetError
         When the scene does not fit.
     """
+    output = run.output.path
     with Judges(run, bench) as judges:
         poses = scored_poses(run.seen.of(run.seen.train), run.options, bench.renderer, run.source)
         folder = Path(run.options.scratch or (tempfile.gettempdir() if output is None else output.parent))

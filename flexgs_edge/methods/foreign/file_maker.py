@@ -64,13 +64,13 @@ class WrittenFile:
 
 @contextmanager
 def open_files(
-    format: Format,
     run: Run[CompressOptions],
-    output: Path | None,
+    format: Format,
     bench: Bench | None = None,
     judges: Judges | None = None,
 ) -> Iterator[FileMaker]:
     """A `FileMaker` with a folder beside `output` (in a dry run: in TMPDIR), which is removed when the block ends."""
+    output = run.output.path
     beside = None if output is None else check_writable(output, run.options.force).parent
     renderer, judge = None if bench is None else bench.renderer, None if judges is None else judges.decide
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=beside) as folder:

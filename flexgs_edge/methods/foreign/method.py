@@ -5,14 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import nullcontext
-from pathlib import Path
 
 import numpy as np
 
 from flexgs_edge.goals.steps import Step, step_words
 from flexgs_edge.goals.target import Target
 from flexgs_edge.io.exchange import read_foreign
-from flexgs_edge.io.formats import Format
 from flexgs_edge.methods.best.method import search_best
 from flexgs_edge.methods.best.poses import scored_poses
 from flexgs_edge.methods.foreign.by_cost import file_search
@@ -29,13 +27,7 @@ from flexgs_edge.views.bench import Bench
 LOG = logging.getLogger("flexgs_edge")
 
 
-def compress(
-    run: Run[CompressOptions],
-    bench: Bench | None,
-    output: Path | None,
-    format: Format,
-    scores: np.ndarray | None = None,
-) -> Made:
+def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray | None = None) -> Made:
     """Compress a scene into a file of another program's format.
 
     Parameters
@@ -44,15 +36,11 @@ def compress(
         Planned. Its method decides: `best` searches by measured costs, `paper` prunes in rank order.
     bench : Bench or None
         Draws the views; `None` for runs without views, whose rates are fixed.
-    output : Path or None
-        The file to write; `None` in a dry run.
-    format : Format
-        The format to write.
     scores : np.ndarray or None
         [N] f64 from a file, for `paper`.
     """
-    options, plan = run.options, run.plan
-    assert plan is not None
+    options, plan, output, format = run.options, run.plan, run.output.path, run.output.format
+    assert plan is not None and format is not None
     with nullcontext() if bench is None else Judges(run, bench) as judges:
         order: np.ndarray | None = None
         reused = False
@@ -66,7 +54,7 @@ def compress(
         poses = None
         if order is None and bench is not None:
             poses = scored_poses(run.seen.of(run.seen.train), options, bench.renderer, run.source)
-        with open_files(format, run, output, bench, judges) as files:
+        with open_files(run, format, bench, judges) as files:
             if plan.target is not None:
                 LOG.info("searching for %s", plan.target.describe())
             if order is not None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from contextlib import nullcontext
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -55,9 +54,7 @@ class Ranking:
     reused: bool = False
 
 
-def compress(
-    run: Run[CompressOptions], bench: Bench | None, output: Path | None, scores: np.ndarray | None = None
-) -> Made:
+def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray | None = None) -> Made:
     """Compress a scene into a `.fgs` of version 1.
 
     Parameters
@@ -66,8 +63,6 @@ def compress(
         Planned.
     bench : Bench or None
         Draws the views; `None` for runs without views, whose rates are fixed.
-    output : Path or None
-        The file to write; `None` in a dry run.
     scores : np.ndarray or None
         [N] f64 from a file (see `given_scores`). By default they are computed if the run needs them.
     """
@@ -91,7 +86,7 @@ def compress(
         choice = search.chosen.choice if search else run.options.fixed
         assert choice is not None
         with evaluator.quantized(choice) as quantized:
-            quality = _write(run, output, quantized, search, judges)
+            quality = _write(run, quantized, search, judges)
         return Made(
             size=evaluator.size(choice),
             count=quantized.count,
@@ -169,13 +164,12 @@ def _search(run: Run[CompressOptions], evaluator: SceneEvaluator) -> SearchResul
 
 def _write(
     run: Run[CompressOptions],
-    output: Path | None,
     quantized: QuantizedScene,
     search: SearchResult | None,
     judges: Judges | None,
 ) -> Quality | None:
     """Write the file under a temporary name, measure the decoded scene, and only then give the file its name."""
-    settings = make_settings(run, search, quantized.bits)
+    settings, output = make_settings(run, search, quantized.bits), run.output.path
     if output is None:
         if run.reporter is not None:
             run.reporter.read_contents_of(lambda place: write_container(place, quantized, settings))

@@ -24,6 +24,7 @@ from flexgs_edge.methods.foreign.file_maker import open_files
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.run.judge import measurement_of
+from flexgs_edge.run.outputs import Output
 from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.run.settings import make_settings
 from flexgs_edge.scene.source import MemorySource
@@ -238,7 +239,7 @@ def peer_points(studied: StudyScene, folder: Path) -> Found:
 def _peer_point(studied: StudyScene, name: str, format: Format, place: Path) -> RatePoint:
     source = studied.run.source
     with ExitStack() as stack:
-        files = stack.enter_context(open_files(format, studied.run, place))
+        files = stack.enter_context(open_files(replace(studied.run, output=Output(place, format)), format))
         started = time.perf_counter()
         # Rows in the order that `compress` writes: neighbours along the curve have similar bytes.
         path, decoded = files.write(source.select(near_order(source)))
