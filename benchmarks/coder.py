@@ -111,7 +111,7 @@ def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str |
         start = {**from_grid(grid), **exact, "sh_dc": np.ascontiguousarray(planes["sh_dc"][:, order])}
         degrees = np.full(source.count, source.sh_degree, np.uint8)
         with targets:
-            mended = refit_colours(
+            refitted = refit_colours(
                 start,
                 degrees,
                 Original(Bench(renderer), source.origin, cameras, targets, (), progress),
@@ -119,7 +119,7 @@ def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str |
                 False,
                 SUBSETS,
             )
-        write_grid(output, recolour(grid, mended["sh_dc"], exact["sh_rest"]), {}, force=True)
+        write_grid(output, recolour(grid, refitted["sh_dc"], exact["sh_rest"]), {}, force=True)
         decoded = GridSource(output)
         values = {**decoded.read(slice(0, decoded.count), list(FIELD)), **exact}
         with renderer.load(MemorySource(values, source.sh_degree, decoded.origin)) as compressed:

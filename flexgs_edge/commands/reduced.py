@@ -82,14 +82,16 @@ def _coarser_positions(grid: GridScene) -> GridScene:
     corner = cells.min(axis=1, keepdims=True, initial=np.iinfo(np.int32).max)
     order = np.lexsort((morton(cells - corner), grid.layer))
     return replace(
-        grid.take(order), position=cells[:, order], steps=replace(grid.steps, position=2 * grid.steps.position)
+        grid.take(order),
+        position=cells[:, order],
+        step_sizes=replace(grid.step_sizes, position=2 * grid.step_sizes.position),
     )
 
 
 def _coarser(grid: GridScene, name: str) -> GridScene:
-    steps: dict[str, Any] = {name: 2 * getattr(grid.steps, name)}
+    steps: dict[str, Any] = {name: 2 * getattr(grid.step_sizes, name)}
     values: dict[str, Any] = {name: _halved(getattr(grid, name))}
-    return replace(grid, steps=replace(grid.steps, **steps), **values)
+    return replace(grid, step_sizes=replace(grid.step_sizes, **steps), **values)
 
 
 def _level(grid: GridScene, name: str) -> GridScene:
@@ -101,9 +103,9 @@ def _level(grid: GridScene, name: str) -> GridScene:
 
 
 def _coarser_sh(grid: GridScene, degree: int) -> GridScene:
-    bands, steps = list(grid.sh), list(grid.steps.sh)
+    bands, steps = list(grid.sh), list(grid.step_sizes.sh)
     bands[degree - 1], steps[degree - 1] = _halved(bands[degree - 1]), 2 * steps[degree - 1]
-    return replace(grid, sh=tuple(bands), steps=replace(grid.steps, sh=tuple(steps)))
+    return replace(grid, sh=tuple(bands), step_sizes=replace(grid.step_sizes, sh=tuple(steps)))
 
 
 def _without_sh(grid: GridScene, degree: int) -> GridScene:
@@ -113,7 +115,7 @@ def _without_sh(grid: GridScene, degree: int) -> GridScene:
         sh_degree=left,
         sh_degrees=np.minimum(grid.sh_degrees, left).astype(np.uint8),
         sh=grid.sh[:left],
-        steps=replace(grid.steps, sh=grid.steps.sh[:left]),
+        step_sizes=replace(grid.step_sizes, sh=grid.step_sizes.sh[:left]),
     )
 
 

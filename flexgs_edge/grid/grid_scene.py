@@ -22,7 +22,7 @@ class GridScene:
         D; 0 if no row has SH.
     origin : np.ndarray
         [3] f64, world: positions are relative to it.
-    steps : StepSizes
+    step_sizes : StepSizes
         A value is its code times the step size.
     position : np.ndarray
         [3, n] i32.
@@ -45,7 +45,7 @@ class GridScene:
     count: int
     sh_degree: int
     origin: np.ndarray
-    steps: StepSizes
+    step_sizes: StepSizes
     position: np.ndarray
     scale: np.ndarray
     rotation: np.ndarray
@@ -70,7 +70,7 @@ class GridScene:
             len(rows),
             top,
             self.origin,
-            replace(self.steps, sh=self.steps.sh[:top]),
+            replace(self.step_sizes, sh=self.step_sizes.sh[:top]),
             storage.take(self.position, rows),
             storage.take(self.scale, rows),
             storage.take(self.rotation, rows),

@@ -96,7 +96,7 @@ def lowered(grid: GridScene, storage: Storage = IN_MEMORY) -> GridScene:
     return replace(
         grid,
         sh_degree=top,
-        steps=replace(grid.steps, sh=grid.steps.sh[:top]),
+        step_sizes=replace(grid.step_sizes, sh=grid.step_sizes.sh[:top]),
         sh_degrees=degrees,
         sh=tuple(bands[:top]),
     )

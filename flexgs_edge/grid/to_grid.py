@@ -130,10 +130,12 @@ def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray, storage: S
     dc = storage.empty((3, grid.count), np.int32)
     for part in blocks(grid.count):
         rows, some = np.arange(part.start, part.stop), read_rows(sh_dc, part)[:, None]
-        put_rows(dc, part, _colour_codes("sh_dc", some, grid.steps.colour(grid.steps.dc), rows)[:, 0])
+        put_rows(dc, part, _colour_codes("sh_dc", some, grid.step_sizes.colour(grid.step_sizes.dc), rows)[:, 0])
     degrees = range(1, grid.sh_degree + 1)
     colours = OrderedPlanes({"sh_rest": sh_rest}, None, storage)
-    bands = tuple(_band_codes(colours, d, np.flatnonzero(grid.sh_degrees >= d), grid.steps, storage) for d in degrees)
+    bands = tuple(
+        _band_codes(colours, d, np.flatnonzero(grid.sh_degrees >= d), grid.step_sizes, storage) for d in degrees
+    )
     return replace(grid, dc=dc, sh=bands)
 
 

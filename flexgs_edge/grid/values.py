@@ -58,7 +58,7 @@ def from_grid(
     dict
         {field: [width, n] f32}; SH above a row's degree are zero.
     """
-    steps = grid.steps
+    steps = grid.step_sizes
     makers = {
         "means": lambda: _values(_part(grid.position, rows), steps.position),
         "sh_dc": lambda: _rgb(_part(grid.dc, rows)[:, None], steps.colour(steps.dc))[:, 0],
@@ -98,7 +98,9 @@ def _spread_bands(grid: GridScene, degrees: np.ndarray, bands: Sequence[np.ndarr
     planes = np.zeros((3, sh_rest_count(grid.sh_degree), len(degrees)), np.float32)
     for degree, chosen in enumerate(bands, start=1):
         has = np.flatnonzero(degrees >= degree)
-        values = _rgb(chosen.reshape(3, 2 * degree + 1, len(has)), grid.steps.colour(grid.steps.sh[degree - 1]))
+        values = _rgb(
+            chosen.reshape(3, 2 * degree + 1, len(has)), grid.step_sizes.colour(grid.step_sizes.sh[degree - 1])
+        )
         band = planes[:, degree * degree - 1 : (degree + 1) ** 2 - 1]
         for colour, coefficients in zip(band, values, strict=True):
             # Plane by plane: indexing all planes at once with one list of places is much slower.

@@ -57,11 +57,11 @@ def test_info_of_version_2_shares_every_byte_out(tmp_path: Path) -> None:
     for degree in (1, 2):
         channel = channels[f"sh {degree}"]
         assert channel["rows"] == np.count_nonzero(grid.sh_degrees >= degree) < 900
-        assert channel["step"] == grid.steps.sh[degree - 1]
+        assert channel["step"] == grid.step_sizes.sh[degree - 1]
         assert channel["bits_per_row"] == pytest.approx(8 * channel["bytes"] / channel["rows"], rel=0.01)
         assert channel["bits_per_gaussian"] < channel["bits_per_row"]
-    assert channels["position"]["step"] == grid.steps.position and channels["sh degree"]["step"] is None
-    assert found["cut_from"] is None and found["chroma"] == grid.steps.chroma
+    assert channels["position"]["step"] == grid.step_sizes.position and channels["sh degree"]["step"] is None
+    assert found["cut_from"] is None and found["chroma"] == grid.step_sizes.chroma
     assert [layer["rows"] for layer in found["layers"]] == np.bincount(grid.layer).tolist()
     chunks = sum(
         section.length

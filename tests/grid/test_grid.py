@@ -119,7 +119,7 @@ def test_some_rows_and_fields() -> None:
 
 def test_a_second_trip_changes_nothing() -> None:
     grid = make_grid(400, 2, layers=2)
-    back, order = to_grid(from_grid(grid), grid.sh_degrees, grid.steps, grid.origin, grid.layer)
+    back, order = to_grid(from_grid(grid), grid.sh_degrees, grid.step_sizes, grid.origin, grid.layer)
     np.testing.assert_array_equal(order, np.arange(400))
     for name in ("position", "opacity", "dc", "sh_degrees"):
         np.testing.assert_array_equal(getattr(back, name), getattr(grid, name))
@@ -175,11 +175,11 @@ def test_steps_through_json() -> None:
 def test_values_of_a_grid_are_found_on_it_again(degree: int) -> None:
     grid = make_grid(300, degree, 17)
     planes = from_grid(grid)
-    steps = steps_of(("flexgs-edge knows", grid_comment(grid.steps)))
-    assert steps == grid.steps
+    steps = steps_of(("flexgs-edge knows", grid_comment(grid.step_sizes)))
+    assert steps == grid.step_sizes
     order = np.random.default_rng(3).permutation(300)
-    again = on_grid({name: values[:, order] for name, values in planes.items()}, grid.steps, grid.origin)
-    assert again is not None and again.steps.sh == grid.steps.sh[: again.sh_degree]
+    again = on_grid({name: values[:, order] for name, values in planes.items()}, grid.step_sizes, grid.origin)
+    assert again is not None and again.step_sizes.sh == grid.step_sizes.sh[: again.sh_degree]
     for name, values in from_grid(again).items():
         np.testing.assert_array_equal(values, planes[name][: len(values)] if name != "sh_rest" else values)
     np.testing.assert_array_equal(again.rotation, grid.rotation)
@@ -200,8 +200,8 @@ def test_degrees_are_as_low_as_the_codes_allow(zero_above: int) -> None:
         bands.append(codes)
     grid = replace(grid, sh=tuple(bands))
     low = lowered(grid)
-    again = on_grid(from_grid(grid), grid.steps, grid.origin)
-    assert again is not None and low.sh_degree == again.sh_degree and low.steps == again.steps
+    again = on_grid(from_grid(grid), grid.step_sizes, grid.origin)
+    assert again is not None and low.sh_degree == again.sh_degree and low.step_sizes == again.step_sizes
     assert (low.sh_degrees <= grid.sh_degrees).all() and low.sh_degrees[rows].max(initial=0) <= zero_above
     np.testing.assert_array_equal(low.sh_degrees, again.sh_degrees)
     for mine, theirs in zip(low.sh, again.sh, strict=True):
@@ -216,9 +216,9 @@ def test_values_that_were_changed_lie_on_no_grid(field: str) -> None:
     grid = make_grid(60, 1, 18)
     planes = from_grid(grid)
     planes[field][-1, 7] = np.nextafter(planes[field][-1, 7], np.float32(9))
-    assert on_grid(planes, grid.steps, grid.origin) is None
+    assert on_grid(planes, grid.step_sizes, grid.origin) is None
     # Steps of another scene: nothing fits, and codes may be out of range.
-    tiny = replace(grid.steps, position=1e-20)
+    tiny = replace(grid.step_sizes, position=1e-20)
     assert on_grid(from_grid(grid), tiny, grid.origin) is None
 
 

@@ -31,7 +31,7 @@ def make_grid(count: int, sh_degree: int = 2, seed: int = 0, layers: int = 1, st
 
 def assert_same_grid(one: GridScene, two: GridScene) -> None:
     """Equal codes, steps and layers."""
-    assert (one.count, one.sh_degree, one.steps) == (two.count, two.sh_degree, two.steps)
+    assert (one.count, one.sh_degree, one.step_sizes) == (two.count, two.sh_degree, two.step_sizes)
     for name in ("origin", "position", "scale", "rotation", "opacity", "dc", "sh_degrees", "layer"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name), name)
     assert len(one.sh) == len(two.sh)

@@ -142,13 +142,13 @@ def test_a_row_at_the_camera_leaves_no_trace(form: str) -> None:
     with renderer.load(source) as scene, References.of(renderer, scene, cameras) as references:
         costs = measure_costs(Bench(renderer), scene, cameras)
         planes = {**arrays, "sh_dc": arrays["sh_dc"] / 2}
-        mended = refit_colours(
+        refitted = refit_colours(
             planes, np.full(16, 2), Original(Bench(renderer), np.zeros(3), cameras, references), rounds=2
         )
     renderer.release()
     assert costs.weight2[3] == 0 and not costs.sh[:, 3].any() and not costs.sh_mean[:, :, 3].any()
     assert (costs.weight2 > 0).sum() > 5
-    for name, values in mended.items():
+    for name, values in refitted.items():
         assert np.isfinite(values).all() and same_bits(values[:, 3], planes[name][:, 3])
 
 

@@ -110,7 +110,7 @@ class GridHeader:
             grid.count,
             grid.sh_degree,
             (x, y, z),
-            grid.steps.to_json(),
+            grid.step_sizes.to_json(),
             tuple(int(rows) for rows in layers),
             chunk_rows,
             depth,

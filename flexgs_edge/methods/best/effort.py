@@ -17,9 +17,9 @@ LEAST_VIEWS = 6
 """Least poses for a step of the refit. Steps from fewer poses overfit the scored poses, and all others get worse:
 docs/results/tuning.md#least_views"""
 
-MENDED = 0.66
+REFITTED = 0.66
 """Expected loss after the first round of the colour refit, divided by the loss before it, until a candidate tells:
-docs/results/tuning.md#mended"""
+docs/results/tuning.md#refitted"""
 LARGEST_STEP = 4
 """Largest distance in pixels between those that we look at. Splats of one or two pixels must not fall between them
 in every view."""
@@ -49,8 +49,8 @@ class Effort:
     pixels : int
         Least pixels of all scored poses for each Gaussian. We look at every k-th pixel in both directions, with the
         largest k that leaves as many. More pixels take longer, fewer make files larger: docs/results/tuning.md#pixels
-    mended : float
-        `MENDED` at this effort: the fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
+    refitted : float
+        `REFITTED` at this effort: the fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
         makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#mended
     probed : int
         Most poses that trial grids are measured on: docs/results/tuning.md#probed
@@ -66,7 +66,7 @@ class Effort:
     few: int
     views: int
     pixels: int
-    mended: float = MENDED
+    refitted: float = REFITTED
     probed: int = 8
     passes: float = 0.0
 
@@ -102,10 +102,10 @@ def _lattice(camera: Camera, step: int) -> int:
 
 EFFORTS = {
     "fast": Effort(
-        keep=0.77, refit_rounds=0, subsets=7, steps=1, close=0.08, few=18, views=48, pixels=12, mended=0.86, probed=4
+        keep=0.77, refit_rounds=0, subsets=7, steps=1, close=0.08, few=18, views=48, pixels=12, refitted=0.86, probed=4
     ),
     "balanced": Effort(
-        keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.06, few=32, views=96, pixels=24, mended=0.7
+        keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.06, few=32, views=96, pixels=24, refitted=0.7
     ),
     "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, few=400, views=400, pixels=24),
     "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=96, views=96, pixels=24, passes=10.0),

@@ -105,28 +105,28 @@ class GridSearch(MultiplierSearch[GridScene]):
         if steps:
             self.pruned_part, self.keeps_best = PRUNED_DISTILLED, True
         self._slopes: Slopes | None = None
-        self._mended: Refitted | None = None
+        self._refitted: Refitted | None = None
         self._descents: list[tuple[float, Refitted]] = []
         # Without a refit of SH, a candidate takes nothing over from the one before.
         self._drift = DRIFT_DISTILLED if steps else DRIFT if effort.refit_rounds else 0.0
         self._expected = 0.0
 
     def _before_refit(self, multiplier: float) -> GridScene:
-        kept, steps = self._choice(multiplier)
-        return self._to_grid(kept.planes, kept.degrees, steps, self.rounds.storage)[0]
+        kept, step_sizes = self._choice(multiplier)
+        return self._to_grid(kept.planes, kept.degrees, step_sizes, self.rounds.storage)[0]
 
     def _to_grid(
-        self, planes: Planes, degrees: np.ndarray, steps: StepSizes, storage: Storage = IN_MEMORY
+        self, planes: Planes, degrees: np.ndarray, step_sizes: StepSizes, storage: Storage = IN_MEMORY
     ) -> tuple[GridScene, np.ndarray]:
-        return to_grid(planes, degrees, steps, self.rounds.original.origin, storage=storage)
+        return to_grid(planes, degrees, step_sizes, self.rounds.original.origin, storage=storage)
 
     def _probe_slopes(self, snapshot: Snapshot) -> Slopes:
         original = self.rounds.original
         renderer, planes = original.bench.renderer, snapshot.planes
         return probe_slopes(renderer, planes, original.origin, original.cameras, self.effort.probed)
 
-    def _distil(self, kept: Kept, schedule: Schedule, steps: StepSizes) -> Planes:
-        return distil(kept.planes, kept.degrees, self.rounds.original, schedule, steps)
+    def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes) -> Planes:
+        return distil(kept.planes, kept.degrees, self.rounds.original, schedule, step_sizes)
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
         original = self.rounds.original
@@ -144,7 +144,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         """Probe for the multiplier whose candidate should be just below the target. A refit changes the excess alike nearby."""
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
-        offset = math.log(self._mended_part()) if self.refit and not by_size else 0.0
+        offset = math.log(self._refitted_part()) if self.refit and not by_size else 0.0
         if steps:
             offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
             if self.refit and not by_size:
@@ -170,32 +170,32 @@ class GridSearch(MultiplierSearch[GridScene]):
                 break
         return math.exp(place)
 
-    def _mended_part(self) -> float:
+    def _refitted_part(self) -> float:
         """Expected loss after the first candidate's refit or descent, divided by the loss before it."""
         if self.steps:
             return DISTILLED
-        return self.effort.mended * FURTHER ** (self.effort.refit_rounds - 1)
+        return self.effort.refitted * FURTHER ** (self.effort.refit_rounds - 1)
 
     def _choice(self, multiplier: float) -> tuple[Kept, StepSizes]:
         """The rows that a multiplier keeps, with the colours of the last refit, and the step sizes of the grid."""
         kept = self.kept(multiplier)
-        mended = self._descended(multiplier) if self.steps else self._mended
-        if mended is not None:
-            kept.planes = mended.apply(kept.rows, kept.degrees, kept.planes, self.rounds.storage)
+        refitted = self._descended(multiplier) if self.steps else self._refitted
+        if refitted is not None:
+            kept.planes = refitted.apply(kept.rows, kept.degrees, kept.planes, self.rounds.storage)
         snapshot = self.rounds.snapshots[kept.snapshot]
         if self._slopes is None:
-            # Measured once, near the answer: slopes change little between snapshots, and steps must not jump there.
+            # Measured once, near the answer: slopes change little between snapshots, and step sizes must not jump there.
             self._slopes = self._probe_slopes(snapshot)
-        steps = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
+        step_sizes = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
         count = len(kept.rows)
-        kept = kept.take(reachable(steps, kept.planes, kept.weight2 > 0), self.rounds.storage)
+        kept = kept.take(reachable(step_sizes, kept.planes, kept.weight2 > 0), self.rounds.storage)
         kept.left_out = count - len(kept.rows)
-        return kept, holdable(steps, kept.planes)
+        return kept, holdable(step_sizes, kept.planes)
 
     def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, GridScene]:
         started = time.perf_counter()
-        kept, steps = self._choice(multiplier)
-        grid = self._distilled(multiplier, kept, steps) if self.steps else self._finish(kept, steps)
+        kept, step_sizes = self._choice(multiplier)
+        grid = self._distilled(multiplier, kept, step_sizes) if self.steps else self._finish(kept, step_sizes)
         grid = lowered(grid, self.rounds.storage)
         size = self.size_of(grid)
         measurement = self.measure(values_of(grid, self.rounds.storage))
@@ -210,27 +210,27 @@ class GridSearch(MultiplierSearch[GridScene]):
         A descent that kept fewer Gaussians will not do. Its values make up for the missing ones, which are back now:
         docs/results/tuning.md#descended
         """
-        before = [(at, mended) for at, mended in self._descents if at <= multiplier]
+        before = [(at, refitted) for at, refitted in self._descents if at <= multiplier]
         return max(before, key=lambda pair: pair[0])[1] if before else None
 
-    def _distilled(self, multiplier: float, kept: Kept, steps: StepSizes) -> GridScene:
+    def _distilled(self, multiplier: float, kept: Kept, step_sizes: StepSizes) -> GridScene:
         """Move all values towards the references, put them on the grid, and refit the constant colour."""
         first = self._descended(multiplier) is None
         count, rate = (self.steps, 1.0) if first else (math.ceil(FURTHER_STEPS * self.steps), FURTHER_RATE)
         rate *= rate_from(self.measure(kept.planes, estimate=True).fidelity)
-        moved = self._distil(kept, Schedule(count, rate), steps)
+        moved = self._distil(kept, Schedule(count, rate), step_sizes)
         own = np.arange(len(kept.rows))
         self._descents.append((multiplier, Refitted.of(kept.rows, kept.degrees, own, moved, fields=tuple(moved))))
-        grid, order = self._to_grid(moved, kept.degrees, holdable(steps, moved))
+        grid, order = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
         if not self.refit:
             return grid
         moved = self._refit_colours(values_of(grid), kept.degrees[order], 1, bands=False)
         return recolour(grid, moved["sh_dc"], moved["sh_rest"])
 
-    def _finish(self, kept: Kept, steps: StepSizes) -> GridScene:
+    def _finish(self, kept: Kept, step_sizes: StepSizes) -> GridScene:
         """Put geometry on its grid, refit all colours, put SH on their grid, refit the constant colour, put it on its grid."""
         storage, planes = self.rounds.storage, kept.planes
-        fine = replace(steps, dc=steps.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in steps.sh))
+        fine = replace(step_sizes, dc=step_sizes.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in step_sizes.sh))
         fine = holdable(fine, planes)
         grid, order = self._to_grid(planes, kept.degrees, fine, storage)
         degrees = kept.degrees[order]
@@ -238,9 +238,9 @@ class GridSearch(MultiplierSearch[GridScene]):
         if self.refit:
             if self.effort.refit_rounds:
                 moved = self._refit_colours(moved, degrees, self.effort.refit_rounds)
-                self._mended = Refitted.of(kept.rows, kept.degrees, order, moved, storage)
-            grid = replace(grid, steps=replace(grid.steps, sh=steps.sh[: grid.sh_degree]))
+                self._refitted = Refitted.of(kept.rows, kept.degrees, order, moved, storage)
+            grid = replace(grid, step_sizes=replace(grid.step_sizes, sh=step_sizes.sh[: grid.sh_degree]))
             coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], storage), storage)
             moved = self._refit_colours(coarse, degrees, 1, bands=False)
-        final = replace(grid.steps, dc=steps.dc, sh=steps.sh[: grid.sh_degree])
-        return recolour(replace(grid, steps=final), moved["sh_dc"], moved["sh_rest"], storage)
+        final = replace(grid.step_sizes, dc=step_sizes.dc, sh=step_sizes.sh[: grid.sh_degree])
+        return recolour(replace(grid, step_sizes=final), moved["sh_dc"], moved["sh_rest"], storage)

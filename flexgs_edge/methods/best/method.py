@@ -125,7 +125,7 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
             search=search,
             quality=quality,
             trained=judges.trained,
-            step_sizes=grid.steps,
+            step_sizes=grid.step_sizes,
         )
 
 

@@ -161,7 +161,7 @@ class PruneRounds:
         with self.original.bench.renderer.load(source, sum_row_bytes(source.sh_degree), references=self.refit) as scene:
             turn = (len(self.snapshots) - 1) % len(self._parts)
             views = self._views[turn]
-            measured = self._measure_and_mend(scene, planes, views) if self.refit else self._measure(scene, views)
+            measured = self._measure_and_refit(scene, planes, views) if self.refit else self._measure(scene, views)
         self._parts = [
             measured if part == turn else sums.take(keep, self.storage) for part, sums in enumerate(self._parts)
         ]
@@ -213,7 +213,7 @@ class PruneRounds:
         finally:
             costs.release()
 
-    def _measure_and_mend(self, scene: DeviceScene, planes: dict[str, np.ndarray], views: Sequence[int]) -> CostParts:
+    def _measure_and_refit(self, scene: DeviceScene, planes: dict[str, np.ndarray], views: Sequence[int]) -> CostParts:
         makers = [
             cost_sums(self.original.bench.renderer, scene.sh_degree, first=4),
             normal_sums(self.original.bench.renderer),

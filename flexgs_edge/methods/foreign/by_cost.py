@@ -102,10 +102,10 @@ class FileSearch(MultiplierSearch[WrittenFile]):
             place, coded = self.files.write(MemorySource(planes, origin=original.origin))
             decoded = coded.read(slice(0, coded.count), list(FIELD))
             place.unlink()
-            mended = refit_colours(
+            refitted = refit_colours(
                 {**decoded, "sh_dc": moved["sh_dc"]}, *shared, rounds=1, bands=False, subsets=subsets
             )
-            planes["sh_dc"] = _put(mended["sh_dc"], rows)
+            planes["sh_dc"] = _put(refitted["sh_dc"], rows)
         return self.files.make(MemorySource(planes, origin=original.origin))
 
 

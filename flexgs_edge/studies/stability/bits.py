@@ -94,7 +94,7 @@ def _coarser(ours: Whole, factor: float) -> tuple[int, MemorySource]:
     if factor == 1.0:
         return ours.size, ours.source
     planes = from_grid(ours.grid)
-    grid, _ = to_grid(planes, ours.grid.sh_degrees, _scaled(ours.grid.steps, factor), ours.grid.origin)
+    grid, _ = to_grid(planes, ours.grid.sh_degrees, _scaled(ours.grid.step_sizes, factor), ours.grid.origin)
     return _of_grid(grid)
 
 
@@ -156,7 +156,7 @@ def _losses(rows: Sequence[Row]) -> list[float]:
 def _reordered(grid: GridScene, order: np.ndarray) -> GridScene:
     """The grid of the same rows, made from another order."""
     planes = {name: values[:, order] for name, values in from_grid(grid).items()}
-    return to_grid(planes, grid.sh_degrees[order], grid.steps, grid.origin, rename=False)[0]
+    return to_grid(planes, grid.sh_degrees[order], grid.step_sizes, grid.origin, rename=False)[0]
 
 
 def _evaluator(studied: StudyScene, source: SceneSource, has_sh: np.ndarray, bits: BitSpec = PAPER) -> SceneEvaluator:

@@ -160,7 +160,7 @@ def _best(ours: Whole, added: dict[str, np.ndarray] | None) -> tuple[int, Memory
     whole = _joined(kept, added)
     degrees = np.concatenate([ours.grid.sh_degrees, np.zeros(extra, np.uint8)])
     unseen = np.arange(len(degrees)) >= len(ours.grid.sh_degrees)
-    keep = np.flatnonzero(reachable(ours.grid.steps, whole, ~unseen))
+    keep = np.flatnonzero(reachable(ours.grid.step_sizes, whole, ~unseen))
     whole, degrees = take_rows(whole, keep), degrees[keep]
-    grid, _ = to_grid(whole, degrees, holdable(ours.grid.steps, whole), ours.grid.origin)
+    grid, _ = to_grid(whole, degrees, holdable(ours.grid.step_sizes, whole), ours.grid.origin)
     return coded_size(grid, {}), MemorySource(from_grid(grid), origin=grid.origin)

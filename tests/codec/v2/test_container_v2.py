@@ -135,7 +135,7 @@ def test_the_largest_codes_are_valid_values(tmp_path: Path, rotation: float, col
     grid = make_grid(20, 1)
     for plane in (grid.position, grid.scale, grid.rotation, grid.opacity, grid.dc, *grid.sh):
         plane[:] = 2**24
-    write_grid(path, replace(grid, steps=replace(steps, rotation=rotation, sh=steps.sh[:1])), {})
+    write_grid(path, replace(grid, step_sizes=replace(steps, rotation=rotation, sh=steps.sh[:1])), {})
     source = GridSource(path)
     assert source.valid == (fault is None)
     source.valid = False
@@ -274,7 +274,7 @@ def test_golden_files_are_read(name: str) -> None:
 def test_the_share_of_sh_is_what_leaving_them_out_saves() -> None:
     grid = make_grid(2000, 2)
     bare = replace(
-        grid, sh_degree=0, steps=replace(grid.steps, sh=()), sh_degrees=np.zeros_like(grid.sh_degrees), sh=()
+        grid, sh_degree=0, step_sizes=replace(grid.step_sizes, sh=()), sh_degrees=np.zeros_like(grid.sh_degrees), sh=()
     )
     assert coded_size(grid, {}) - encode_grid(grid).sh_bytes == pytest.approx(coded_size(bare, {}), rel=0.005)
     assert encode_grid(bare).sh_bytes == 0

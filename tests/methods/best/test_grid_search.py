@@ -207,7 +207,7 @@ def test_the_file_is_the_chosen_step_s() -> None:
     assert tuple(seen) == found.steps
     assert any(found.product is grid for grid in world.grids)
     assert (found.product.count, found.product.sh_count) == (found.chosen.count, found.chosen.sh_count)
-    assert found.product.steps.opacity == pytest.approx(UNIT * math.sqrt(found.chosen.multiplier), rel=1e-5)
+    assert found.product.step_sizes.opacity == pytest.approx(UNIT * math.sqrt(found.chosen.multiplier), rel=1e-5)
 
 
 def test_the_same_search_every_time() -> None:
@@ -234,7 +234,7 @@ def test_larger_multipliers_keep_fewer() -> None:
 def test_unseen_gaussians_stay() -> None:
     rounds = FakeRounds(unseen=60)
     found = search(powers(), MaxDrop(1.0), rounds)
-    positions = np.rint(rounds.snapshots[0].planes["means"][:, :60] / found.product.steps.position).astype(int)
+    positions = np.rint(rounds.snapshots[0].planes["means"][:, :60] / found.product.step_sizes.position).astype(int)
     kept = {tuple(p) for p in found.product.position.T.tolist()}
     assert found.reached and all(tuple(p) in kept for p in positions.T.tolist())
 
@@ -244,7 +244,7 @@ def test_unseen_gaussians_that_would_coarsen_the_grid_go() -> None:
     astray.snapshots[0].planes["means"][:, 7] = 1e7
     steps, counts = zip(
         *(
-            (found.product.steps, found.product.count)
+            (found.product.step_sizes, found.product.count)
             for found in (search(powers(), MaxDrop(1.0), rounds) for rounds in (calm, astray))
         )
     )
@@ -286,7 +286,7 @@ def test_descents_go_on_from_each_other(found: float) -> None:
     class Descending(KnownSearch):
         def _distil(self, kept: Kept, schedule: Schedule, steps: StepSizes) -> Any:
             logits = kept.planes["opacity_logits"]
-            seen.append((schedule.steps, schedule.rate, float(logits.max())))
+            seen.append((schedule.iterations, schedule.rate, float(logits.max())))
             return {**kept.planes, "opacity_logits": np.full_like(logits, 9.0)}
 
         def _refit_colours(self, planes: Any, *_: Any, **__: Any) -> Any:
@@ -333,12 +333,12 @@ def test_an_interrupted_search_with_descents_keeps_the_best(steps: int, after: i
 
 def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> None:
     rng = np.random.default_rng(5)
-    mended = {"sh_dc": rng.normal(size=(3, 3)).astype(np.float32), "sh_rest": np.ones((9, 3), np.float32)}
-    last = Refitted.of(np.array([2, 5, 7]), np.array([0, 1, 1]), np.array([2, 0, 1]), mended)
+    refitted = {"sh_dc": rng.normal(size=(3, 3)).astype(np.float32), "sh_rest": np.ones((9, 3), np.float32)}
+    last = Refitted.of(np.array([2, 5, 7]), np.array([0, 1, 1]), np.array([2, 0, 1]), refitted)
     planes = {"sh_dc": np.zeros((3, 4), np.float32), "sh_rest": np.zeros((24, 4), np.float32), "means": np.ones((3, 4))}
     found = last.apply(np.array([1, 2, 5, 7]), np.array([1, 1, 1, 1]), planes)
     np.testing.assert_array_equal(
-        found["sh_dc"], np.stack([0 * mended["sh_dc"][:, 0]] * 2 + [*mended["sh_dc"].T[[2, 0]]], 1)
+        found["sh_dc"], np.stack([0 * refitted["sh_dc"][:, 0]] * 2 + [*refitted["sh_dc"].T[[2, 0]]], 1)
     )
     # Three coefficients of eight a channel were there before; row 2 had another degree, row 1 was not kept.
     expected = np.zeros((3, 8, 4))

@@ -43,7 +43,7 @@ class Schedule:
 
     Parameters
     ----------
-    steps : int
+    iterations : int
         How many views it looks at, one a step.
     rate : float
         Factor on all rates.
@@ -51,21 +51,23 @@ class Schedule:
         Share of the steps before values are put on their grids for drawing, and share before geometry is held there.
     """
 
-    steps: int
+    iterations: int
     rate: float = 1.0
     on_grid: float = ON_GRID
     holding: float = HOLDING
 
     def parts(self, grid: bool) -> tuple[range, range, range]:
         """Steps off the grid, on it, and on it with geometry held. Without a grid, all steps are off it."""
-        free, moving = (round(share * self.steps) if grid else self.steps for share in (self.on_grid, self.holding))
-        return range(free), range(free, moving), range(moving, self.steps)
+        free, moving = (
+            round(share * self.iterations) if grid else self.iterations for share in (self.on_grid, self.holding)
+        )
+        return range(free), range(free, moving), range(moving, self.iterations)
 
     def order(self, views: int) -> np.ndarray:
-        """[steps] i64, the view of each step: all views in a shuffled order, then all again in another order."""
+        """[iterations] i64, the view of each step: all views in a shuffled order, then all again in another order."""
         rng = np.random.default_rng(0)
-        rounds = [rng.permutation(views) for _ in range(-(-self.steps // max(views, 1)))]
-        return np.concatenate([*rounds, np.zeros(0, np.int64)])[: self.steps]
+        rounds = [rng.permutation(views) for _ in range(-(-self.iterations // max(views, 1)))]
+        return np.concatenate([*rounds, np.zeros(0, np.int64)])[: self.iterations]
 
 
 def rates_for(cameras: Sequence[Camera]) -> dict[str, float]:
