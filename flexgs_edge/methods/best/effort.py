@@ -51,7 +51,7 @@ class Effort:
         largest k that leaves as many. More pixels take longer, fewer make files larger: docs/results/tuning.md#pixels
     refitted : float
         `REFITTED` at this effort: the fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
-        makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#mended
+        makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#refitted
     probed : int
         Most poses that trial grids are measured on: docs/results/tuning.md#probed
     passes : float
