@@ -1,4 +1,4 @@
-"""What a run has to say about how far its figures can be trusted: sentences with a number each, or nothing."""
+"""Warnings of a run whose figures deserve less trust. Each names a number and what to do."""
 
 from __future__ import annotations
 
@@ -15,27 +15,32 @@ from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.views.references import References
 
 FIT_VIEWS = 8
-"""Training poses that the finished file is compared on, evenly spread."""
+"""At most this many training views, evenly spread, compare the finished file with the original."""
 FIT_STEP = 2
-"""Pixels of them from one to the next, in both directions."""
+"""The comparison reads every second pixel in both directions."""
 FIT_GAP = 2.0
-"""Fidelity on training poses above that on held-out views, dB, from which a choice counts as fitted to what was scored."""
+"""We warn of overfitting when training views show this much more fidelity than held-out views, dB."""
 NEEDED_VIEWS = 16
-"""Scored poses from which more change little: docs/results/speed.md#scoring-fewer-views"""
+"""We warn below this many scored views; more change little: docs/results/speed.md#scoring-fewer-views"""
 UNSEEN_SHARE = 0.01
-"""Share of the Gaussians in none of the automatic views that is worth a word."""
+"""We warn when automatic views miss more than this share of the Gaussians."""
 
 
 class TrainingPoses:
-    """Some training poses that a finished file is compared on, beside the views that report.
+    """Compares a finished file with the original on some training views.
+
+    The figures of a run come from other views; these only show whether the result fits the scored views too closely.
 
     Parameters
     ----------
     renderer : Renderer
+        Draws both scenes.
     original : DeviceScene
-        Drawn from them at once.
+        The loaded original; the constructor draws its references.
     cameras : sequence of Camera
-        All training poses.
+        All training views; up to `FIT_VIEWS` of them are used.
+    progress : Progress, optional
+        Shows a bar while the references are drawn.
     """
 
     def __init__(
@@ -47,7 +52,7 @@ class TrainingPoses:
         self._references = References.of(renderer, original, self._cameras, progress=progress)
 
     def fidelity(self, scene: DeviceScene) -> float | None:
-        """Fidelity of `scene`, mean over the poses; `None` when all are identical."""
+        """Mean fidelity of `scene` over these views, dB; `None` if all renders are identical."""
         found = []
         for view, camera in enumerate(self._renderer.in_turn(scene, self._cameras)):
             inside = (slice(None), slice(camera.height), slice(camera.width))
@@ -56,40 +61,47 @@ class TrainingPoses:
         return mean_psnr(found)
 
     def close(self) -> None:
-        """Remove what the original looked like."""
+        """Free the renders of the original."""
         self._references.close()
 
 
 def doubts(
     views: ViewSet, scored: Scored | None, count: int, trained: float | None, held_out: float | None
 ) -> tuple[str, ...]:
-    """Warnings of a run.
+    """Warnings of a run, as sentences for a person.
 
     Parameters
     ----------
+    views : ViewSet
+        All views of the run.
     scored : Scored or None
-        What the search was told by.
+        Numbers of scored views and of unseen Gaussians; `None` if the search measured no costs.
     count : int
         Gaussians of the scene.
     trained, held_out : float or None
-        Fidelity on training poses and on held-out views, dB.
+        Mean fidelity on training views and on held-out views, dB; `None` if not measured.
+
+    Returns
+    -------
+    tuple of str
+        Empty if there is nothing to warn of.
     """
     found = []
     if trained is not None and held_out is not None and trained - held_out > FIT_GAP:
         found.append(
-            f"fidelity is {trained:.1f} dB on training poses and {held_out:.1f} dB on held-out views, {trained - held_out:.1f} "
-            "dB less: the choice fits what was scored, and views from elsewhere may look worse; score more poses "
-            "(--effort thorough, more cameras) or try --views-margin"
+            f"Fidelity is {trained:.1f} dB on training views and {held_out:.1f} dB on held-out views, {trained - held_out:.1f} "
+            "dB less. The result fits the views that were scored, and others may look worse. Score more views (--effort "
+            "thorough, or more cameras), or add --views-margin."
         )
     if scored is not None and scored.poses < NEEDED_VIEWS:
         found.append(
-            f"{scored.poses} poses were scored, and ranks settle from about {NEEDED_VIEWS}: the loss away from them is not known "
-            "well; give more cameras, or --views-margin, which makes some"
+            f"Only {scored.poses} camera views were used; below about {NEEDED_VIEWS} the result may look worse from elsewhere. "
+            "Give more cameras, or add --views-margin to generate some."
         )
     if scored is not None and views.cameras_from == AUTO_CAMERAS and scored.unseen > UNSEEN_SHARE * count:
         found.append(
-            f"{scored.unseen} of {count} Gaussians ({100 * scored.unseen / count:.1f} %) are in none of the {scored.poses} "
-            "automatic views that were scored: what they show was not judged; give the scene's cameras (--cameras PATH), and see "
-            "--unseen"
+            f"{scored.unseen} of {count} Gaussians ({100 * scored.unseen / count:.1f} %) appear in none of the {scored.poses} "
+            "automatic views that were scored, so nothing checked how they look. Give the scene's cameras (--cameras PATH), or "
+            "choose with --unseen what happens to them."
         )
     return tuple(found)

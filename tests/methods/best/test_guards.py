@@ -230,21 +230,21 @@ def test_a_compression_with_margin(project: Path, tmp_path: Path) -> None:
             41.0,
             35.5,
             "auto",
-            ["41.0 dB on training poses and 35.5 dB on held-out views, 5.5 dB less"],
+            ["41.0 dB on training views and 35.5 dB on held-out views, 5.5 dB less"],
         ),
         (
             Scored(NEEDED_VIEWS - 1, 0, 0),
             41.0,
             None,
             "auto",
-            [f"{NEEDED_VIEWS - 1} poses were scored, and ranks settle"],
+            [f"Only {NEEDED_VIEWS - 1} camera views were used; below about {NEEDED_VIEWS} "],
         ),
         (
             Scored(48, 0, 30),
             None,
             40.0,
             "auto",
-            [r"30 of 1000 Gaussians \(3.0 %\) are in none of the 48 automatic views"],
+            [r"30 of 1000 Gaussians \(3.0 %\) appear in none of the 48 automatic views"],
         ),
         (Scored(48, 0, 30), None, 40.0, "cameras.json", []),
         (None, 41.0, 30.0, "auto", ["11.0 dB less"]),
@@ -262,8 +262,8 @@ def test_doubts(
 def test_doubts_are_told(project: Path, plain: CompressResult) -> None:
     """6 poses are few, and fitted: in the result, its JSON, the summary and the page."""
     fitted, few = plain.warnings
-    assert "dB on training poses and" in fitted and few.startswith(
-        "6 poses were scored, and ranks settle from about 16"
+    assert "dB on training views and" in fitted and few.startswith(
+        "Only 6 camera views were used; below about 16 "
     )
     assert plain.to_json()["warnings"] == [fitted, few]
     page = (project.parent / "page" / "index.html").read_text()
