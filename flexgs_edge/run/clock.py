@@ -1,4 +1,4 @@
-"""Wall seconds by stage."""
+"""A stopwatch: wall seconds by stage of a run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Wall seconds by stage, in the order of first entry; a stage inside another is counted once, as the inner one."""
+    """Wall seconds by stage, in the order of first entry.
+
+    The time of a stage inside another counts for the inner stage only.
+    """
 
     def __init__(self) -> None:
         self.stages: dict[str, float] = {}
@@ -29,5 +32,5 @@ class Stopwatch:
 
     @property
     def total(self) -> float:
-        """Seconds since the stopwatch was made."""
+        """Seconds since the stopwatch was created."""
         return time.perf_counter() - self._started

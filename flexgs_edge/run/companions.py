@@ -1,4 +1,7 @@
-"""What lies beside a scene. Apart from `inputs`: `info` starts without the coder."""
+"""Find the cameras and photos beside a scene.
+
+This is not part of `inputs`, so that `info` starts without importing the coder.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ LOG = logging.getLogger("flexgs_edge")
 
 
 def companions_of(path: str | os.PathLike[str]) -> Companions:
-    """What lies beside the scene at `path`; logged, so that nobody wonders where cameras came from."""
+    """Find cameras, photos and drawing settings beside the scene at `path`, and log the cameras and photos found."""
     found = find_companions(path)
     if found.cameras is None:
         folder = Path(path) if Path(path).is_dir() else Path(path).parent
@@ -26,7 +29,11 @@ def companions_of(path: str | os.PathLike[str]) -> Companions:
 
 
 def merge_companions(first: Companions, second: Companions) -> Companions:
-    """Cameras and photos of one place (`first` where it has cameras), background and antialiasing of either."""
+    """Combine the companions of two scenes.
+
+    Cameras and photos both come from `first` if it has cameras, else from `second`: photos of another place would not match.
+    Background and antialiasing come from whichever scene states them, `first` before `second`.
+    """
     chosen = first if first.cameras is not None else second
     white = first.white_background if first.white_background is not None else second.white_background
     antialiased = first.antialiased if first.antialiased is not None else second.antialiased

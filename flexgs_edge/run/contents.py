@@ -1,4 +1,4 @@
-"""What a `.fgs` holds, and whether every byte of it is whole."""
+"""Collect what `info` says about a `.fgs` file."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from flexgs_edge.scene.fields import FIELDS
 
 
 def contents(path: str | Path) -> InfoResult:
-    """`info` of a `.fgs`.
+    """Read what a `.fgs` file holds: counts, settings, and the bytes of every channel.
 
-    The header is read; of version 2 a file that was cut is decoded, since entropy coding shares the bytes out.
+    Reads only the header of most files. A version 2 file that was cut is decoded, which takes much longer: only its symbols
+    tell how many bytes each channel takes.
     """
     place = Path(path)
     header = read_header(place)
@@ -34,7 +35,7 @@ def contents(path: str | Path) -> InfoResult:
 
 
 def _packed_info(path: Path, header: Header) -> InfoResult:
-    """A file of version 1: bit-packed arrays, whose bytes follow from the header."""
+    """Contents of a version 1 file. The header gives the bytes of each bit-packed array."""
     channels: dict[str, dict[str, Any]] = {}
     for field in FIELDS:
         rows, width, bits = header.rows(field.name), header.width(field.name), header.bits.of(field.name)
@@ -54,7 +55,7 @@ def _packed_info(path: Path, header: Header) -> InfoResult:
 
 
 def _grid_info(path: Path) -> InfoResult:
-    """A file of version 2: what each channel takes stands in its header, or is known once its symbols have been decoded."""
+    """Contents of a version 2 file. The bytes of each channel come from the header, else from decoding the file."""
     container = GridContainer(path)
     header = container.header
     known = header.channels or _decoded_channels(path, header)
@@ -82,7 +83,7 @@ def _grid_info(path: Path) -> InfoResult:
 
 
 def _decoded_channels(path: Path, header: GridHeader) -> Channels:
-    """What a file does not say of itself, such as one that was cut."""
+    """Decode a file whose header does not list its channels, such as one that was cut."""
     rows = np.zeros(header.sh_degree, np.int64)
 
     def count(chunk: Chunk, entry: ChunkEntry, codes: ChunkCodes) -> None:
@@ -96,7 +97,7 @@ def _decoded_channels(path: Path, header: GridHeader) -> Channels:
 def _fgs_result(
     path: Path, header: Header | GridHeader, version: int, sh_count: int, channels: dict[str, dict[str, Any]]
 ) -> InfoResult:
-    """What files of both versions tell."""
+    """Fill in the fields that both versions share."""
     settings = dict(header.settings)
     count, degree = settings.get("source_count"), settings.get("source_sh_degree")
     known = isinstance(count, int) and isinstance(degree, int) and 0 <= degree <= 4

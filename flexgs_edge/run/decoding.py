@@ -1,4 +1,4 @@
-"""How a file is decoded: on which device, how many chunks ahead, to memory or to scratch files."""
+"""Decide how to decode a file: on which device, how many chunks ahead, to memory or to scratch files."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from flexgs_edge.run.open_bench import counted_backend
 from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
 
 DECODE_BYTES = 800
-"""Bytes a row that decoding a chunk holds: codes, features, neighbours' weights, sums."""
+"""Bound on the bytes per row while a chunk is decoded: codes, features, neighbours' weights, sums."""
 DEVICE_ROWS = 40_000
-"""Gaussians from which a device codes. Below, the kernels take longer to start than they save:
+"""A device codes scenes with at least this many Gaussians. Below, starting the kernels takes longer than they save:
 docs/results/tuning.md#device_rows"""
 
 
@@ -31,29 +31,35 @@ def decoder(
     least: int = DEVICE_ROWS,
     devices: Callable[[], list[DeviceInfo]] = list_devices,
 ) -> Backend | None:
-    """The device that decodes a scene; None: NumPy does, with the same results.
+    """Open the OpenCL device that decodes a scene.
 
-    That is so for files that are not of container version 2, with `device` "numpy", on GPUs (a work-item decodes a chunk: theirs
-    would crawl), and, unless a device is named, for scenes too small to make up for opening one, and where no processor has a
-    driver that works.
+    Only processors decode. One work-item decodes a whole chunk, and a single work-item of a GPU is too slow for that.
+    NumPy gives the same results.
 
     Parameters
     ----------
     device : str or None
-        As the user names it.
+        As the user named it. Default: a processor, if one has a working driver and the scene has at least `least` Gaussians.
     source : SceneSource
-        What is decoded.
-    budget, clock
-        Of the run.
+        The scene to decode. Devices decode container version 2 only.
+    budget : MemoryBudget
+        Pays for the OpenCL runtime.
+    clock : Stopwatch
+        Times the stage `device`.
     least : int, optional
-        Gaussians from which a device decodes that nobody named.
+        Without a named device, smaller scenes are decoded by NumPy.
     devices : callable, optional
-        Lists those that there are.
+        Lists the devices of this machine.
+
+    Returns
+    -------
+    Backend or None
+        `None`: NumPy decodes.
 
     Raises
     ------
     DeviceError
-        When the device that is named does not exist or failed its self-test.
+        If the named device does not exist or failed its self-test.
     """
     if device == "numpy" or not isinstance(source, GridSource):
         return None
@@ -69,7 +75,7 @@ def decoder(
 
 @contextmanager
 def ahead(source: SceneSource, budget: MemoryBudget, backend: Backend | None = None) -> Iterator[None]:
-    """Decoding of the next chunks while one is written, where memory allows."""
+    """Decode the next chunks while the caller uses one, as far as memory allows."""
     if not isinstance(source, GridSource):
         yield
         return
@@ -88,9 +94,11 @@ def ahead(source: SceneSource, budget: MemoryBudget, backend: Backend | None = N
 
 
 def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
-    """A file's scene for a renderer that draws several views of it: decoded once, to scratch files, where scenes lie there.
+    """Prepare a file's scene for drawing several views.
 
-    Otherwise it is the source as it is, which views in memory read once. Views give their memory to the decoder.
+    A renderer with scratch files reads a scene again for each view, so the file is decoded once, to scratch files. The view
+    buffers are freed first to make room for the decoder. A renderer without scratch files reads the source once, and gets it
+    unchanged.
     """
     storage, budget = renderer.storage, renderer.budget
     if not storage.spills:
@@ -103,7 +111,10 @@ def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
 
 
 def coding_device(backend: Backend | None, budget: MemoryBudget, count: int, sh_degree: int) -> Backend | None:
-    """The backend, where it codes large scenes well and memory has room for its work; None: NumPy does, with the same bytes."""
+    """Return `backend` if it should entropy-code this scene, else `None`: then NumPy codes it, to the same bytes.
+
+    The device must be a processor, the scene large enough to gain from it, and the free memory enough for its buffers.
+    """
     if backend is None or not backend.threads or count < DEVICE_ROWS:
         return None
     return backend if backend.threads * device_bytes(CHUNK_ROWS, sh_degree) <= budget.free else None

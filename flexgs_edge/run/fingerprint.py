@@ -1,4 +1,4 @@
-"""A digest of scene, poses and drawing: the same exactly where scores would be."""
+"""A digest of everything that scores depend on, to know whether kept scores still apply."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.scene.source import SceneSource
 
 ROWS = 1 << 16
-"""Rows of the scene hashed at a time."""
+"""We hash this many rows at a time."""
 FIELDS = ("means", "log_scales", "quats", "opacity_logits")
-"""What hits, weights and volumes depend on; colours change none of them."""
+"""Fields that change hits, weights or volumes. Colours change none of them."""
 
 
 def fingerprint(
@@ -26,18 +26,25 @@ def fingerprint(
     antialiased: bool = False,
     fields: Sequence[str] = FIELDS,
 ) -> str:
-    """A digest of everything that scores depend on; reads the scene once, by default without its colours.
+    """Hash everything that scores depend on. Reads the scene once, by default without its colours.
 
     Parameters
     ----------
     source : SceneSource
-        The scene as it is scored: rows left out are not part of it.
+        The scene as it is scored, without rows that were left out.
     cameras : sequence of Camera
-        The training poses, at the size they are drawn. Their names do not count.
-    kind, near, extent, antialiased : str, float, str, bool
-        Which score, and how views are drawn.
+        The training views, at the size they are drawn. Their names do not change the digest.
+    kind : str
+        The score, such as `gs`.
+    near, extent, antialiased : float, str, bool
+        How views are drawn.
     fields : sequence of str
-        What the score depends on.
+        Fields of the scene to hash.
+
+    Returns
+    -------
+    str
+        The digest in hexadecimal.
     """
     digest = hashlib.sha256(
         f"{__version__} {kind} {near!r} {extent} {antialiased} {source.count} {len(cameras)}".encode()

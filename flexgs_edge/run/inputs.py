@@ -1,4 +1,4 @@
-"""From paths to a checked scene: what was given, and what lies beside it."""
+"""From a path to a checked scene, and to options with every drawing setting filled in."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ LOG = logging.getLogger("flexgs_edge")
 
 @dataclass(frozen=True)
 class CheckedScene:
-    """A checked scene and what its file says about drawing it.
+    """A scene whose values have been checked, and the settings that its file states.
 
     Parameters
     ----------
     path : Path or None
-        As given; `None` for a scene from memory, beside which nothing lies.
+        As given; `None` for a scene from memory, which has no cameras or photos beside it.
     source : SceneSource
-        Finite, not empty.
+        Every value is finite; there is at least one Gaussian.
     input_count : int
-        Gaussians in the file, before any were left out.
+        Gaussians in the file, before invalid ones were left out.
     settings : dict
-        Of a `.fgs`; of other files what they say about drawing (`antialiased` in a `.spz`), mostly nothing.
+        How a `.fgs` was made. Other files only state drawing settings, if any (`antialiased` in a `.spz`).
     """
 
     path: Path | None
@@ -45,40 +45,40 @@ class CheckedScene:
 
     @property
     def ply_bytes(self) -> int:
-        """Bytes of the scene's PLY as INRIA writes it, with normals (248 a Gaussian at SH degree 3)."""
+        """Bytes of the scene as a PLY in INRIA's layout, with normals: 248 per Gaussian at SH degree 3."""
         return self.input_count * inria_dtype(self.source.sh_degree).itemsize
 
     @property
     def ply_bytes_without_normals(self) -> int:
-        """The same without the three normals that nobody reads."""
+        """Bytes of the scene as a PLY without normals, which no viewer reads."""
         return self.ply_bytes - 12 * self.input_count
 
 
 ScenePlace = str | os.PathLike[str] | CheckedScene
-"""Where a scene is: a file, a model folder, or one that is open already."""
+"""A scene file, a model folder, or a scene that is already open."""
 
 
 def read_scene(path: str | os.PathLike[str], drop_invalid: bool = False) -> SceneSource:
-    """A checked scene from a scene file or a model folder: finite values, at least one Gaussian; read lazily."""
+    """Open a scene file or a model folder, and check that its values are finite. Later reads are lazy."""
     return load_scene(path, drop_invalid).source
 
 
 def load_scene(path: ScenePlace, drop_invalid: bool = False) -> CheckedScene:
-    """Open a scene and check every value of it once (raises `InputError` for what cannot be used).
+    """Open a scene and check every value once. Raises `InputError` for invalid values, unless `drop_invalid` leaves them out.
 
-    A scene that is open already is handed back.
+    Returns a scene that is already open unchanged.
     """
     return path if isinstance(path, CheckedScene) else checked_scene(open_scene(path), Path(path), drop_invalid)
 
 
 def checked_scene(opened: SceneSource, path: Path | None = None, drop_invalid: bool = False) -> CheckedScene:
-    """Check every value of a scene once."""
+    """Check every value of an open scene once."""
     settings = dict(getattr(opened, "settings", {}))
     return CheckedScene(path, check_scene(opened, drop_invalid), opened.count, settings)
 
 
 def resolve_drawing(options: Options, scene: CheckedScene, companions: Companions) -> Options:
-    """Options with all that drawing needs filled in: as given, else as the files say, else the defaults."""
+    """Fill in every drawing setting: from the options, else from the files, else from the defaults."""
     stored = scene.settings
     background = options.background
     if background is None:
@@ -93,7 +93,7 @@ def resolve_drawing(options: Options, scene: CheckedScene, companions: Companion
         found = stored.get("antialiased", companions.antialiased)
         antialiased = found if isinstance(found, bool) else False
         if antialiased:
-            LOG.info("drawn antialiased, as %s says", "the file" if "antialiased" in stored else "cfg_args")
+            LOG.info("drawing antialiased, as %s says", "the file" if "antialiased" in stored else "cfg_args")
     extent = options.extent or stored.get("extent") or "exact"
     return replace(options, near=near, background=background, extent=extent, antialiased=antialiased)
 
@@ -105,7 +105,7 @@ def _background(value: object, default: tuple[float, float, float]) -> tuple[flo
 
 
 def scene_info(scene: CheckedScene) -> SceneInfo:
-    """The record of a scene."""
+    """The scene as a record for results."""
     return SceneInfo(
         path=scene.source.name if scene.path is None else os.fspath(scene.path),
         count=scene.source.count,
