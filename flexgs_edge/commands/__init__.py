@@ -1,1 +1,1 @@
-"""One module a command: what the command line and Python users call."""
+"""One module per command: the functions that the command line and Python users call."""

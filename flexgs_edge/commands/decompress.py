@@ -1,4 +1,4 @@
-"""`decompress`: a scene to a PLY that every viewer opens, or to another program's format."""
+"""`decompress`: write a scene as a PLY that every viewer opens, or in another program's format."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flexgs_edge.run.inputs import ScenePlace, load_scene, scene_info
 from flexgs_edge.run.open_bench import run_info
 
 WRITE_COPIES = 3
-"""Times a chunk's rows that decoding and writing hold at once: codes, planes, rows of the PLY."""
+"""Copies of a chunk's rows in memory while decoding and writing: codes, planes, rows of the PLY."""
 ANTIALIASED_NOTE = "an antialiased model: the file does not say so; viewers must be told, and here --antialiased"
 
 
@@ -30,7 +30,9 @@ def decompress(
     memory_limit: int | None = None,
     device: str | None = None,
 ) -> DecompressResult:
-    """Decode a scene to a PLY in INRIA's layout (little endian, zero normals), chunk by chunk, or convert it.
+    """Decode a scene to a PLY in INRIA's layout, or convert it to another format.
+
+    The PLY is little endian with zero normals, and is written chunk by chunk.
 
     Parameters
     ----------
@@ -39,11 +41,23 @@ def decompress(
     output : path
         The `.ply`, `.spz`, `.sog` or `.compressed.ply` to write.
     force : bool
-        Overwrite `output` if it exists.
+        Overwrite `output` if it exists. Default: raise `InputError`.
     memory_limit : int, optional
-        Bytes for the whole process.
+        Bytes for the whole process. Default: three quarters of the free memory.
     device : str, optional
-        What decodes: see `decoder`.
+        Device that decodes: a processor as `devices` lists it, or `numpy`. Default: see `decoder`.
+
+    Returns
+    -------
+    DecompressResult
+        Paths, sizes, times and memory.
+
+    Raises
+    ------
+    InputError
+        If a path or a format is not usable.
+    FormatError
+        If the input does not follow its format.
     """
     format = format_of(output)
     if format is None and Path(output).suffix.lower() != ".ply":

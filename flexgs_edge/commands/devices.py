@@ -1,4 +1,4 @@
-"""`devices`: the OpenCL devices, whether they work, and which one is used."""
+"""`devices`: list the OpenCL devices, test them, and choose one."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from flexgs_edge.report.file_results import DevicesResult
 
 
 def devices(device: str | None = None) -> DevicesResult:
-    """List the OpenCL devices, test each, and say which one is used.
+    """List the OpenCL devices, test each, and choose the one that other commands would use.
 
     Parameters
     ----------
     device : str, optional
-        Which one would be chosen: a number, part of a name, `cpu` or `gpu`.
+        Device to choose: a number, part of a name, `cpu` or `gpu`. Default: the best one that works.
 
     Returns
     -------
     DevicesResult
-        `chosen` is `None` where none works; nothing is raised for that.
+        `chosen` is `None` if no device works; this raises no error.
     """
     found = tuple(kernels.list_devices())
     try:

@@ -1,4 +1,4 @@
-"""`evaluate`: a scene against a reference, view by view."""
+"""`evaluate`: compare a scene with its original, view by view."""
 
 from __future__ import annotations
 
@@ -32,32 +32,39 @@ def evaluate(
     lpips: bool = False,
     **words: Any,
 ) -> EvaluateResult:
-    """Measure what a scene lost against another one.
+    """Measure the quality that a scene lost against its original.
 
     Parameters
     ----------
     input : path
-        The scene to judge (a file or a model folder).
+        The scene to measure: a file or a model folder.
     against : path
-        The original. Cameras and photos beside it are used unless given; else those beside `input`.
+        The original. Its cameras and photos are used if it has some beside it, else those beside `input`.
     options : ViewOptions, optional
-        What the command line would say; `holdout=0` evaluates every view, otherwise the held-out views.
+        Options as on the command line. Default: measure the held-out views; `holdout=0` measures all.
     base_psnr : float
-        PSNR of the original that the modelled drop starts from, dB.
+        Assumed PSNR of the original against its photos, for the modelled drop, dB.
+    progress : Progress, optional
+        Shows a bar.
     report : path, optional
-        Folder for a page about the run (index.html) and its record (result.json).
+        Write a page about the run (index.html) and its record (result.json) to this folder.
     force : bool
-        Overwrite the files of an earlier report.
+        Overwrite an earlier report.
     lpips : bool
-        Measure LPIPS as well (extra `lpips`).
+        Also measure LPIPS, which takes far longer (extra `lpips`).
     **words
-        Single options by the names of `ViewOptions`.
+        Single options, by the names of `ViewOptions`.
+
+    Returns
+    -------
+    EvaluateResult
+        Quality of every view, times and memory.
     """
     options = replace(options or ViewOptions(), **words)
     if not 0.0 < base_psnr < 200.0:
         raise InputError(f"--base-psnr {base_psnr:g}: expected decibels between 0 and 200")
     reporter = Reporter.maybe(report, force)
-    # Both are drawn alike; a compressed scene knows how its original was.
+    # Draw both scenes alike: a compressed scene stores how its original is drawn.
     run = open_run(against, options, progress, reporter, judged_path=input)
     views, scene, clock, budget = run.seen, run.judged or run.scene, run.clock, run.budget
     indices = views.held_out or views.train
@@ -65,7 +72,7 @@ def evaluate(
         bench = stack.enter_context(open_bench(run))
         renderer = bench.renderer
         distance: Lpips | None = None
-        if lpips:  # before any drawing: packages or weights may be missing
+        if lpips:  # first, because packages or weights may be missing
             with clock.stage("lpips"):
                 distance = Lpips(budget, max(camera.width * camera.height for camera in views.of(indices)))
             stack.callback(distance.close)

@@ -1,4 +1,4 @@
-"""`info`: what a file holds."""
+"""`info`: show what a scene file holds."""
 
 from __future__ import annotations
 
@@ -11,17 +11,22 @@ from flexgs_edge.run.open_scene import open_scene
 
 
 def info(path: str | os.PathLike[str]) -> InfoResult:
-    """What a scene file holds.
+    """Read what a scene file holds.
 
     Parameters
     ----------
     path : path
-        A `.fgs` (its header is read; one that was cut is decoded, since entropy coding shares the bytes out), a `.ply`, a
-        file of another program's format or a model folder.
+        A `.fgs`, a `.ply`, a file of another program's format, or a model folder. Of a `.fgs` only the header is read. One
+        that was cut is decoded, which takes longer: only its symbols tell the bytes per channel.
+
+    Returns
+    -------
+    InfoResult
+        Counts, settings, and the bytes of every channel of a `.fgs`.
     """
     place = Path(path)
     if place.suffix.lower() == ".fgs":
-        # Imports the coder, which a .ply does not need.
+        # Imported here because it loads the coder, which a .ply does not need.
         from flexgs_edge.run.contents import contents
 
         if place.is_file():
@@ -30,7 +35,7 @@ def info(path: str | os.PathLike[str]) -> InfoResult:
 
 
 def _scene_info(path: Path) -> InfoResult:
-    # Imports cameras, options and other programs' formats, none of which a .fgs needs.
+    # Imported here because they load cameras, options and other formats, which a .fgs does not need.
     from flexgs_edge.io.formats import format_of
     from flexgs_edge.run.companions import companions_of
 

@@ -1,4 +1,4 @@
-"""A compressed scene with a bit less of one channel, or without it: what each would save in the file, exactly."""
+"""Make a compressed scene with one channel coarser or gone, and count the bytes that this saves in the file."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Lesser:
-    """A scene that has less of one channel.
+    """A scene with one channel coarser or gone.
 
     Parameters
     ----------
     channel : str
-        As `info` names it; `rest from 2`: the SH of degree 2 and higher of a file of version 1.
+        The channel's name, as `info` shows it. `rest from 2` means the SH of degree 2 and higher of a version 1 file.
     change : str
-        `one bit less`: values at twice their step. `dropped`: SH of this degree and higher gone; other channels the same for all
-        Gaussians, their mean (rotations: none). Positions are never dropped: nothing would be left.
+        `one bit less`: values at twice their step size. `dropped`: the SH of this degree and higher are gone. Any other
+        dropped channel has its mean in all Gaussians; rotations become the identity. Positions are never dropped.
     make : callable
-        Gives the bytes saved and the scene.
+        Returns the bytes saved and the scene.
     """
 
     channel: str
@@ -45,15 +45,15 @@ class Lesser:
 
 
 def reduced_scenes(source: FgsSource | GridSource) -> list[Lesser]:
-    """Every channel of a file, a bit coarser and dropped, in the order of `info`."""
+    """List each channel of a file coarser by one bit, and dropped, in the order of `info`."""
     return list(_of_grid(source) if isinstance(source, GridSource) else _of_packed(source.quantized()))
 
 
 def _of_grid(source: GridSource) -> Iterator[Lesser]:
-    """Each is coded again, whole: with entropy coding, what is saved is known in no other way."""
+    """Reduced scenes of a version 2 file. Each is coded again: only the entropy coder knows the bytes saved."""
     grid, header = source.grid(), source.container.header
     size = partial(coded_size, settings=header.settings, chunk_rows=header.chunk_rows)
-    # Not the file's: one that was cut is coded by the tables of the whole.
+    # Not the size of the file: a file that was cut still uses the tables of the whole scene.
     before = size(grid)
 
     def lesser(channel: str, change: str, make: Callable[[], GridScene]) -> Lesser:
@@ -73,7 +73,7 @@ def _of_grid(source: GridSource) -> Iterator[Lesser]:
 
 
 def _halved(codes: np.ndarray) -> np.ndarray:
-    """Codes at twice the step; of two that are equally near, the even one, so that nothing moves in the mean."""
+    """Codes at twice the step size. Ties go to the even code, so that the mean does not move."""
     return np.rint(codes / 2).astype(np.int32)
 
 
@@ -95,7 +95,7 @@ def _coarser(grid: GridScene, name: str) -> GridScene:
 
 
 def _level(grid: GridScene, name: str) -> GridScene:
-    """The mean of a channel for all rows; of rotations none, since axes of different order have no mean."""
+    """Give all rows the mean of a channel. Rotations become the identity: their axes differ in order and have no mean."""
     values = getattr(grid, name)
     mean = np.rint(values.mean(axis=-1, keepdims=True)) if grid.count and name != "rotation" else 0
     level: dict[str, Any] = {name: np.broadcast_to(mean, values.shape).astype(np.int32)}
@@ -120,7 +120,7 @@ def _without_sh(grid: GridScene, degree: int) -> GridScene:
 
 
 def _of_packed(scene: QuantizedScene) -> Iterator[Lesser]:
-    """Bit-packed arrays have exact sizes: nothing is written for them."""
+    """Reduced scenes of a version 1 file. Sizes of bit-packed arrays follow from their shape, without coding."""
 
     def lesser(channel: str, change: str, field: str, make: Callable[[], QuantizedArray | None]) -> Lesser:
         def made() -> tuple[int, SceneSource]:
@@ -131,7 +131,7 @@ def _of_packed(scene: QuantizedScene) -> Iterator[Lesser]:
                 return old.nbytes, QuantizedSource(found)
             degree = _degree_of(array.channels) if field == "sh_rest" else scene.sh_degree
             found = replace(scene, sh_degree=degree, arrays={**scene.arrays, field: array})
-            # What is the same for all rows takes a few bytes of a header, not one bit a row.
+            # A value that all rows share would take a few bytes of the header, not one bit per row.
             return old.nbytes - (0 if change == DROPPED and field != "sh_rest" else array.nbytes), QuantizedSource(
                 found
             )
@@ -176,7 +176,7 @@ def _level_codes(array: QuantizedArray, name: str) -> QuantizedArray:
 
 
 def _lower_degree(array: QuantizedArray, degree: int) -> QuantizedArray | None:
-    """Channels are one colour after the other: those of the lower coefficients of each."""
+    """Keep the lower coefficients of each colour. Channels hold all of red, then green, then blue."""
     if degree == 0:
         return None
     rest, kept = array.channels // 3, sh_rest_count(degree)

@@ -1,4 +1,4 @@
-"""`render`: views of a scene as PNG files, timed."""
+"""`render`: draw views of a scene as PNG files, and time them."""
 
 from __future__ import annotations
 
@@ -35,22 +35,29 @@ def render_views(
     progress: Progress = SILENT,
     **words: Any,
 ) -> RenderResult:
-    """Draw views of a scene into a folder, `<view name>.png`, 8 bits a channel.
+    """Draw views of a scene as PNG files, `<view name>.png`, with 8 bits per channel.
 
     Parameters
     ----------
     input : path
         A scene file or a model folder.
     output : path
-        Folder; made if it is missing.
+        Folder for the files; created if it does not exist.
     options : ViewOptions, optional
-        What the command line would say.
+        Options as on the command line.
     views : sequence of int, optional
-        Views to draw, as indices in order of name. Default: all.
+        Indices of the views to draw, in order of name. Default: all views.
     force : bool
-        Overwrite files that exist.
+        Overwrite existing files. Default: raise `InputError`.
+    progress : Progress, optional
+        Shows a bar.
     **words
-        Single options by the names of `ViewOptions`.
+        Single options, by the names of `ViewOptions`.
+
+    Returns
+    -------
+    RenderResult
+        Files, and the time of each view.
     """
     options = replace(options or ViewOptions(), **words)
     run = open_run(input, options, progress, photos=False)
@@ -66,7 +73,7 @@ def render_views(
         with device_scene:
             started = time.perf_counter()
             with clock.stage("warm up"):
-                # The first view builds kernels and lists; timed views should not.
+                # Draw one view first: it builds kernels and lists, which the timed views should not pay for.
                 renderer.render(device_scene, found.cameras[chosen[0]])
             warm_up = time.perf_counter() - started
             for i, place in zip(progress.track(chosen, "rendering", len(chosen)), places, strict=True):
@@ -88,7 +95,7 @@ def render_views(
 
 
 def write_png(path: Path, image: np.ndarray, force: bool = False) -> None:
-    """Write [H, W, 3] f32 as PNG: clamped to [0, 1], rounded to 8 bits."""
+    """Write [H, W, 3] f32 as a PNG, clamped to [0, 1] and rounded to 8 bits."""
     from PIL import Image
 
     pixels = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
@@ -108,7 +115,7 @@ def _choose(views: Sequence[int] | None, count: int) -> list[int]:
 
 
 def _places(folder: Path, names: Sequence[str], force: bool) -> list[Path]:
-    """A file a view, all checked before anything is drawn."""
+    """Path of the file for each view. All are checked before anything is drawn."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"-o {folder}: expected a folder, found a file")
     places = [folder / f"{_file_name(name)}.png" for name in names]
@@ -125,6 +132,6 @@ def _places(folder: Path, names: Sequence[str], force: bool) -> list[Path]:
 
 
 def _file_name(name: str) -> str:
-    """A view's name as a plain file name: folders in it become part of the name."""
+    """Turn a view's name into a plain file name. Folders in it become part of the name."""
     stem = re.sub(r"\.(jpe?g|png)$", "", name, flags=re.IGNORECASE)
     return re.sub(r"[^\w.-]+", "_", stem).lstrip(".") or "view"

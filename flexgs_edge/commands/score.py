@@ -1,4 +1,4 @@
-"""`score`: importance of every Gaussian, kept in a file so that other targets need no scoring."""
+"""`score`: save the importance of every Gaussian, so that later runs of the method `paper` need no scoring."""
 
 from __future__ import annotations
 
@@ -31,22 +31,29 @@ def score_gaussians(
     progress: Progress = SILENT,
     **words: Any,
 ) -> ScoreResult:
-    """Score every Gaussian over the training poses and save the scores.
+    """Score every Gaussian over the training views, and save the scores.
 
     Parameters
     ----------
     input : path
         A scene file or a model folder.
     output : path
-        The `.npy` file to write: [N] f64, logarithms of the scores, -inf for Gaussians that no pose sees.
+        The `.npy` file to write: [N] f64, logarithms of the scores, -inf for Gaussians that no view sees.
     options : ViewOptions, optional
-        What the command line would say.
+        Options as on the command line.
     score : {"gs", "meson"}
-        Which score.
+        The score to compute. Default: `gs`.
     force : bool
-        Overwrite `output` if it exists.
+        Overwrite `output` if it exists. Default: raise `InputError`.
+    progress : Progress, optional
+        Shows a bar.
     **words
-        Single options by the names of `ViewOptions`.
+        Single options, by the names of `ViewOptions`.
+
+    Returns
+    -------
+    ScoreResult
+        What was scored, times and memory.
     """
     options = replace(options or ViewOptions(), **words)
     if score not in SCORES:
@@ -54,7 +61,7 @@ def score_gaussians(
     if Path(output).suffix.lower() != ".npy":
         raise InputError(f"-o {output}: expected a name that ends in .npy")
     check_writable(output, force)
-    # Photos decide at which size poses are drawn, and with it the hits: the same scores as in `compress`.
+    # Open the photos as `compress` does: their size sets the size of the views, and with it the scores.
     run = open_run(input, options, progress)
     views, clock = run.seen, run.clock
     if not views.train:

@@ -1,4 +1,4 @@
-"""`synth`: a big scene from a small one, for tests of memory and time, written as it is made."""
+"""`synth`: make a large scene from a small one, to test memory and time. Rows are written as they are made."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from flexgs_edge.scene.source import SceneSource
 LOG = logging.getLogger("flexgs_edge")
 
 ROW_COPIES = 3
-"""Times a row of the PLY that making and writing one holds: the parent's values, planes, the table."""
+"""Copies of a PLY row in memory while rows are made and written: the parent's values, planes, the table."""
 WORK_BYTES = 800
-"""Bytes a row beside that: float64 of means, scales, rotations and their products, numbers of rows."""
+"""Bytes per row besides: means, scales, rotations and their products in float64, and row numbers."""
 CHUNK_ROWS = 16384
-"""Rows at a time, memory allowing: 25 MB; more is slower (float64 planes leave the cache)."""
+"""We make at most this many rows at a time. More is slower, because the float64 planes no longer fit the cache."""
 _SAMPLE_ROWS = 65536
 _CORE = (0.01, 0.99)
-"""Quantiles of the positions between which a tile lies: the far background of a scene overlaps its neighbours."""
+"""A tile spans the positions between these quantiles. The far background of a scene overlaps its neighbours."""
 _GAP = 1.05
-"""Distance of tiles in their own widths."""
+"""Distance between tiles, in widths of a tile."""
 
 
 def synth(
@@ -50,9 +50,9 @@ def synth(
 ) -> SynthResult:
     """Write a scene of `gaussians` Gaussians made from a smaller one, and cameras for it.
 
-    Up to `MOST_PARTS` times the scene's count every Gaussian becomes parts that look like it together; beyond that there are
-    tiles, copies of the scene side by side. Memory does not grow with `gaussians`, and the bytes depend on nothing but the
-    scene, `gaussians` and `seed`.
+    Up to `MOST_PARTS` times the scene's count, each Gaussian is split into parts that look like it together. Beyond that,
+    copies of the scene (tiles) stand side by side. Memory does not grow with `gaussians`. The same scene, `gaussians` and
+    `seed` give the same bytes.
 
     Parameters
     ----------
@@ -61,25 +61,25 @@ def synth(
     input : path
         A scene file or a model folder.
     gaussians : int
-        Exactly so many.
+        Number of Gaussians to write, at least as many as the scene has.
     seed : int
-        Chooses which Gaussians get one part more than others.
+        Chooses the Gaussians that get one part more than others.
     force : bool
-        Overwrite files that exist.
+        Overwrite existing files.
     memory_limit : int, optional
-        Bytes for the whole process.
+        Bytes for the whole process. Default: three quarters of the free memory.
 
     Returns
     -------
     SynthResult
-        What was made.
+        Counts, tiles, parts and cameras of the new scene.
 
     Raises
     ------
     InputError
-        When the scene has more Gaussians than are asked for, or a file is in the way.
+        If the scene has more Gaussians than asked for, or a file exists already.
     BudgetError
-        When the memory limit is too small for any chunk, or the disk is full.
+        If the memory limit is too small for any chunk, or the disk is full.
     """
     if Path(output).suffix.lower() != ".ply" or str(output).lower().endswith(".compressed.ply"):
         raise InputError(f"{output}: expected a name that ends in .ply (and not in .compressed.ply)")
@@ -114,7 +114,7 @@ def synth(
     with clock.stage("write"):
         LOG.info("writing %d Gaussians, %d at a time", gaussians, rows)
         if cameras:
-            # The cameras take their name when the scene has taken its own.
+            # The file of cameras gets its name only after the scene has got its own.
             with atomic_write(beside, force) as file:
                 file.write(inria_json(cameras).encode())
                 notes = (*write_ply(target, made, force=force, chunk_rows=rows), *notes)
@@ -140,9 +140,9 @@ def synth(
 
 
 def tile_shifts(source: SceneSource, tiles: int) -> np.ndarray:
-    """Where copies of a scene stand side by side: [tiles, 3] f64, scene units, the first at zero.
+    """Offsets of the copies of a scene: [tiles, 3] f64, scene units. The first is zero.
 
-    They fill a grid, as square as can be, in the plane of the two axes along which the scene is widest.
+    The copies fill a nearly square grid in the plane of the scene's two widest axes.
     """
     shifts = np.zeros((tiles, 3))
     if tiles == 1:
@@ -152,7 +152,7 @@ def tile_shifts(source: SceneSource, tiles: int) -> np.ndarray:
     low, high = np.quantile(sample, _CORE, axis=1)
     width = high - low
     axes = np.sort(np.argsort(-width, kind="stable")[:2])
-    # A scene that is a point or a line: copies in one place would be no tiles.
+    # A point or a line has no width: without this its copies would all stand in one place.
     pitch = _GAP * np.where(width[axes] > 0, width[axes], max(width.max(), 1.0))
     columns = int(np.ceil(np.sqrt(tiles)))
     number = np.arange(tiles)
@@ -162,9 +162,10 @@ def tile_shifts(source: SceneSource, tiles: int) -> np.ndarray:
 
 
 def tiled_cameras(cameras: list[Camera], shifts: np.ndarray) -> list[Camera]:
-    """Cameras for tiles: those given for one tile; for more, as many as there are cameras or tiles, each in the next tile.
+    """Spread cameras over tiles: each camera moves to the next tile in turn.
 
-    So every tile is looked at from inside, every pose is used, and a pass over all views costs little more than with one tile.
+    One tile keeps its cameras. More tiles get as many cameras as there are cameras or tiles, whichever is more. Every tile is
+    then seen from inside, and a pass over all views costs little more than with one tile.
     """
     if len(shifts) == 1:
         return cameras
@@ -177,7 +178,7 @@ def tiled_cameras(cameras: list[Camera], shifts: np.ndarray) -> list[Camera]:
 
 
 def _camera_notes(cameras: list[Camera]) -> tuple[str, ...]:
-    """What INRIA's cameras.json cannot say of these cameras."""
+    """Notes on properties of these cameras that INRIA's cameras.json cannot hold."""
     notes = []
     if any(camera.distortion is not None for camera in cameras):
         notes.append("lens distortion left out of cameras.json: only poses and focal lengths are kept")

@@ -1,4 +1,4 @@
-"""`trim`: a smaller file from a layered one, by copying whole layers."""
+"""`trim`: make a smaller file from a layered one, by copying whole layers."""
 
 from __future__ import annotations
 
@@ -17,30 +17,32 @@ from flexgs_edge.report.file_results import TrimResult
 def trim(
     input: str | os.PathLike[str], output: str | os.PathLike[str], max_size: int, force: bool = False
 ) -> TrimResult:
-    """Copy as many whole layers of a `.fgs` file as fit into a size, at the speed of copying.
+    """Copy as many whole layers of a `.fgs` file as fit into a size. Takes as long as copying the file.
 
     Parameters
     ----------
     input : path
-        A `.fgs` of version 2; neither the original nor cameras are needed.
+        A `.fgs` of version 2. The original scene and cameras are not needed.
     output : path
         The `.fgs` to write.
     max_size : int
-        Bytes that it may have.
+        Most bytes of the new file.
     force : bool
-        Overwrite `output` if it exists.
+        Overwrite `output` if it exists. Default: raise `InputError`.
 
     Returns
     -------
     TrimResult
-        What was kept.
+        Layers, Gaussians and bytes kept.
 
     Raises
     ------
     InputError
-        For files without layers; `FormatError` for damaged ones.
+        If the file has no layers.
+    FormatError
+        If the file is damaged.
     TargetError
-        When not even the first layer fits.
+        If not even the first layer fits.
     """
     if max_size < 1:
         raise InputError(f"--max-size {max_size}: expected at least 1 byte")

@@ -1,4 +1,4 @@
-"""`verify`: every byte of a `.fgs` file against its checksums."""
+"""`verify`: check every byte of a `.fgs` file against its checksums."""
 
 from __future__ import annotations
 
@@ -11,17 +11,22 @@ from flexgs_edge.report.file_results import VerifyResult
 
 
 def verify(path: str | os.PathLike[str]) -> VerifyResult:
-    """Check every checksum of a `.fgs` file.
+    """Check every checksum of a `.fgs` file. A damaged part is reported, not raised.
+
+    Parameters
+    ----------
+    path : path
+        The `.fgs` file.
 
     Returns
     -------
     VerifyResult
-        The verdict on every part.
+        Whether each part is whole.
 
     Raises
     ------
     FormatError
-        When the header itself is damaged: nothing behind it can be found then.
+        If the header is damaged: the parts behind it cannot be found then.
     """
     place = Path(path)
     if place.is_dir() or (place.exists() and place.suffix.lower() != ".fgs"):

@@ -1,4 +1,4 @@
-"""`info --errors`: what every channel of a `.fgs` is worth, measured by drawing the scene with less of it."""
+"""`info --errors`: measure the quality and the bytes that each channel of a `.fgs` is worth."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ from flexgs_edge.run.view_set import views_info
 from flexgs_edge.scene.fields import FIELDS
 
 COPIES = 4
-"""Scenes of float32 values that are held at the most: the codes, those of one lesser scene, its values, and coding it."""
+"""Bound on the scenes in memory, each counted as float32: codes, reduced codes, reduced values, and the coder's buffers."""
 
 
 def worth(
     path: str | os.PathLike[str], options: ViewOptions | None = None, progress: Progress = SILENT, **words: Any
 ) -> WorthResult:
-    """What `info` finds, and what each channel is worth.
+    """Reduce each channel of a `.fgs` in turn, and measure bytes saved and quality lost.
 
     Parameters
     ----------
     path : path
-        A `.fgs`.
+        A `.fgs` file.
     options : ViewOptions, optional
-        Views as for `evaluate`: cameras given, else beside the file, else automatic; the held-out ones are drawn. Photos are
-        not used: the file's own renders are the reference.
+        Options as on the command line. Default: the cameras beside the file, else automatic ones. Only held-out views are
+        drawn. Photos are not used: the references are renders of the file itself.
     progress : Progress, optional
-        A bar.
+        Shows a bar.
     **words
-        Single options by the names of `ViewOptions`.
+        Single options, by the names of `ViewOptions`.
 
     Returns
     -------
     WorthResult
-        What `info` finds, the views, and for every channel and change of `reduced_scenes` the bytes of the file that it
-        saves, the fidelity (dB; None where nothing changes) and the modelled drop (dB).
+        The result of `info`, the views, and a record for each change of `reduced_scenes`: bytes saved, fidelity (dB; None if
+        nothing changes) and modelled drop (dB).
     """
     options = replace(options or ViewOptions(), images=None, **words)
     place = Path(path)

@@ -1,4 +1,4 @@
-"""The views that judge: renders of the original and photos, kept in memory as far as the budget goes."""
+"""Compare a scene with renders of the original and with photos, kept in memory as far as the budget allows."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.bench import Bench
 
 SHARE = 4
-"""Reference images may take this part of the free budget (one in four): the rest is for the scene and its views."""
+"""Reference images take at most one part in `SHARE` of the free budget. The scene and its views need the rest."""
 LIBRARY_BYTES = 12 * 2**20
-"""Bound on what Pillow takes when it is loaded and decodes: docs/results/tuning.md#memory"""
+"""Bound on the bytes that loading Pillow and decoding with it take: docs/results/tuning.md#memory"""
 WORK_BYTES = 100
-"""Bytes a pixel that decoding a photo, or SSIM, holds for a moment (32 of SSIM's are the backend's)."""
+"""Bound on the bytes per pixel while a photo is decoded or SSIM is computed. SSIM's share includes the backend's buffers."""
 ESTIMATE_STEP = 2
-"""Pixels from one to the next, in both directions, that an estimate looks at."""
+"""An estimate reads every second pixel in both directions."""
 
 
 class Judge:
-    """Compares a scene with the original (and with photos) over some views.
+    """Compares a scene with the original, and with photos, over some views.
 
     Parameters
     ----------
     bench : Bench
-        Draws both; kept images are taken from its budget, at most a quarter of what is free.
+        Draws both scenes. Kept images take at most a quarter of its free budget.
     source : SceneSource
-        The original; drawn again whenever a reference was not kept.
+        The original. A reference that was not kept is drawn again.
     views : ViewSet
-        All views.
+        All views of the run.
     indices : sequence of int
-        The views that judge.
+        The views to compare.
     with_photos : bool
-        Compare with photos as well, where there are any.
+        Also compare with the photos, if there are any.
     base_psnr : float
-        For the modelled drop, dB.
+        PSNR of the original that the modelled drop starts from, dB.
     reports : bool
-        Its qualities are what a run reports, SSIM and all: a search takes them whole, and a file that decodes to what the search
-        measured is not measured again.
+        The run reports these qualities, SSIM included. The judge then remembers them, and does not measure the same scene
+        twice.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Judge:
         self._original_error: list[float] = []
         self._coarse_error: dict[int, float] = {}
         self._known: dict[bytes, Quality] = {}
-        # Taken now and not when images come: scenes that are loaded later must not count on it.
+        # Reserve the memory now: scenes that are loaded later must not count on it.
         pixels = [camera.width * camera.height for camera in self.cameras]
         images = 1 if self.photos is None else 2
         wanted = sum(camera.width * camera.height + _coarse_pixels(camera) for camera in self.cameras) * 12 * images
@@ -86,11 +86,11 @@ class Judge:
         budget.reclaimers.append(self._give_back)
 
     def prepare(self, scene: DeviceScene, progress: Progress = SILENT) -> None:
-        """Draw the references from `scene` (the original, loaded), and measure them against the photos."""
+        """Draw the references from `scene`, the loaded original, and measure them against the photos."""
         self._original_error, self._coarse_error, self._known = [], {}, {}
         images = self.bench.images(scene, self.cameras)
         for i, drawn in enumerate(progress.track(images, "drawing the original", len(self.cameras))):
-            # Clamped once, and contiguous by channel as renders are: comparing is then much faster.
+            # Clamp once, and store channel by channel as renders do: comparisons are then much faster.
             image = _planes(drawn)
             self._keep(("original", i), image)
             if self.photos is not None:
@@ -99,7 +99,7 @@ class Judge:
                 self._keep(("photo", i), photo)
 
     def close(self) -> None:
-        """Give the memory of the kept images back."""
+        """Free the kept images and the reserved memory."""
         self._kept, self._away = {}, {}
         self._budget.give(self._reserved + self._work)
         self._reserved = self._work = self._left = 0
@@ -107,7 +107,10 @@ class Judge:
             self._budget.reclaimers.remove(self._give_back)
 
     def _give_back(self, short: int) -> None:
-        """Give up room and then kept images until `short` bytes are free: to scratch files, or to be drawn and read again."""
+        """Free `short` bytes: first unused reserve, then kept images.
+
+        Images go to scratch files if the run has some; otherwise they are drawn or read again when needed.
+        """
         freed = min(self._left, short)
         self._left -= freed
         while freed < short and self._kept:
@@ -119,7 +122,7 @@ class Judge:
 
     @property
     def kept(self) -> int:
-        """Reference renders held in memory."""
+        """Number of reference renders in memory."""
         return sum(kind == "original" for kind, _ in self._kept)
 
     def compare(
@@ -129,9 +132,20 @@ class Judge:
         progress: Progress = SILENT,
         lpips: Distance | None = None,
     ) -> Quality:
-        """Quality of `scene` over the views. LPIPS takes far longer than drawing them.
+        """Measure the quality of `scene` over the views.
 
-        One that reports draws nothing twice: a scene that is the same to the bit has the same quality.
+        With `reports`, a scene that equals an earlier one bit for bit returns the earlier quality without drawing.
+
+        Parameters
+        ----------
+        scene : DeviceScene
+            The loaded scene.
+        with_ssim : bool
+            Also measure SSIM.
+        progress : Progress, optional
+            Shows a bar.
+        lpips : Distance, optional
+            Also measure LPIPS with this network. It takes far longer than drawing the views. Default: no LPIPS.
         """
         whole, elsewhere = self.reports and with_ssim and lpips is None, self.bench.ready_cluster is not None
         drawn = scene.fingerprint(elsewhere) if whole else None
@@ -152,7 +166,7 @@ class Judge:
         return quality
 
     def estimate(self, scene: DeviceScene) -> Quality:
-        """`compare` at a fourth of the pixels, for a search that only has to know where to look next."""
+        """Measure PSNR on a quarter of the pixels: enough for a search to choose its next step, and faster than `compare`."""
         found = []
         few = [camera.every(ESTIMATE_STEP) for camera in self.cameras]
         for i, camera in enumerate(self.renderer.in_turn(scene, few)):
@@ -161,7 +175,7 @@ class Judge:
         return Quality(tuple(found), self.base_psnr)
 
     def _coarse(self, i: int) -> tuple[np.ndarray, np.ndarray | None, float | None]:
-        """What an estimate compares with: original and photo at its pixels, and the error between them."""
+        """References of an estimate: original and photo at its pixels, and the mean squared error between them."""
         every = (slice(None, None, ESTIMATE_STEP),) * 2
         original, photo = self._held(("coarse original", i)), self._held(("coarse photo", i))
         if original is None:
@@ -181,14 +195,14 @@ class Judge:
     def _ssims(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
         height, width = pairs[0][0].shape[:2]
         work = min(ssim_bytes(width, height), self._work)
-        self._budget.give(work)  # taken again by the arrays themselves
+        self._budget.give(work)  # the arrays of `ssims` take it themselves
         try:
             return ssims(self.renderer.backend, pairs)
         finally:
             self._budget.take("comparing views", work)
 
     def images(self, scene: DeviceScene, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Render of `scene`, render of the original and photo of the view `indices[i]`: [H, W, 3] f32 in [0, 1]."""
+        """Render of `scene`, render of the original and photo of view `indices[i]`, each [H, W, 3] f32 in [0, 1]."""
         image = _planes(self.renderer.render(scene, self.cameras[i]))
         return image, _planes(self.original(i)), self._photo(i)
 
@@ -200,7 +214,7 @@ class Judge:
             self._put_away(key, image)
 
     def _put_away(self, key: tuple[str, int], image: np.ndarray) -> None:
-        """Keep an image in a scratch file, where this run has some."""
+        """Move an image to a scratch file if the run has some; otherwise drop it."""
         storage = self.renderer.storage
         if storage.spills:
             height, width, _ = image.shape
@@ -211,7 +225,7 @@ class Judge:
         return self._kept.get(key, self._away.get(key))
 
     def original(self, i: int) -> np.ndarray:
-        """Render of the original from the view `indices[i]`, [H, W, 3] f32."""
+        """Render of the original from view `indices[i]`, [H, W, 3] f32. Drawn again if it was not kept."""
         held = self._held(("original", i))
         if held is None:
             with self.renderer.load(self.source) as scene:
@@ -227,13 +241,13 @@ class Judge:
 
 
 def _coarse_pixels(camera: Camera) -> int:
-    """Pixels that an estimate looks at."""
+    """Number of pixels that an estimate reads."""
     few = camera.every(ESTIMATE_STEP)
     return few.width * few.height
 
 
 def measurement_of(quality: Quality) -> Measurement:
-    """The means that a search decides by, and the worst view's own figures."""
+    """The figures that a search decides on: the means, and those of the worst view."""
     worst = quality.worst
     alone = None if worst is None else Quality((worst,), quality.base_psnr)
     return Measurement(
@@ -245,7 +259,7 @@ def measurement_of(quality: Quality) -> Measurement:
 
 
 def _planes(image: np.ndarray) -> np.ndarray:
-    """[H, W, 3] in [0, 1] whose memory is contiguous by channel."""
+    """Clamp [H, W, 3] to [0, 1], stored channel by channel."""
     planes = np.ascontiguousarray(image.transpose(2, 0, 1))
     np.clip(planes, 0.0, 1.0, out=planes)
     return planes.transpose(1, 2, 0)

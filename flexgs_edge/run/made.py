@@ -1,4 +1,4 @@
-"""What a method hands back."""
+"""The record that a method returns."""
 
 from __future__ import annotations
 
@@ -15,30 +15,32 @@ from flexgs_edge.quality.view_quality import Quality
 
 @dataclass(frozen=True)
 class Made:
-    """A finished file: its numbers, how it was found and what it is worth.
+    """A finished file: its size, the search that found it, and its quality.
 
     Parameters
     ----------
     size : int
-        Bytes.
+        Bytes of the file.
     count, sh_count, sh_degree : int
-        Gaussians, those with SH, and the highest degree.
+        Gaussians, those with SH above degree 0, and the highest SH degree.
     choice : Choice
-        What was pruned, in thousandths.
+        Prune rate and SH rate, in thousandths.
     search : SearchResult or None
-        `None` where nothing was judged.
+        Every step of the search; `None` for fixed rates.
     quality : Quality or None
-        Of the decoded file, over the views that report.
+        Quality of the decoded file over the report views; `None` without views.
     trained : float or None
-        Fidelity of the decoded file on training poses, dB.
-    bits, groups : BitSpec, mapping, or None
-        Bits for each attribute and groups for each array (`paper`).
+        Fidelity of the decoded file on training views, dB; `None` if not measured.
+    bits : BitSpec or None
+        Bits per attribute (`paper`).
+    groups : mapping or None
+        Quantization groups per array (`paper`).
     step_sizes : StepSizes or None
-        Of the grid (`best`).
+        Quantization step sizes (`best`).
     sensitivity : tuple of Sensitivity
-        What `--bits auto` measured.
+        Loss per attribute and bit width, as `--bits auto` measured it.
     scores_reused : bool
-        Scores came from the cache.
+        Whether the scores came from the cache.
     """
 
     size: int

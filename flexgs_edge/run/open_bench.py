@@ -1,4 +1,4 @@
-"""Open what draws: the backend, the renderer, and the cluster where one is asked for."""
+"""Open the bench of a run: backend, renderer and, if asked for, a cluster."""
 
 from __future__ import annotations
 
@@ -19,16 +19,28 @@ from flexgs_edge.views.cluster import Cluster
 from flexgs_edge.views.worker import Drawing
 
 BUILD_BYTES = 24 * 2**20
-"""Bound on what building our kernels adds to the loaded compiler: docs/results/tuning.md#memory"""
+"""Bound on the bytes that building our kernels adds to the loaded compiler: docs/results/tuning.md#memory"""
 
 
 def open_bench(run: Run[Any], cluster: str | None = None) -> Bench:
-    """What draws the views of a run; close it when done.
+    """Open the renderer, and the cluster if there is one. Close the bench when done.
 
     Parameters
     ----------
+    run : Run
+        Names the device, and pays for memory.
     cluster : str, optional
-        Address of workers that draw for it (stage `cluster`), each with the run's memory limit for itself.
+        Address of a Dask scheduler, or `local:N`. Each worker gets the run's whole memory limit. Default: no cluster.
+
+    Returns
+    -------
+    Bench
+        Opening it is timed as the stages `device` and `cluster`.
+
+    Raises
+    ------
+    DeviceError
+        If the named device does not exist or failed its self-test.
     """
     options: ViewOptions = run.options
     assert options.near is not None and options.background is not None
@@ -49,18 +61,18 @@ def open_bench(run: Run[Any], cluster: str | None = None) -> Bench:
 
 
 def counted_backend(device: str | None, budget: MemoryBudget, clock: Stopwatch) -> Backend:
-    """The backend that `device` names (stage `device`), and what its runtime holds taken from the budget."""
+    """Open the backend that `device` names, as the stage `device`, and take its runtime's memory from the budget."""
     before = current_rss()
     with clock.stage("device"):
         backend = open_backend(device, budget)
     if not backend.is_numpy:
-        # The runtime and its compiler stay loaded, and take more where no kernels are cached.
+        # The runtime and its compiler stay loaded. They take more memory when no kernels are cached.
         budget.take("the OpenCL runtime", max(current_rss() - before, 0) + BUILD_BYTES)
     return backend
 
 
 def bench_info(run: Run[Any], bench: Bench | None) -> RunInfo:
-    """Seconds, memory and device of a run that draws (never stored in files)."""
+    """Record seconds, memory and device of a run that draws. Files never store this record: their bytes would change."""
     if bench is None:
         return run_info(run.budget, run.clock)
     return run_info(run.budget, run.clock, bench.renderer.backend, bench.renderer.storage)
@@ -69,7 +81,7 @@ def bench_info(run: Run[Any], bench: Bench | None) -> RunInfo:
 def run_info(
     budget: MemoryBudget, clock: Stopwatch, backend: Backend | None = None, storage: Storage = IN_MEMORY
 ) -> RunInfo:
-    """The same of what draws nothing."""
+    """Record seconds, memory and device of a run that has no bench."""
     return RunInfo(
         seconds=clock.total,
         stages=dict(clock.stages),

@@ -1,4 +1,4 @@
-"""From a path to a scene: each kind of file and the reader that opens it."""
+"""Open a scene file with the reader of its suffix."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ READERS: dict[str, str] = {
     ".fgs": "flexgs_edge.codec.open_fgs:open_fgs",
     **dict.fromkeys(FORMATS, "flexgs_edge.io.exchange:read_foreign"),
 }
-"""Kinds of scene files by suffix: the module and the function that open one, imported when a file asks for them."""
+"""Readers by suffix, as `module:function`. A reader is imported only when a file needs it, so start-up stays fast."""
 
 
 def open_scene(path: str | os.PathLike[str], readers: Mapping[str, str] = READERS) -> SceneSource:
@@ -34,7 +34,9 @@ def open_scene(path: str | os.PathLike[str], readers: Mapping[str, str] = READER
     Raises
     ------
     InputError
-        When there is no such path or its kind is unknown; `FormatError` when the file breaks its format.
+        If the path does not exist or its suffix is unknown.
+    FormatError
+        If the file does not follow its format.
     """
     place = Path(path)
     supported = f"supported: files ending in {', '.join(readers)}, or a model folder with point_cloud/iteration_*"
@@ -42,7 +44,7 @@ def open_scene(path: str | os.PathLike[str], readers: Mapping[str, str] = READER
         return PlySource(latest_iteration(place))
     if not place.exists():
         raise InputError(f"{path}: no such file or folder; {supported}")
-    # The longest suffix wins: .compressed.ply is another format than .ply.
+    # Use the longest suffix: .compressed.ply is another format than .ply.
     suffixes = [suffix for suffix in readers if place.name.lower().endswith(suffix) and place.suffix]
     if not suffixes:
         raise InputError(f"{path}: unknown kind of scene {place.suffix!r}; {supported}")

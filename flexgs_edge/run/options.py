@@ -1,4 +1,4 @@
-"""The words of the command line as one record, checked before any work starts."""
+"""The options of the command line as records, checked before any work starts."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from flexgs_edge.goals.target import Figure, MaxDrop, MaxSize, MinFidelity, Targ
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 
 NO_PHOTOS = "none"
-"""`--images none`: leave photos that lie beside the scene alone."""
+"""`--images none`: do not use the photos beside the scene."""
 AUTO_CAMERAS = "auto"
-"""`--cameras auto`: views made from the scene itself."""
+"""`--cameras auto`: generate camera views from the scene itself."""
 NO_CAMERAS = "none"
-"""`--cameras none`: no views at all; only fixed rates work then."""
+"""`--cameras none`: no views at all. Only fixed rates work then."""
 METHODS = ("best", "paper")
 EFFORT_WORDS = (*REFINE_STEPS, "max")
-"""`max`, with a descent of all values, is for the best method and a `.fgs` only."""
+"""`max` also distils. Only the method `best` knows it, and only for a `.fgs`."""
 SELECTS = ("test", "train")
 LAYERS_MOST = 4
 DISTIL_MOST = 100_000
-"""Steps of a descent: hours on any machine, and no more is gained from a few thousand on."""
+"""Most iterations of distillation. This many take hours on any machine; beyond a few thousand nothing is gained."""
 DEFAULT_MAX_DROP = 1.0
 METHOD_ONLY: dict[str, tuple[str, object]] = {
     "prune_rate": ("paper", None),
@@ -45,11 +45,11 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "resume": ("best", False),
     "cluster": ("best", None),
 }
-"""Options that only one `--method` knows, with their defaults."""
+"""Options that only one `--method` knows: the method and the default of each."""
 
 
 def check_method(method: str, given: Iterable[str]) -> None:
-    """Raise `InputError` for options that another method than `method` was meant by; none is ignored silently."""
+    """Raise `InputError` if an option in `given` belongs to another method. We never ignore an option silently."""
     for name in given:
         other = METHOD_ONLY[name][0]
         if other != method:
@@ -62,34 +62,34 @@ def check_method(method: str, given: Iterable[str]) -> None:
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Where views come from and how they are drawn.
+    """Where the views come from, and how they are drawn.
 
     Parameters
     ----------
     cameras : str, optional
-        A camera file or a folder with one, `auto`, or `none`. Default: what lies beside the scene, else `auto`.
+        A camera file, a folder with one, `auto`, or `none`. Default: the cameras beside the scene, else `auto`.
     ignore_distortion : bool
-        Take the poses of distorted lenses, without photos.
+        Use the poses of cameras with lens distortion, without their photos. Default: raise `InputError` for them.
     images : str, optional
-        Folder of photos; `none` for no photos. Default: `images/` beside the scene.
+        Folder of photos, or `none`. Default: `images/` beside the scene.
     holdout : int
-        Every holdout-th view by name is held out; 0 holds out none.
+        Hold out every n-th view in order of name; 0 holds out none.
     resolution : int
-        Wider views are scaled down to this many pixels.
+        Scale wider views down to this many pixels. Fewer pixels are faster.
     near : float, optional
-        Near plane, scene units. Default: what a `.fgs` says, else 0.2.
+        Near plane, scene units. Default: as a `.fgs` states, else 0.2.
     background : tuple of float, optional
-        Red, green, blue in [0, 1]. Default: what a `.fgs` or `cfg_args` says, else black.
+        Red, green, blue in [0, 1]. Default: as a `.fgs` or `cfg_args` states, else black.
     extent : str, optional
-        `exact` or `inria`. Default: what a `.fgs` says, else `exact`.
+        How far a Gaussian reaches on the screen: `exact` or `inria`. Default: as a `.fgs` states, else `exact`.
     antialiased : bool, optional
-        Opacities compensated for the dilation. Default: what a `.fgs` or `cfg_args` says, else not.
+        Reduce opacities to make up for the screen-space dilation. Default: as a `.fgs` or `cfg_args` states, else no.
     drop_invalid : bool
-        Leave rows with NaN, infinity or zero quaternions out.
+        Leave out Gaussians with NaN, infinity or zero quaternions. Default: raise `InputError` for them.
     memory_limit : int, optional
-        Bytes for the whole process. Default: 3/4 of what is free.
+        Bytes for the whole process. Default: three quarters of the free memory.
     device : str, optional
-        OpenCL device (number, part of its name, `cpu`, `gpu`) or `numpy`.
+        OpenCL device (number, part of its name, `cpu` or `gpu`) or `numpy`. Default: the one that `devices` shows as chosen.
     """
 
     cameras: str | None = None
@@ -117,64 +117,66 @@ class ViewOptions:
 
 @dataclass(frozen=True)
 class CompressOptions(ViewOptions):
-    """Everything that `compress` may be told, beside input and output.
+    """All options of `compress` besides input and output.
 
     Parameters
     ----------
     method : {"best", "paper"}
-        Measured costs, one multiplier and the real coder (the default), or the paper's method as it is.
+        `best` (the default) measures the cost of each Gaussian and codes with entropy coding. `paper` is the published
+        method: faster, larger files.
     select : {"test", "train"}
-        Views that decide where to stop: the held-out ones, or the training poses.
+        Views that decide when the search stops: the held-out views (`test`) or the training views. Default: `test`.
     score : str
-        `gs`, `meson`, or a .npy/.npz file with one number a Gaussian (`paper`).
+        Importance score: `gs`, `meson`, or a .npy/.npz file with one number per Gaussian (`paper`). Default: `gs`.
     save_scores : str, optional
-        Write the scores here, .npy (`paper`).
+        Also write the scores to this .npy file (`paper`).
     score_cache : str, optional
-        Keep the scores here, and take them from here when they are of the same scene, poses and score (`paper`).
+        Keep the scores in this file. Reuse them when scene, views and score are the same (`paper`).
     max_drop, min_fidelity : float, optional
-        Quality targets, dB.
+        Quality target: most PSNR lost, or least fidelity, dB. Default: `max_drop=1`.
     max_worst_drop : float, optional
-        Drop that no deciding view may pass, beside a quality target, dB.
+        Largest drop of any single deciding view, in addition to a quality target, dB.
     max_size : int, optional
-        Size target, bytes.
+        Size target: most bytes of the file.
     min_ratio : float, optional
-        Size target, PLY bytes / file bytes.
+        Size target: PLY bytes divided by file bytes.
     prune_rate, sh_rate : float, optional
-        Fixed rates from 0 to 1: no search (`paper`).
+        Fixed rates from 0 to 1, instead of a search (`paper`). Give both or none.
     bits : str
-        Bits per attribute, `auto`, or `rtn4`, `rtn8`, ... (`paper`).
+        Bits per attribute, `paper`, `auto`, or `rtn4`, `rtn8`, ... (`paper`). Default: `paper`.
     groups : int, optional
-        Quantization groups per channel (`paper`). Default: one for about 512 rows.
+        Quantization groups per channel (`paper`). Default: one group for about 512 rows.
     base_psnr : float
-        PSNR of the original against its photos that the modelled drop starts from, dB.
+        Assumed PSNR of the original against its photos, for the modelled drop, dB.
     effort : {"fast", "balanced", "thorough", "max"}
-        Steps of the search; `max` distils as well (`best`, `.fgs`).
+        More effort makes smaller files and takes longer. `max` also distils (`best`, `.fgs`). Default: `balanced`.
     best_effort : bool
-        Write the closest point when the target cannot be met.
+        If the target cannot be met, write the closest result. Default: raise `TargetError`.
     unseen : str
-        What becomes of Gaussians that no training pose sees (`best`): `keep`, `drop`, or the share that stays, such as `20%`.
+        What to do with Gaussians that no training view sees (`best`): `keep` them without view-dependent colour (the
+        default), `drop` them, or keep the most visible share, such as `20%`.
     views_margin : bool
-        Make three poses of every two given ones, nearer to what is seen, farther from it and in between, and score them too
-        (`best`).
+        Also score generated camera views: closer, farther and in between (`best`). Slower, slightly larger files. Default: no.
     refit : bool
-        Refit colours after pruning and quantizing (`best`).
+        Refit colours after pruning and quantizing (`best`). Default: yes; without it files are larger.
     distil : int, optional
-        Steps of the descent towards the original's renders, 0 for none (`best`, `.fgs`). Default: as the effort says.
+        Iterations that fine-tune the file against renders of the original, 0 for none (`best`, `.fgs`). Default: as the
+        effort says.
     layers : int
-        Layers that `trim` can cut the file at, 1 to 4 (`best`).
+        Write the file in 1 to 4 layers, between which `trim` can cut it (`best`). Default: 1.
     scratch : str, optional
-        Folder for scratch files of scenes that do not fit into memory (`best`). Default: the output's.
+        Folder for scratch files of scenes that do not fit into memory (`best`). Default: the folder of the output.
     resume : bool
-        Keep every round of the search in the scratch folder until the run is done, and go on from the rounds of a run that was
-        cut short (`best`).
+        Keep each round of the search in the scratch folder until the run is done. Continue from the rounds of an interrupted
+        run (`best`).
     cluster : str, optional
-        Workers that draw what is scored and compared: the address of a Dask scheduler, or `local:N` (`best`).
+        Draw views on Dask workers: the address of a scheduler, or `local:N` (`best`). Default: draw them here.
     report : str, optional
-        Folder for a page about the run (index.html) and its record (result.json).
+        Write a page about the run (index.html) and its record (result.json) to this folder.
     dry_run : bool
-        Do everything but write.
+        Do all the work, but write no file.
     force : bool
-        Overwrite files that exist.
+        Overwrite existing files.
     """
 
     method: str = "best"
@@ -258,7 +260,7 @@ class CompressOptions(ViewOptions):
 
     @property
     def unseen_share(self) -> float:
-        """Share from 0 to 1 of the Gaussians that no pose sees that stays."""
+        """Share, from 0 to 1, of the unseen Gaussians to keep."""
         word = self.unseen.strip().lower()
         if word in ("keep", "drop"):
             return float(word == "keep")
@@ -272,7 +274,7 @@ class CompressOptions(ViewOptions):
 
     @property
     def fixed(self) -> Choice | None:
-        """The fixed rates, if they were given."""
+        """The fixed rates; `None` if a search is asked for."""
         if self.prune_rate is None or self.sh_rate is None:
             return None
         choice = Choice.from_rates(self.prune_rate, self.sh_rate)
@@ -281,7 +283,7 @@ class CompressOptions(ViewOptions):
         return choice
 
     def target(self, figure: Figure, ply_bytes: int) -> Target | None:
-        """The target; `figure` is what decides on drops, `None` comes back for fixed rates."""
+        """The target of the search, or `None` for fixed rates. `figure` is the kind of drop that decides."""
         if self.fixed is not None:
             return None
         if self.max_size is not None:
@@ -293,7 +295,7 @@ class CompressOptions(ViewOptions):
         return mean if self.max_worst_drop is None else WorstToo(mean, self.max_worst_drop, figure)
 
     def bit_spec(self) -> tuple[BitSpec | None, int | None]:
-        """Bits (`None`: to be searched) and groups that `--bits` and `--groups` ask for."""
+        """Bits and groups that `--bits` and `--groups` ask for. `None` for bits: measure them (`auto`)."""
         words = self.bits.strip().lower()
         if words == "auto":
             return None, self.groups

@@ -1,4 +1,4 @@
-"""Pictures and camera places for a report: a few views of the original and of the decoded scene, drawn and encoded."""
+"""Draw and encode the pictures of a report, and collect the camera positions for its plans."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.source import SceneSource
 
 MOST_SHOTS = 5
-"""Views with pictures: the worst, the median, the best, and one between each two."""
+"""A report shows pictures of at most this many views: the worst, the median, the best, and one between each two."""
 MOST_WIDTH = 800
-"""Pictures are scaled down to this many pixels: twice a phone's, and a page of a few MB at most."""
+"""Wider pictures are scaled down to this many pixels: sharp on a phone, and a page of a few MB at most."""
 LAYERS = 4
-"""Pictures of a view: original, compressed, error map, photo."""
+"""Pictures per view: original, compressed, error map, photo."""
 PIXEL_BYTES = 1
-"""Bytes a pixel that an encoded picture is allowed for. Only noise takes more: docs/results/tuning.md#memory"""
+"""Bytes per pixel that we reserve for an encoded picture. Only noise takes more: docs/results/tuning.md#memory"""
 JPEG_QUALITY = 95
-"""The pictures shall differ by what compression did, not by JPEG: docs/results/tuning.md#jpeg_quality"""
+"""High enough that pictures differ by our compression and not by JPEG: docs/results/tuning.md#jpeg_quality"""
 ERROR_QUALITY = 85
 MOST_POINTS = 1500
-"""Gaussians that stand for the scene in the plans of the cameras."""
+"""The camera plans show the scene as at most this many of its Gaussians."""
 
 
 def shown_size(camera: Camera) -> tuple[int, int]:
@@ -40,13 +40,13 @@ def shown_size(camera: Camera) -> tuple[int, int]:
 
 
 def shots_bytes(cameras: Sequence[Camera]) -> int:
-    """Most bytes that the pictures of these views take, encoded."""
+    """Bytes to reserve for the encoded pictures of a report on `cameras`."""
     sizes = sorted((width * height for width, height in map(shown_size, cameras)), reverse=True)
     return LAYERS * PIXEL_BYTES * sum(sizes[:MOST_SHOTS])
 
 
 def chosen_ranks(count: int) -> list[int]:
-    """Places, from the worst view on, of the views that are shown.
+    """Ranks of the views to show, counted from the worst view.
 
     >>> chosen_ranks(10), chosen_ranks(2), chosen_ranks(0)
     ([0, 2, 4, 6, 9], [0, 1], [])
@@ -56,14 +56,16 @@ def chosen_ranks(count: int) -> list[int]:
 
 
 def draw_shots(judge: Judge, scene: DeviceScene, quality: Quality, progress: Progress = SILENT) -> tuple[Shot, ...]:
-    """Pictures of some views, the worst first.
+    """Draw and encode the pictures of some views, the worst view first.
 
     Parameters
     ----------
     judge : Judge
-        What measured `quality`; works in the memory that it holds for comparing views.
+        Measured `quality`. Drawing reuses the memory that it holds for comparing views.
     scene : DeviceScene
-        The decoded scene.
+        The decoded scene, loaded.
+    quality : Quality
+        Ranks the views.
     """
     order = quality.by_loss
     ranks = chosen_ranks(len(order))
@@ -90,7 +92,7 @@ def draw_shots(judge: Judge, scene: DeviceScene, quality: Quality, progress: Pro
 
 
 def encode(image: np.ndarray, size: tuple[int, int], quality: int = JPEG_QUALITY) -> bytes:
-    """JPEG of [H, W, 3] f32 in [0, 1], scaled down to `size` by area; colours keep their full resolution."""
+    """Encode [H, W, 3] f32 in [0, 1] as JPEG, scaled down to `size` by area. Chroma keeps its full resolution."""
     from PIL import Image
 
     pixels = np.rint(np.clip(image, 0.0, 1.0) * np.float32(255.0)).astype(np.uint8)
@@ -103,7 +105,10 @@ def encode(image: np.ndarray, size: tuple[int, int], quality: int = JPEG_QUALITY
 
 
 def encode_error(image: np.ndarray, original: np.ndarray, size: tuple[int, int]) -> bytes:
-    """JPEG of the error map between two renders; errors are averaged where it is scaled down, not the pictures."""
+    """Encode the error map between two renders as JPEG.
+
+    The map is computed at full size and then scaled down: averaging the pictures first would hide errors.
+    """
     from PIL import Image
 
     errors = error_map(image, original)
@@ -113,7 +118,7 @@ def encode_error(image: np.ndarray, original: np.ndarray, size: tuple[int, int])
 
 
 def rig_of(views: ViewSet, source: SceneSource) -> Rig:
-    """Where the cameras stand, and some of the scene's Gaussians (evenly spaced rows: the same ones every time)."""
+    """Collect the camera poses, and some Gaussians at evenly spaced rows. The same scene gives the same Gaussians."""
     cameras = views.cameras
     rows = np.unique(np.linspace(0, source.count - 1, min(source.count, MOST_POINTS)).astype(np.int64))
     means = source.read(rows, ["means"])["means"]

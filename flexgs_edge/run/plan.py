@@ -1,4 +1,4 @@
-"""What a run of `compress` needs, decided before any work, and what its file will say about it."""
+"""Plan a run of `compress` before any work: the views that decide and report, the target, and the scores it needs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,20 @@ EVERYTHING = Choice(0, 0)
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run needs, decided before any work.
+    """Views, target and scores of a run.
 
-    `decide` and `report` are the views that decide where to stop and that the final figures come from: the held-out ones,
-    unless the training poses were asked to decide (then the held-out ones, which decided nothing, still report).
+    Parameters
+    ----------
+    decide : list of int
+        Views that decide when the search stops: the held-out views, or the training views with `--select train`.
+    report : list of int
+        Views that the final figures come from: the held-out views, or the training views if none are held out.
+    figure : str
+        The kind of drop that decides: `drop` against photos, else `modelled drop`.
+    target : Target or None
+        `None` for fixed rates.
+    needs_scores, computes_scores : bool
+        Whether the method needs importance scores, and whether it computes them instead of reading a file.
     """
 
     decide: list[int]
@@ -74,14 +84,14 @@ class Plan:
 
     @property
     def decided_by(self) -> str | None:
-        """The figure that decides: `drop`, `modelled drop`, `fidelity` or `size`; `None` for fixed rates."""
+        """Name of the deciding figure: `drop`, `modelled drop`, `fidelity` or `size`; `None` for fixed rates."""
         if self.target is None:
             return None
         return "size" if self.target.limit_bytes is not None else self.target.figure
 
     @staticmethod
     def kind_of(indices: list[int], views: ViewSet | None) -> str:
-        """`held-out`, `training` or `none`."""
+        """Name of the kind of views at `indices`: `held-out`, `training` or `none`."""
         if not indices or views is None:
             return "none"
         return "held-out" if indices == views.held_out else "training"

@@ -1,4 +1,4 @@
-"""`--report DIR`: what is gathered while a job runs, and the two files that come of it."""
+"""`--report DIR`: collect pictures and figures during a run, and write the page and the record at the end."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ PAGE, RECORD = "index.html", "result.json"
 
 
 class Reporter:
-    """Gathers what the page shows and writes it at the end.
+    """Collects the contents of a report during a run, and writes them at the end.
 
     Parameters
     ----------
     folder : path
-        Made at the end if it is missing; checked now.
+        Created at the end if it does not exist. The constructor only checks that it can be written.
     force : bool
-        Overwrite the files of an earlier report.
+        Overwrite an earlier report.
 
     Raises
     ------
     InputError
-        When the report could not be written there.
+        If the report cannot be written there.
     """
 
     def __init__(self, folder: str | Path, force: bool) -> None:
@@ -60,7 +60,7 @@ class Reporter:
 
     @classmethod
     def maybe(cls, folder: str | Path | None, force: bool) -> Reporter | None:
-        """`None` when no report was asked for."""
+        """Create a reporter, or return `None` if no report is asked for."""
         return None if folder is None else cls(folder, force)
 
     def _check(self) -> None:
@@ -80,34 +80,34 @@ class Reporter:
                 check_writable(folder / name, self.force)
 
     def reserve(self, budget: MemoryBudget, views: ViewSet) -> None:
-        """Take the pictures' memory before any work, so that a limit that is too small is named at once."""
+        """Reserve the memory of the pictures before any work, so that too small a limit fails at once."""
         budget.take("pictures of the report", shots_bytes(views.of(views.held_out or views.train)))
 
     def look(
         self, judge: Judge, scene: DeviceScene, quality: Quality, clock: Stopwatch, progress: Progress = SILENT
     ) -> None:
-        """Draw the pictures of a decoded scene that has just been measured."""
+        """Draw the pictures of a decoded scene whose quality `judge` has just measured."""
         with clock.stage("pictures"):
             self._shots = draw_shots(judge, scene, quality, progress)
 
     def read_contents(self, path: str | Path) -> None:
-        """What the channels of a finished `.fgs` take (other formats have none that `info` knows)."""
+        """Read the bytes per channel of a finished `.fgs`. Other formats are skipped: `info` knows no channels of theirs."""
         if Path(path).suffix.lower() == ".fgs":
             self._contents = contents(Path(path)).to_json()
 
     def read_contents_of(self, write: Callable[[Path], object]) -> None:
-        """The same in a dry run: `write` makes the file, which is gone afterwards."""
+        """Read the bytes per channel in a dry run: `write` writes a temporary file, which is then removed."""
         with tempfile.TemporaryDirectory(prefix="flexgs-") as folder:
             place = Path(folder) / "dry-run.fgs"
             write(place)
             self.read_contents(place)
 
     def see_cameras(self, views: ViewSet, scene: CheckedScene) -> None:
-        """Take down where the cameras stand."""
+        """Keep the camera poses for the plans."""
         self._rig = rig_of(views, scene.source)
 
     def write(self, result: CompressResult | EvaluateResult, target: Target | None = None) -> Path:
-        """Write the page and the record, both or neither."""
+        """Write the page and the record: both, or neither if writing fails. Returns the path of the page."""
         material = Material(self._shots, self._rig, self._contents, target)
         words = (
             compress_page(result, material) if isinstance(result, CompressResult) else evaluate_page(result, material)
@@ -124,7 +124,7 @@ class Reporter:
                 atomic_write(place, self.force) as page,
             ):
                 record.write(json_text(result.to_json()).encode())
-                # Written out before the page takes its name: no page without its record on a full disk.
+                # Flush the record before the page gets its name: on a full disk no page may stand without its record.
                 record.flush()
                 page.write(words.encode())
         except BaseException:

@@ -1,4 +1,4 @@
-"""What a `.fgs` file says about its making."""
+"""The settings that a `.fgs` file stores about how it was made."""
 
 from __future__ import annotations
 
@@ -15,7 +15,19 @@ from flexgs_edge.run.run import Run
 def make_settings(
     run: Run[CompressOptions], search: SearchResult | None, bits: BitSpec | None = None
 ) -> dict[str, Any]:
-    """What the file says about its making: the same for every run and machine, so no times, paths or devices."""
+    """Collect the settings that a `.fgs` file stores.
+
+    Every run and machine must store the same settings, so they hold no times, paths or devices.
+
+    Parameters
+    ----------
+    run : Run
+        Gives the options, the plan and the scene.
+    search : SearchResult or None
+        `None` for fixed rates.
+    bits : BitSpec, optional
+        Bits per attribute (`paper`).
+    """
     options, plan, scene, views = run.options, run.plan, run.scene, run.views
     choice = search.chosen.choice if search else options.fixed
     assert plan is not None and choice is not None and options.background is not None

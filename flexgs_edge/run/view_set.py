@@ -1,4 +1,4 @@
-"""The views of a run: cameras, photos, and which of them are held out."""
+"""The views of a run: cameras, photos, and the split into training and held-out views."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOpt
 from flexgs_edge.scene.source import SceneSource
 
 MEMORY = "memory"
-"""Stands for a path where something came from memory."""
+"""Takes the place of a path in records when cameras or photos came from memory."""
 WITHOUT_VIEWS = f"--cameras {NO_CAMERAS} leaves no views: leave it out for automatic ones, or give --cameras PATH"
 
 
 @dataclass(frozen=True)
 class ViewSet:
-    """Views in order of name, and how they are split.
+    """Views in order of name, and their split.
 
     Parameters
     ----------
     cameras : list of Camera
-        World coordinates, at the size they are drawn.
+        In world coordinates, at the size they are drawn.
     photos : Photos or None
-        One a camera.
+        One photo per camera.
     train, held_out : list of int
         Indices into `cameras`.
     cameras_from : str
-        Path of their file, or `auto`.
+        Path of the camera file, or `auto`.
     images_path : Path or None
-        Where the photos came from.
+        Folder of the photos.
     notes : tuple of str
-        How an automatic rig was made; what was scaled.
+        How automatic cameras were placed, and which views were scaled or lost their distortion.
     """
 
     cameras: list[Camera]
@@ -60,16 +60,16 @@ class ViewSet:
 
 @dataclass(frozen=True)
 class GivenViews:
-    """Cameras and photos from memory, in place of files.
+    """Cameras and photos from memory instead of files.
 
     Parameters
     ----------
     cameras : sequence of Camera, optional
-        Default: those that the options name, or that lie beside the scene.
+        Default: those that the options name, else those beside the scene.
     images : sequence of np.ndarray, optional
-        [H, W, 3] or [H, W, 4] u8, one a camera, in the order of `cameras` (of cameras from a file: in order of name).
+        [H, W, 3] or [H, W, 4] u8, one per camera, in the order of `cameras`. For cameras from a file: in order of name.
     cameras_from : str
-        Where the cameras were read, where that is known: photos beside them are found then.
+        File that the cameras were read from, so that photos beside it are found. Default: unknown.
     """
 
     cameras: Sequence[Camera] | None = None
@@ -77,7 +77,7 @@ class GivenViews:
     cameras_from: str = MEMORY
 
     def in_order_of_name(self) -> GivenViews:
-        """The same with cameras, and their photos, in order of name."""
+        """Return a copy with cameras, and their photos, in order of name. Raises `InputError` if two names are equal."""
         cameras, images = self.cameras or (), self.images
         if not cameras:
             raise InputError("cameras: expected at least one camera, found none")
@@ -85,7 +85,7 @@ class GivenViews:
         for i, j in zip(order, order[1:]):
             if cameras[i].name == cameras[j].name:
                 raise InputError(f"cameras: {i} and {j} are both called {cameras[i].name!r}; names must differ")
-        if images is not None and len(images) == len(order):  # another number is refused where they are opened
+        if images is not None and len(images) == len(order):  # `Photos` reports another number
             images = [images[i] for i in order]
         return replace(self, cameras=[cameras[i] for i in order], images=images)
 
@@ -97,9 +97,30 @@ def find_views(
     with_photos: bool = True,
     given: GivenViews | None = None,
 ) -> ViewSet | None:
-    """The views that the options or the files beside the scene give, else an automatic rig; `None` for `--cameras none`.
+    """Find the views of a run: from memory, from the options, beside the scene, or else generated.
 
-    `options` must have its background filled in (photos with an alpha channel are put on it). What is `given` comes first.
+    Parameters
+    ----------
+    options : ViewOptions
+        Its background must be filled in: photos with an alpha channel are blended with it.
+    companions : Companions
+        Cameras and photos beside the scene.
+    source : SceneSource
+        The scene, from which automatic cameras are placed.
+    with_photos : bool
+        Also open the photos. Default: yes.
+    given : GivenViews, optional
+        Cameras and photos from memory. They go before options and files.
+
+    Returns
+    -------
+    ViewSet or None
+        `None` for `--cameras none`.
+
+    Raises
+    ------
+    InputError
+        If cameras or photos cannot be read or do not match.
     """
     given = given or GivenViews()
     place = options.cameras or companions.cameras or AUTO_CAMERAS
@@ -142,7 +163,7 @@ def find_views(
 
 
 def _automatic_views(options: ViewOptions, source: SceneSource) -> ViewSet:
-    LOG.info("no cameras are used: making views from the scene itself")
+    LOG.info("generating camera views from the scene itself")
     cameras, how = automatic_rig(source)
     cameras, note = limit_width(cameras, options.resolution)
     train, held_out = split_views(len(cameras), options.holdout)
@@ -156,7 +177,7 @@ def _images(options: ViewOptions, companions: Companions, place: str | Path) -> 
         return Path(options.images)
     if place == MEMORY:
         return None
-    # Cameras from elsewhere need not be the ones that the photos beside the scene belong to.
+    # The photos beside the scene belong to the cameras beside it, not to cameras from elsewhere.
     beside = companions.cameras
     if beside is not None and Path(place).resolve() != beside.resolve():
         return None
@@ -164,7 +185,7 @@ def _images(options: ViewOptions, companions: Companions, place: str | Path) -> 
 
 
 def views_info(views: ViewSet) -> ViewsInfo:
-    """The record of the views; width and height are the largest."""
+    """The views as a record for results. Width and height are the largest of all views."""
     return ViewsInfo(
         cameras=views.cameras_from,
         images=None if views.images_path is None else os.fspath(views.images_path),

@@ -262,9 +262,7 @@ def test_doubts(
 def test_doubts_are_told(project: Path, plain: CompressResult) -> None:
     """6 poses are few, and fitted: in the result, its JSON, the summary and the page."""
     fitted, few = plain.warnings
-    assert "dB on training views and" in fitted and few.startswith(
-        "Only 6 camera views were used; below about 16 "
-    )
+    assert "dB on training views and" in fitted and few.startswith("Only 6 camera views were used; below about 16 ")
     assert plain.to_json()["warnings"] == [fitted, few]
     page = (project.parent / "page" / "index.html").read_text()
     for words in (fitted, few):
