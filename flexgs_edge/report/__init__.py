@@ -1,1 +1,1 @@
-"""What a person or a program reads: records, text, JSON, pages and charts."""
+"""Results for people and programs: records, text, JSON, pages and charts."""

@@ -1,4 +1,4 @@
-"""Results as JSON: rounded where digits mean nothing, null where there is no figure."""
+"""Write results as JSON. Figures are rounded to the digits that matter; null stands for a missing figure."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from flexgs_edge.quality.view_quality import Quality, ViewQuality
 
 
 def json_text(record: dict[str, Any]) -> str:
-    """A record as `--json` and reports write it."""
+    """Format a record as `--json` and reports write it."""
     return json.dumps(record, indent=2, allow_nan=False) + "\n"
 
 
 def step_json(step: Step) -> dict[str, Any]:
-    """A step of the search."""
+    """Return a step of the search as JSON values."""
     found = step.measurement
     return {
         "phase": step.phase,
@@ -42,7 +42,10 @@ def _worst_json(worst: Measurement) -> dict[str, float | None]:
 
 
 def quality_json(quality: Quality) -> dict[str, Any]:
-    """Means, the worst view, and every view; null where images are identical, there is no photo, or nothing was measured."""
+    """Return the means, the worst view and every view as JSON values.
+
+    null stands for identical images, for no photo, or for a figure that was not measured.
+    """
     worst = quality.worst
     return {
         "drop": rounded(quality.drop),
@@ -81,5 +84,5 @@ def _view_json(view: ViewQuality) -> dict[str, Any]:
 
 
 def rounded(value: float | None, digits: int = 4) -> float | None:
-    """A figure without the digits that mean nothing; `None` stays `None`."""
+    """Round a figure to the digits that matter; `None` stays `None`."""
     return None if value is None else round(value, digits)

@@ -1,4 +1,4 @@
-"""Where cameras stood: a plan seen from above and one from the side, as inline SVG."""
+"""Plans of the camera positions, from above and from the side, as inline SVG."""
 
 from __future__ import annotations
 
@@ -11,28 +11,30 @@ from flexgs_edge.report.html import render
 from flexgs_edge.report.material import Rig
 
 SIDE = 360
-"""Width of a plan in its own units: a phone's, as for charts."""
+"""Width of a plan in its own units: as wide as a phone, like the charts."""
 WEDGE = 0.055
-"""Length of the wedge that shows where a camera looks, as a share of the plan."""
+"""Length of a camera's viewing wedge, as a share of the plan's width."""
 ROOM = 0.06
-"""Empty rim, as a share of the plan."""
+"""Empty margin, as a share of the plan's width."""
 FAR = 0.35
-"""The scene's points widen the plan by at most so many times the cameras' own extent: some scenes reach to the horizon."""
+"""The scene's points widen the plan by at most this share of the cameras' extent. Some scenes reach to the horizon."""
 MOST_NAMES = 400
-"""With more cameras their names (seen under a pointer) are left out: a page is not a list."""
+"""With more cameras than this, plans leave out the names that a pointer would show, so that pages stay small."""
 
 
 def plans(rig: Rig, numbers: Mapping[str, int]) -> str:
-    """Both plans with their key.
+    """Draw both plans and their key.
 
     Parameters
     ----------
+    rig : Rig
+        Camera poses and points of the scene.
     numbers : mapping
-        Number by name of the views whose pictures are shown.
+        The page's number of each view with pictures, by the name of its camera.
     """
     across, away, up = axes(rig)
     low, high = extent(rig, np.stack([across, away, up]))
-    # One scale for both, so that they can be compared.
+    # Both plans use one scale, so that they can be compared.
     scale = SIDE * (1 - 2 * ROOM) / max(float((high - low)[:2].max()), 1e-12)
     return render(
         "plans.html",
@@ -50,9 +52,10 @@ def plans(rig: Rig, numbers: Mapping[str, int]) -> str:
 
 
 def axes(rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit vectors [3] of a plan's axes in the world: across, away (from the one who looks from the side) and up.
+    """Unit vectors [3] of the plan's axes in the world: across, away and up.
 
-    Up is the mean of the cameras' own; where they cancel out, the direction in which cameras differ least.
+    Away points from the viewer of the side plan into the scene. Up is the mean up direction of the cameras. If those cancel
+    out, up is the direction in which camera positions vary least.
     """
     centred = rig.centers - rig.centers.mean(axis=0)
     up = -rig.rotations[:, 1, :].mean(axis=0)
@@ -63,7 +66,7 @@ def axes(rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     across = np.linalg.svd(flat, full_matrices=True)[2][0]
     across = across - (across @ up) * up
     if np.linalg.norm(flat) < 1e-9 or np.linalg.norm(across) < 1e-6:
-        # One place for all cameras: what the first calls right (its own up is not `up`, or it would have no right of its own).
+        # All cameras stand in one place: use right or forward of the first camera, whichever is less parallel to up.
         right, forward = rig.rotations[0, 0], rig.rotations[0, 2]
         across = max((axis - (axis @ up) * up for axis in (right, forward)), key=lambda axis: float(axis @ axis))
     across = across / np.linalg.norm(across)
@@ -73,7 +76,7 @@ def axes(rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def extent(rig: Rig, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ends [3] of the plan along the rows of `basis`: all cameras, and the scene's middle as far as it is not too large."""
+    """Ends [3] of the plan along the rows of `basis`: all cameras, and the middle of the scene as far as `FAR` allows."""
     places = rig.centers @ basis.T
     low, high = places.min(axis=0), places.max(axis=0)
     if len(rig.points):
@@ -82,7 +85,7 @@ def extent(rig: Rig, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         reach = FAR * size if size > 0 else np.inf
         low = np.minimum(low, np.maximum(inner[0], low - reach))
         high = np.maximum(high, np.minimum(inner[1], high + reach))
-    # A lone camera without a scene: some room around it.
+    # A single camera without a scene has no extent: add a margin.
     if float((high - low).max()) == 0.0:
         low, high = low - 1.0, high + 1.0
     return low, high
@@ -96,13 +99,13 @@ def _plan(
     scale: float,
     half: int,
 ) -> dict[str, Any]:
-    """Places of one plan; `half`: which half angle (0 width, 1 height) the wedges open by."""
+    """Compute the positions of one plan. `half` chooses the half angle of the wedges: 0 of the width, 1 of the height."""
     rows = np.stack(basis)
     low, high = ends
     rim = ROOM * SIDE
     size = float(scale * (high - low)[1])
     height = min(max(size + 2 * rim, SIDE / 4), SIDE)
-    # In the middle of the plan: the extent along its shorter side does not fill it.
+    # Centre the plan: the extent does not fill its shorter side.
     offset = np.array([(SIDE - scale * (high - low)[0]) / 2, (height - size) / 2])
 
     def at(points: np.ndarray) -> np.ndarray:
@@ -115,7 +118,7 @@ def _plan(
     reach = np.minimum(rig.reach[:, half], 1.5)[:, None]
     feet = at(rig.centers)
     left, right = (at(rig.centers + length * (forward + sign * reach * side)) for sign in (-1, 1))
-    # Held-out cameras last: they are few and shall not be covered.
+    # Draw the held-out cameras last: they are few and must stay visible.
     order = sorted(range(len(rig.names)), key=lambda i: (i in rig.held_out, i))
     return {
         "title": title,
@@ -136,6 +139,6 @@ def _plan(
 
 
 def _dots(points: np.ndarray, height: float) -> list[tuple[int, int]]:
-    """Whole places within the plan, each once."""
+    """Round points to whole positions within the plan, each once."""
     inside = points[((points >= 0) & (points <= (SIDE, height))).all(axis=1)]
     return list(dict.fromkeys((round(x), round(y)) for x, y in inside))

@@ -1,4 +1,4 @@
-"""Records of the jobs that judge nothing: `decompress`, `render`, `score`, `verify`, `trim`, `synth` and `devices`."""
+"""Results of the commands that compare no pictures: from `decompress` to `devices`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DecompressResult:
-    """What `decompress` wrote."""
+    """Result of `decompress`: the file it wrote."""
 
     scene: SceneInfo
     output: str
@@ -26,7 +26,7 @@ class DecompressResult:
     notes: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """Return the record as JSON values."""
         return {
             "program": f"flexgs-edge {__version__}",
             "command": "decompress",
@@ -38,7 +38,7 @@ class DecompressResult:
         }
 
     def summary(self) -> str:
-        """What the command prints."""
+        """Return the text that the command prints."""
         lines = scene_lines("scene", self.scene)
         lines.append(line("wrote", f"{self.output}, {self.size} bytes ({format_size(self.size)})"))
         lines += [line("note", note) for note in self.notes]
@@ -47,7 +47,7 @@ class DecompressResult:
 
 @dataclass(frozen=True)
 class RenderResult:
-    """What `render` drew; start-up and kernel compilation are in `run`, apart from the views."""
+    """Result of `render`: the files and the time of each view. `run` holds the times of start-up and kernel compilation."""
 
     scene: SceneInfo
     views: ViewsInfo
@@ -58,12 +58,12 @@ class RenderResult:
 
     @property
     def ms_per_view(self) -> float:
-        """Median time of a view in milliseconds, drawing only: no loading, compiling or file writing."""
+        """Median time to draw a view, milliseconds. Loading, compiling and writing files are not included."""
         times = sorted(self.view_seconds)
         return 1000 * (times[(len(times) - 1) // 2] + times[len(times) // 2]) / 2 if times else 0.0
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """Return the record as JSON values."""
         run = self.run.to_json()
         return {
             "program": f"flexgs-edge {__version__}",
@@ -80,7 +80,7 @@ class RenderResult:
         }
 
     def summary(self) -> str:
-        """What the command prints."""
+        """Return the text that the command prints."""
         lines = [*scene_lines("scene", self.scene), *view_lines(self.views)]
         first = self.files[0] if self.files else "no files"
         last = f" ... {self.files[-1]}" if len(self.files) > 1 else ""
@@ -97,7 +97,7 @@ class RenderResult:
 
 @dataclass(frozen=True)
 class ScoreResult:
-    """What `score` wrote."""
+    """Result of `score`: the file of scores it wrote."""
 
     scene: SceneInfo
     views: ViewsInfo
@@ -108,7 +108,7 @@ class ScoreResult:
     run: RunInfo
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """Return the record as JSON values."""
         return {
             "program": f"flexgs-edge {__version__}",
             "command": "score",
@@ -122,7 +122,7 @@ class ScoreResult:
         }
 
     def summary(self) -> str:
-        """What the command prints."""
+        """Return the text that the command prints."""
         lines = [*scene_lines("scene", self.scene), *view_lines(self.views)]
         unseen = f"; {self.unseen} Gaussians are in none of them" if self.unseen else ""
         lines.append(line("scored", f"{self.score}, over {self.scored_views} training poses{unseen}"))
@@ -132,14 +132,14 @@ class ScoreResult:
 
 @dataclass(frozen=True)
 class VerifyResult:
-    """What `verify` found.
+    """Result of `verify`: the parts of a file and their verdicts.
 
     Parameters
     ----------
     path : str
         The file.
     sections : tuple of Section
-        Name, offset, bytes and verdict of every part, in the order of the file.
+        Name, offset, bytes and verdict of each part, in the order of the file.
     """
 
     path: str
@@ -147,16 +147,16 @@ class VerifyResult:
 
     @property
     def ok(self) -> bool:
-        """Whether every checksum holds."""
+        """Whether every checksum matches."""
         return not self.damaged
 
     @property
     def damaged(self) -> tuple[str, ...]:
-        """Names of the parts whose checksums do not hold."""
+        """Names of the parts whose checksums do not match."""
         return tuple(section.name for section in self.sections if not section.ok)
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """Return the record as JSON values."""
         return {
             "program": f"flexgs-edge {__version__}",
             "command": "verify",
@@ -166,7 +166,7 @@ class VerifyResult:
         }
 
     def summary(self) -> str:
-        """What the command prints: a line a part."""
+        """Return the text that the command prints: one line per part."""
         parts, bad = self.sections, len(self.damaged)
         lines = [f"{s.name:<12} {s.length:>12} bytes at {s.offset:>12}  {'ok' if s.ok else 'DAMAGED'}" for s in parts]
         verdict = f"{bad} of {len(parts)} parts DAMAGED" if bad else "every checksum holds"
@@ -176,7 +176,7 @@ class VerifyResult:
 
 @dataclass(frozen=True)
 class TrimResult:
-    """What `trim` kept of a file: sizes in bytes, Gaussians, layers."""
+    """Result of `trim`: layers, Gaussians and bytes before and after the cut."""
 
     input: str
     input_size: int
@@ -189,11 +189,11 @@ class TrimResult:
     max_size: int
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """Return the record as JSON values."""
         return {"program": f"flexgs-edge {__version__}", "command": "trim", **asdict(self)}
 
     def summary(self) -> str:
-        """What the command prints."""
+        """Return the text that the command prints."""
         lines = [
             f"{self.input}: {self.input_size} bytes ({format_size(self.input_size)}), "
             f"{self.input_count} Gaussians in {self.input_layers} layers",
@@ -205,24 +205,24 @@ class TrimResult:
 
 @dataclass(frozen=True)
 class SynthResult:
-    """What `synth` made.
+    """Result of `synth`: the scene it made.
 
     Parameters
     ----------
     input, input_count, sh_degree : str, int, int
-        The scene that it was made from.
+        The scene it was made from: path, Gaussians and SH degree.
     output, count, size : str, int, int
-        The scene written, its Gaussians and bytes.
+        The scene it wrote: path, Gaussians and bytes.
     seed : int
-        As asked for.
+        Seed of the run.
     tiles : int
-        Copies side by side.
+        Number of copies side by side.
     parts : tuple of int
-        Fewest and most parts of a Gaussian.
+        Fewest and most parts that a Gaussian was split into.
     cameras, views : str or None, int
-        The cameras written beside it.
+        File of the cameras beside the scene, and their number.
     notes : tuple of str
-        What was left out or changed.
+        Properties of the cameras that were left out or changed.
     run : RunInfo
         Times and memory.
     """
@@ -242,7 +242,7 @@ class SynthResult:
     run: RunInfo
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """Return the record as JSON values."""
         return {
             "program": f"flexgs-edge {__version__}",
             "command": "synth",
@@ -264,7 +264,7 @@ class SynthResult:
         }
 
     def summary(self) -> str:
-        """What the command prints."""
+        """Return the text that the command prints."""
         few, many = self.parts
         parts = f"{few}" if few == many else f"{few} or {many}"
         tiles = "" if self.tiles == 1 else f", in {self.tiles} copies side by side"
@@ -283,16 +283,16 @@ class SynthResult:
 
 @dataclass(frozen=True)
 class DevicesResult:
-    """The OpenCL devices, and which of them is used.
+    """Result of `devices`: the OpenCL devices, and the chosen one.
 
     Parameters
     ----------
     devices : tuple of DeviceInfo
-        Each with its limits and its verdict.
+        Limits and self-test verdict of each device.
     chosen : int or None
-        Index of the one that is used; `None` where none works, or not the one asked for.
+        Index of the chosen device; `None` if no device works, or not the one asked for.
     reason : str
-        Why it was chosen, or why none was.
+        Why this device was chosen, or why none was.
     """
 
     devices: tuple[DeviceInfo, ...]
@@ -300,11 +300,11 @@ class DevicesResult:
     reason: str
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """Return the record as JSON values."""
         return {"devices": [info.to_json() for info in self.devices], "chosen": self.chosen, "reason": self.reason}
 
     def summary(self) -> str:
-        """What the command prints: a few lines a device."""
+        """Return the text that the command prints: a few lines per device."""
         lines = [line for info in self.devices for line in _device_lines(info)]
         if self.chosen is not None:
             lines.append(f"chosen: [{self.chosen}] ({self.reason})")

@@ -1,4 +1,4 @@
-"""The one door to the templates of `templates/`: pages of reports and studies, one file each, nothing fetched."""
+"""Fill the templates of `templates/`. Each page is one file and fetches nothing. Only this module imports jinja2."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).with_name("templates")
 
-# What HTML forbids (controls, halves of surrogate pairs, as in names that are no UTF-8) or what turns text around.
+# Characters that HTML forbids, and those that change the direction of text. Names that are not UTF-8 hold lone surrogates.
 _UNFIT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]")
 
 
 def render(template: str, **values: object) -> str:
-    """What a template makes of `values`, as HTML that other templates take as it is.
+    """Fill a template with `values`. The result is HTML that other templates do not escape again.
 
-    Every value is escaped; what HTML cannot hold becomes U+FFFD.
+    Every value is escaped. Characters that HTML cannot hold become U+FFFD.
     """
-    from markupsafe import Markup  # slow to import; a run without a report need not pay for it
+    from markupsafe import Markup  # imported here because it is slow, and only reports need it
 
     return Markup(_UNFIT.sub("\ufffd", environment().get_template(template).render(values)))
 
 
 @cache
 def environment() -> Environment:
-    """What knows the templates, and the filters that they use."""
+    """Create the jinja2 environment: the templates and their filters."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     made = Environment(
@@ -50,7 +50,7 @@ def environment() -> Environment:
 
 
 def data_uri(data: bytes, kind: str) -> str:
-    """`data` as the value of a `src`, such as an image of kind `image/png`.
+    """Encode `data` as a data URI; `kind` is its media type, such as `image/png`.
 
     >>> data_uri(b"abc", "text/plain")
     'data:text/plain;base64,YWJj'
@@ -59,7 +59,7 @@ def data_uri(data: bytes, kind: str) -> str:
 
 
 def figure(value: float | None, form: str, missing: str = "\u2013") -> str:
-    """A number in a format of Python, or a dash.
+    """Format a number with a Python format, or return a dash for `None`.
 
     >>> figure(0.98765, ".4f")
     '0.9877'
@@ -68,7 +68,7 @@ def figure(value: float | None, form: str, missing: str = "\u2013") -> str:
 
 
 def decibel(value: float | None) -> str:
-    """A PSNR or a difference of two; `None` stands for identical pictures.
+    """Format a PSNR or a difference of two; `None` means identical pictures.
 
     >>> decibel(1.5), decibel(None)
     ('1.500', 'identical')
@@ -77,7 +77,7 @@ def decibel(value: float | None) -> str:
 
 
 def count(value: int) -> str:
-    """A whole number by digit groups; a narrow no-break space keeps them in one piece.
+    """Format a whole number in groups of three digits, with a narrow no-break space between them.
 
     >>> count(1234567) == "1\u202f234\u202f567"
     True

@@ -1,4 +1,4 @@
-"""The record of `info`: what a scene file holds, as values, as JSON and as text."""
+"""Result of `info`, as values, as JSON and as text."""
 
 from __future__ import annotations
 
@@ -12,42 +12,42 @@ from flexgs_edge.units import format_size
 
 @dataclass(frozen=True)
 class InfoResult:
-    """What a scene file holds.
+    """Contents of a scene file.
 
     Parameters
     ----------
     path : str
-        The file; of a model folder its latest scene.
+        The file; for a model folder, its latest scene.
     format : str
         `fgs`, `ply`, `spz`, `sog` or `compressed.ply`.
     size : int
         Bytes of the file.
     count, sh_count, sh_degree : int
-        Gaussians, how many of them may have SH above degree 0, and the degree.
+        Gaussians, those that may have SH above degree 0, and the SH degree.
     origin : tuple of float
-        What was taken from the positions, world.
+        Offset that the file subtracts from the positions, world coordinates.
     source_ply_bytes : int or None
-        Bytes of the scene as a PLY (of a `.fgs`: of the original, where the file knows it).
+        Bytes of the scene as a PLY; for a `.fgs`, of the original if the file states it.
     notes : tuple of str
-        What the reader left out or changed.
+        Values that the reader left out or changed.
     version : int or None
-        Of the `.fgs` format; `None` for other formats, which have none of the fields up to `cut_from` either.
+        Version of the `.fgs` format. Other formats have `None` here, and leave all fields up to `cut_from` empty.
     channels : dict
         Rows, precision and bytes of every channel, by its name.
     settings : dict
         How the file was made.
     chroma : float or None
-        Grid step of chroma, in steps of luma (version 2).
+        Step size of chroma, relative to that of luma (version 2).
     model_bytes : int or None
         Bytes of the coder's tables (version 2).
     layers : tuple of dict or None
         Rows and bytes of every layer (version 2).
     cut_from : dict or None
-        What the file was before `trim` (version 2).
+        Size and rows of the file before `trim` (version 2).
     cameras, images : str or None
-        What lies beside a file of another format.
+        Cameras and photos beside a file of another format.
     antialiased : bool or None
-        What a file of another format, or its model folder, says about drawing.
+        Whether a file of another format, or its model folder, asks for antialiased drawing.
     """
 
     path: str
@@ -72,21 +72,21 @@ class InfoResult:
 
     @property
     def ratio(self) -> float | None:
-        """Bytes of the original's PLY for each byte of a `.fgs`, to four digits."""
+        """Bytes of the original's PLY divided by those of the `.fgs`, to four digits."""
         return round(self.source_ply_bytes / self.size, 4) if self.version and self.source_ply_bytes else None
 
     @property
     def bits_per_gaussian(self) -> float | None:
-        """Bits of a `.fgs` for each Gaussian in it, to three digits."""
+        """Bits of the `.fgs` per Gaussian, to three digits."""
         return round(8 * self.size / self.count, 3) if self.version and self.count else None
 
     @property
     def overhead_bytes(self) -> int:
-        """Bytes of a `.fgs` that belong to no channel."""
+        """Bytes of the `.fgs` that belong to no channel."""
         return self.size - sum(int(channel["bytes"]) for channel in self.channels.values())
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """Return the record as JSON values."""
         record: dict[str, Any] = {
             "program": f"flexgs-edge {__version__}",
             "command": "info",
@@ -126,7 +126,7 @@ class InfoResult:
         return record
 
     def summary(self) -> str:
-        """What the command prints."""
+        """Return the text that the command prints."""
         version = "" if self.version is None else f" version {self.version}"
         lines = [f"{self.path}: {self.format}{version}, {self.size} bytes ({format_size(self.size)})"]
         with_sh = "" if self.version is None else f", {self.sh_count} of them with SH"

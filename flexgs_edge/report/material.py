@@ -1,4 +1,4 @@
-"""What a page shows beside the result record: pictures, where cameras stood, what the file holds."""
+"""Contents of a page besides the result: pictures, camera poses, and channels of the file."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class Shot:
     camera : int
         Index into the cameras of the rig.
     rank, of : int
-        Place from the worst (0) among the views that were measured, and their number.
+        Rank among the measured views, 0 for the worst, and the number of measured views.
     width, height : int
-        Pixels of the pictures (views that are wider were scaled down).
+        Pixels of the pictures. Wider views were scaled down.
     original, compressed, error : bytes
-        Render of the original, of the decoded file, and the error map between them.
+        Render of the original, render of the decoded file, and the error map between them.
     photo : bytes or None
-        The photo of this view.
+        The photo of this view, if there is one.
     """
 
     view: int
@@ -43,7 +43,7 @@ class Shot:
 
     @property
     def place(self) -> str:
-        """The rank in words.
+        """Describe the rank in words.
 
         >>> Shot(0, 0, 0, 5, 1, 1, b"", b"", b"").place, Shot(0, 0, 1, 5, 1, 1, b"", b"", b"").place
         ('Worst view', 'View 2 of 5 from the worst')
@@ -56,21 +56,22 @@ class Shot:
 
 @dataclass(frozen=True)
 class Rig:
-    """Where cameras stood, in order of name.
+    """Camera poses in order of name, and some points of the scene.
 
     Parameters
     ----------
     names : tuple of str
+        Names of the V cameras.
     centers : np.ndarray
-        [V, 3] f64, world.
+        [V, 3] f64, positions in world coordinates.
     rotations : np.ndarray
         [V, 3, 3] f64, world to camera (x right, y down, z forward).
     reach : np.ndarray
-        [V, 2] f64, half the width and height of what is seen at distance 1.
+        [V, 2] f64, half the width and height of the visible area at distance 1.
     held_out : frozenset of int
-        The other views are for training.
+        Indices of the held-out cameras. All others are training cameras.
     points : np.ndarray
-        [P, 3] f64, world: positions of some Gaussians of the scene.
+        [P, 3] f64, positions of some Gaussians in world coordinates.
     """
 
     names: tuple[str, ...]
@@ -83,18 +84,18 @@ class Rig:
 
 @dataclass(frozen=True)
 class Material:
-    """Everything beside the record.
+    """Contents of a page besides the result.
 
     Parameters
     ----------
     shots : tuple of Shot
-        Worst view first.
+        Pictures, worst view first.
     rig : Rig or None
-        `None` without cameras.
+        Camera poses; `None` without cameras.
     contents : dict or None
-        What `info` found in the file (`None` where it knows no channels).
+        JSON record of `info`; `None` for formats whose channels it does not know.
     target : Target or None
-        Where the line of the search's chart stands.
+        Target that the search chart marks with a line.
     """
 
     shots: tuple[Shot, ...] = ()

@@ -1,4 +1,4 @@
-"""The page of a `compress` and of an `evaluate`: records and pictures in, one HTML document out."""
+"""Make the HTML page of a `compress` or an `evaluate` from its result and pictures."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from flexgs_edge.report.tones import ERROR_SCALE, css_ramp
 from flexgs_edge.units import format_size
 
 FEW_ROWS = 16
-"""With more steps their table is folded up, and with more views theirs gets a height of its own."""
+"""With more steps than this, their table is folded up. With more views, their table scrolls."""
 
 
 def compress_page(result: CompressResult, material: Material) -> str:
-    """The page of a `compress`."""
+    """Return the page of a `compress`, as HTML."""
     quality, search, target = result.quality, result.search, material.target
     name = _name(result.output or result.scene.path)
     done, became = ("would be", "would become") if result.output is None else ("is", "became")
@@ -50,7 +50,7 @@ def compress_page(result: CompressResult, material: Material) -> str:
 
 
 def evaluate_page(result: EvaluateResult, material: Material) -> str:
-    """The page of an `evaluate`."""
+    """Return the page of an `evaluate`, as HTML."""
     tiles, contents = _quality_tiles(result.quality), material.contents
     if contents is not None and contents.get("ratio"):
         tiles.insert(0, (f"{contents['ratio']:.2f}\u00d7", f"smaller: {format_size(contents['size'])}"))
@@ -69,7 +69,7 @@ def evaluate_page(result: EvaluateResult, material: Material) -> str:
 
 
 def _shared(result: CompressResult | EvaluateResult, material: Material) -> dict[str, Any]:
-    """What both pages show alike."""
+    """Return the template values that both pages share."""
     numbers = {shot.view: number for number, shot in enumerate(material.shots, start=1)}
     rig, shown = material.rig, {}
     if rig is not None:
@@ -98,7 +98,7 @@ def _loss_words(quality: Quality, kind: str) -> str:
     if quality.fidelity is None:
         return f"The renders are identical ({over})."
     if quality.drop is not None:
-        if quality.drop < 0:  # compression can smooth noise away
+        if quality.drop < 0:  # compression can smooth noise
             return f"Against the photos PSNR rose by {-quality.drop:.2f} dB ({over})."
         return f"Against the photos {quality.drop:.2f} dB of PSNR were lost ({over})."
     return f"Its renders have a PSNR of {quality.fidelity:.2f} dB against the original's ({over}); there are no photos."
@@ -119,7 +119,7 @@ def _quality_tiles(quality: Quality | None) -> list[tuple[str, str]]:
 
 
 def _channel_rows(contents: Mapping[str, Any]) -> list[tuple[str, int, list[object]]]:
-    """Name, bytes and cells of every channel of a file, and of what is beside them."""
+    """Return name, bytes and table cells of each channel of a file, and of its other bytes."""
     size, packed = max(contents.get("size", 0), 1), contents.get("version") == 1
     rows: list[tuple[str, int, list[object]]] = []
 

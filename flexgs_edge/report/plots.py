@@ -1,7 +1,7 @@
-"""Charts of experiments: what to draw as plain data, and the one place that draws it.
+"""Charts of experiments: records of what to draw, and the functions that draw them with matplotlib.
 
-matplotlib is an extra and is imported by `require_matplotlib` and `draw` alone. Colours are Okabe and Ito's, which people
-who confuse colours can tell apart, and every series has a mark of its own besides.
+matplotlib is an extra, so we import it only inside functions. Colours are those of Okabe and Ito, which colour-blind readers
+can tell apart. Each series also has its own mark.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ INCHES, TALL, DPI = (7.2, 4.4), (7.2, 6.2), 144
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#A0A000")
 GREY, INK = "#7a7a7a", "#222222"
 SHORT = 8
-"""Letters up to which a note is centred over its point."""
+"""Notes shorter than this many letters are centred over their point."""
 MARKS, OPEN_MARKS = ("o", "s", "^", "D", "v", "P", "<", ">"), ("*", "d")
 LINEAR_BELOW = 0.1
 LEVELS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
@@ -38,31 +38,31 @@ _STYLE: dict[Any, Any] = {
     "grid.linewidth": 0.6,
     "legend.frameon": False,
     "figure.facecolor": "white",
-    # Same numbers, same bytes: ids in SVG files come from this word instead of chance.
+    # Ids in SVG files derive from this word and not from chance, so that equal charts have equal bytes.
     "svg.hashsalt": "flexgs-edge",
-    # Text as outlines: a chart then looks the same wherever it is opened.
+    # Text becomes outlines, so that a chart looks the same without its fonts.
     "svg.fonttype": "path",
 }
 
 
 @dataclass(frozen=True)
 class Series:
-    """Points of one kind; those without a y (None) are left out.
+    """Points of one kind. Points whose y is None are left out.
 
     Parameters
     ----------
     label : str
-        In the legend.
+        Name in the legend.
     x, y : sequence
-        As in the table.
+        Coordinates of the points.
     line : bool
-        Join the points.
+        Join the points by a line.
     published : bool
-        Figures of the paper and not of this run: grey, open marks.
+        The figures come from the paper and not from this run: draw grey, open marks.
     notes : sequence of str
-        Words beside the points.
+        Text beside each point.
     broken : sequence of float
-        Where what is shown has broken: points that are crossed out, at the head of the chart if they have no y.
+        x of points to cross out, because the method failed there. Points without a y are crossed out at the top of the chart.
     """
 
     label: str
@@ -81,21 +81,21 @@ class LineChart:
     Parameters
     ----------
     limit : float, optional
-        A level of y to mark, such as a target.
+        Mark this y with a line, such as a target.
     doublings : bool
-        x in powers of two.
+        Show x in powers of two.
     megabytes : bool
-        x in MB, in logarithms.
+        Show x in MB, on a log scale.
     magnitudes : bool
-        y in logarithms, linear from `LINEAR_BELOW` down through zero: losses below and far above 1 dB in one chart.
+        Show y on a log scale that is linear below `LINEAR_BELOW`, for losses below and far above 1 dB in one chart.
     floating : bool
-        y need not start at zero: fidelities.
+        y need not start at zero, such as for fidelity.
     log_x, log_y : bool
-        Plain logarithms, such as of times; all values are above zero then.
+        Use a plain log scale, such as for times. All values must be above zero.
     front : sequence of (x, y)
-        Points that no other beats, joined by steps under the series.
+        Pareto front: points that no other point beats, joined by steps under the series.
     upright : (x, str), optional
-        An x to mark, and words for it: a point without a y.
+        Mark this x with a line and its text: a point without a y.
     """
 
     title: str
@@ -115,16 +115,16 @@ class LineChart:
 
 @dataclass(frozen=True)
 class BarChart:
-    """Bars from zero, grouped; a value is written at each.
+    """Grouped bars from zero, each with its value.
 
     Parameters
     ----------
     groups : sequence of str
         Along the axis.
     bars : dict
-        One value a group, by label.
+        One value per group, by label.
     limit : float, optional
-        A level to mark; bars that pass it get a cross.
+        Mark this level with a line, and bars above it with a cross.
     """
 
     title: str
@@ -137,17 +137,16 @@ class BarChart:
 
 @dataclass(frozen=True)
 class DotChart:
-    """Dots on a log axis, grouped, with words beside them: for values of many magnitudes, which bars would hide.
+    """Grouped dots on a log axis with text beside them, for values of many magnitudes.
 
     Parameters
     ----------
     groups : sequence of str
         Along the axis.
     dots : dict
-        One value a group, by label; those that are not above zero cannot be shown and stand at the foot as "none", those that
-        there are not (None) are left out.
+        One value per group, by label. Values of zero or below stand at the bottom as "none". None is left out.
     words : dict
-        As `dots`, what is written beside each.
+        Text beside each dot, arranged as `dots`.
     """
 
     title: str
@@ -159,22 +158,22 @@ class DotChart:
 
 @dataclass(frozen=True)
 class PlaneChart:
-    """A grid of cells over the two rates, with lines and points on it.
+    """A grid of cells over the prune rate and the SH rate, with lines and points on it.
 
     Parameters
     ----------
     cells : dict
-        Value by (x, y), the middles of the cells.
+        Value of each cell, by its centre (x, y).
     step : float
         Side of a cell.
     top : float
-        Values from here on share the last colour.
+        Values from here up share the last colour.
     frontier : sequence of (x, y)
-        Where the limit lies.
+        Line on which the limit is reached.
     marked : sequence of (x, y)
-        Cells with a dot: the paper's candidates.
+        Cells to mark with a dot: the paper's candidates.
     path : sequence of (x, y)
-        Points in order; the last one is the answer.
+        Points that a search visited, in order. The last one is its result.
     """
 
     title: str
@@ -195,7 +194,7 @@ Chart = LineChart | BarChart | DotChart | PlaneChart
 
 
 def require_matplotlib() -> None:
-    """Load matplotlib, or say how to get it: asked before any work starts."""
+    """Import matplotlib, or raise `InputError` that says how to install it. Call this before any work starts."""
     try:
         import matplotlib.figure  # noqa: F401
     except ImportError as error:
@@ -205,7 +204,7 @@ def require_matplotlib() -> None:
 
 
 def picture(chart: Chart) -> tuple[bytes, bytes]:
-    """The chart as PNG and as SVG; the same chart gives the same bytes on the same machine."""
+    """Draw the chart as PNG and as SVG. The same chart gives the same bytes on the same machine."""
     import matplotlib
 
     png, svg = io.BytesIO(), io.BytesIO()
@@ -217,7 +216,7 @@ def picture(chart: Chart) -> tuple[bytes, bytes]:
 
 
 def draw(chart: Chart) -> Figure:
-    """The chart as a figure that nothing else holds on to (no pyplot: no windows, no state)."""
+    """Draw the chart as a matplotlib figure, without pyplot: no windows and no global state."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=TALL if isinstance(chart, PlaneChart) else INCHES, layout="constrained")
@@ -263,7 +262,7 @@ def _lines(axes: Axes, chart: LineChart) -> None:
             linewidth=1.5,
             label=series.label,
             zorder=2 if series.published else 3,
-            clip_on=False,  # marks at zero are shown whole
+            clip_on=False,  # show marks at zero whole
             **style,
         )
         for place in series.broken:
@@ -271,7 +270,7 @@ def _lines(axes: Axes, chart: LineChart) -> None:
         for x, y, i in points:
             if series.notes:
                 words = series.notes[i]
-                # Long words go towards the middle, so that they do not leave the chart; white under all of them.
+                # Long notes extend towards the middle, so that they stay inside the chart. All have a white outline.
                 side = "center" if len(words) < SHORT else "right" if scale(x) > middle else "left"
                 note = axes.annotate(words, (x, y), (0, 6), textcoords="offset points", fontsize=8, ha=side, zorder=5)
                 note.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
@@ -297,11 +296,11 @@ def _lines(axes: Axes, chart: LineChart) -> None:
         axes.annotate(
             words, (at, 0.02), (-3, 0), ("data", "axes fraction"), "offset points", ha="right", rotation=90, fontsize=8
         )
-    # Losses start at zero, or below where compression helped: no axis makes small ones look large.
+    # Axes of losses start at zero, or below if compression helped, so that small losses do not look large.
     shown = [y for series in chart.series for y in series.y if y is not None]
     low, high = min(shown, default=0.0), max(shown, default=1.0)
     if chart.limit is not None:
-        high = max(high, chart.limit)  # a mark outside the axes would leave them no room
+        high = max(high, chart.limit)  # a mark outside the axes would shrink them
     if chart.magnitudes:
         axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
         axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)

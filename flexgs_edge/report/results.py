@@ -124,7 +124,7 @@ class CompressResult:
         return self.scene.ply_bytes_without_normals / self.size
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """Return the record as JSON values."""
         return {
             "program": f"flexgs-edge {__version__}",
             "command": "compress",
@@ -164,7 +164,7 @@ class CompressResult:
         }
 
     def summary(self) -> str:
-        """What the command prints."""
+        """Return the text that the command prints."""
         lines = [*scene_lines("scene", self.scene), *view_lines(self.views)]
         size = f"{self.size} bytes ({format_size(self.size)})"
         if self.output is None:
@@ -245,7 +245,7 @@ class EvaluateResult:
     run: RunInfo
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines."""
+        """Return the record as JSON values."""
         return {
             "program": f"flexgs-edge {__version__}",
             "command": "evaluate",
@@ -258,7 +258,7 @@ class EvaluateResult:
         }
 
     def summary(self) -> str:
-        """What the command prints."""
+        """Return the text that the command prints."""
         lines = [
             *scene_lines("scene", self.scene),
             *scene_lines("against", self.reference),

@@ -65,7 +65,7 @@ class SceneInfo:
     notes: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """All fields."""
+        """Return all fields as JSON values."""
         return {**asdict(self), "notes": list(self.notes)}
 
 
@@ -83,5 +83,5 @@ class ViewsInfo:
     notes: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """All fields."""
+        """Return all fields as JSON values."""
         return {**asdict(self), "notes": list(self.notes)}

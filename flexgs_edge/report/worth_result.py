@@ -59,7 +59,7 @@ class WorthResult:
         return {**self.info.to_json(), "errors": {"views": views, "base_psnr": self.base_psnr, "changes": changes}}
 
     def summary(self) -> str:
-        """What the command prints."""
+        """Return the text that the command prints."""
         return self.info.summary() + self.table()
 
     def table(self) -> str:
