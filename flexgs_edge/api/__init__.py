@@ -1,1 +1,1 @@
-"""What Python users hold that is no command: scenes and cameras of arrays, bytes in and out, an open file."""
+"""The Python API besides the commands: scenes and cameras from arrays, coding to and from bytes, open files."""

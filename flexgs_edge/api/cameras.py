@@ -1,4 +1,4 @@
-"""Cameras in a sequence: from files or from matrices."""
+"""A sequence of cameras, from files or from matrices."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from flexgs_edge.errors import InputError
 
 
 class Cameras(Sequence[Camera]):
-    """Cameras in order.
+    """A sequence of cameras. A slice of it is again `Cameras`.
 
     Parameters
     ----------
     cameras : iterable of Camera
-        Any.
+        The cameras, in the order of the sequence.
     path : path, optional
-        Where they were read.
+        The file they were read from, so that `compress` finds photos beside it. Default: none.
     """
 
     def __init__(self, cameras: Iterable[Camera], path: StrPath | None = None) -> None:
@@ -40,7 +40,12 @@ class Cameras(Sequence[Camera]):
         path : path
             INRIA's cameras.json, a transforms.json, a COLMAP model, or a folder that holds one.
         ignore_distortion : bool
-            Take the poses of distorted lenses, without photos.
+            Use the poses of cameras with lens distortion, without their photos. Default: raise `InputError` for them.
+
+        Raises
+        ------
+        InputError
+            If the cameras cannot be read.
         """
         return cls(read_cameras(path, ignore_distortion), path)
 
@@ -52,23 +57,23 @@ class Cameras(Sequence[Camera]):
         sizes: ArrayLike,
         names: Sequence[str] | None = None,
     ) -> Cameras:
-        """Cameras of V matrices.
+        """Make V cameras from matrices, such as those of COLMAP, OpenCV or gsplat.
 
         Parameters
         ----------
         world_to_camera : array_like
-            [V, 4, 4]: x right, y down, z forward, as COLMAP and OpenCV have them.
+            [V, 4, 4]: world to camera, with x right, y down, z forward, as in COLMAP and OpenCV.
         intrinsics : array_like
-            [V, 3, 3], pixels, without skew; the corner of the image is (0, 0), so its middle is (W / 2, H / 2).
+            [V, 3, 3], pixels, without skew. (0, 0) is the corner of the image, so its centre is (W / 2, H / 2).
         sizes : array_like
-            [V, 2]: width and height, pixels.
+            [V, 2]: width and height in pixels.
         names : sequence of str, optional
-            Names that differ. Default: view_00000, view_00001, ...
+            V different names. Default: view_00000, view_00001, ...
 
         Raises
         ------
         InputError
-            Naming the argument, what was expected and what was found.
+            If an argument is invalid. The message names it, what was expected and what was found.
         """
         poses = _numbers("world_to_camera", world_to_camera, (4, 4), None)
         lenses = _numbers("intrinsics", intrinsics, (3, 3), len(poses))
@@ -101,7 +106,7 @@ class Cameras(Sequence[Camera]):
 
 
 def _numbers(name: str, values: ArrayLike, inner: tuple[int, ...], count: int | None) -> np.ndarray:
-    """[V, *inner] f64, finite."""
+    """Convert `values` to [V, *inner] f64, and check that they are finite."""
     array = np.asarray(values)
     shape = "[" + ", ".join(map(str, ("V" if count is None else count, *inner))) + "]"
     right = array.ndim == 1 + len(inner) and array.shape[1:] == inner and count in (None, len(array))
@@ -134,7 +139,7 @@ def _camera(i: int, name: str, pose: np.ndarray, lens: np.ndarray, size: np.ndar
         translation=pose[:3, 3],
         fx=float(lens[0, 0]),
         fy=float(lens[1, 1]),
-        # A Camera counts from the centre of the first pixel.
+        # A Camera has its origin at the centre of the first pixel.
         cx=float(lens[0, 2]) - 0.5,
         cy=float(lens[1, 2]) - 0.5,
     )

@@ -1,4 +1,4 @@
-"""Scenes to files and bytes, and back."""
+"""Compress scenes to files or bytes, and decode them."""
 
 from __future__ import annotations
 
@@ -40,35 +40,36 @@ def compress(
     images: StrPath | Sequence[NDArray[np.uint8]] | None = None,
     **words: Unpack[CompressWords],
 ) -> CompressResult:
-    """Compress a scene to the fewest bytes that hold a target.
+    """Compress a scene to the smallest file that meets a target.
 
     Parameters
     ----------
     scene : Scene or path
         A scene, a scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`), or INRIA's model folder.
     output : path or None
-        The `.fgs`, `.spz`, `.sog` or `.compressed.ply` to write (None, for a `.fgs`, only in a dry run).
+        The `.fgs`, `.spz`, `.sog` or `.compressed.ply` to write. None is allowed in a dry run, and then means a `.fgs`.
     options : CompressOptions, optional
-        What the command line would say.
+        Options as on the command line. Default: lose at most 1 dB.
     progress : Progress, optional
-        Bars on long work.
+        Shows bars during long work. Default: none.
     cameras : Cameras or path, optional
-        Cameras, a file of them, `auto` or `none`. Default: what lies beside the scene, else `auto`.
+        Cameras, a camera file, `auto` or `none`. Default: the cameras beside the scene, else `auto`.
     images : path or sequence of np.ndarray, optional
-        Folder of photos, `none`, or arrays [H, W, 3] (or 4, with alpha), one a camera in the order of `cameras`; of cameras
-        from a file in order of name. Default: the photos beside the scene, if its own cameras are used.
+        Folder of photos, `none`, or one array [H, W, 3] or [H, W, 4] (with alpha) per camera. Arrays are in the order of
+        `cameras`; for cameras from a file, in order of name. Default: the photos beside the scene, if its own cameras are
+        used.
     **words
-        Single options by the names of `CompressOptions`, such as `max_drop=0.5`.
+        Single options, by the names of `CompressOptions`, such as `max_drop=0.5`.
 
     Returns
     -------
     CompressResult
-        Sizes, quality of the decoded file, every step of the search, times.
+        Sizes, quality of the decoded file, every step of the search, and times.
 
     Raises
     ------
     FlexGSError
-        `InputError`, `TargetError`, `DeviceError` or `BudgetError`; nothing is left behind then.
+        `InputError`, `TargetError`, `DeviceError` or `BudgetError`. No partly written file is left behind.
     """
     opened = scene.checked if isinstance(scene, Scene) else scene
     named: dict[str, Any] = {}
@@ -94,7 +95,15 @@ def encode(
     images: StrPath | Sequence[NDArray[np.uint8]] | None = None,
     **words: Unpack[CompressWords],
 ) -> tuple[bytes, CompressResult]:
-    """`compress` to the bytes of a `.fgs`, the very ones that it writes; needs room for them where TMPDIR says."""
+    """Compress a scene to the bytes of a `.fgs`: the same bytes that `compress` writes.
+
+    The file passes through the temporary folder (`TMPDIR`), which needs room for it. The arguments are those of `compress`.
+
+    Returns
+    -------
+    tuple of bytes and CompressResult
+        The file, and the result of `compress`.
+    """
     if words.get("dry_run") or (options is not None and options.dry_run):
         raise InputError("dry_run: encode hands back what would be written; leave it out, or call compress")
     with tempfile.TemporaryDirectory(prefix="flexgs-") as folder:
@@ -104,16 +113,21 @@ def encode(
 
 
 def decode(file: bytes | bytearray | memoryview | StrPath) -> Scene:
-    """The scene of a `.fgs`: its bytes, or a path. It is decoded when values are asked for.
+    """Open the scene of a `.fgs` file. Values are decoded when they are read.
+
+    Parameters
+    ----------
+    file : bytes or path
+        The file itself or its path. Bytes are kept as a temporary file as long as the scene lives.
 
     Raises
     ------
     FormatError
-        When the bytes differ from the format.
+        If the file does not follow the format.
     """
     if isinstance(file, (str, os.PathLike)):
         return Scene(checked_scene(open_fgs(file), Path(file)))
-    # A container opens its file for each read, so the bytes lie in one as long as the source lives.
+    # A container opens its file for each read, so bytes need a file as long as the source lives.
     folder = tempfile.TemporaryDirectory(prefix="flexgs-")
     try:
         place = Path(folder.name) / "scene.fgs"

@@ -1,4 +1,4 @@
-"""A `.fgs` file: what it says of itself, its layers, its checksums."""
+"""An open `.fgs` file: its header, its layers, its checksums."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ from flexgs_edge.run.inputs import CheckedScene, checked_scene
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer of a file: its Gaussians and the bytes of their chunks."""
+    """A layer of a file: its number of Gaussians, and the bytes of their chunks."""
 
     count: int
     bytes: int
 
 
 class FgsFile:
-    """A `.fgs` file whose header has been read and checked; values are read when they are asked for.
+    """A `.fgs` file whose header has been read and checked. Values are decoded when they are read.
 
     Parameters
     ----------
     path : path
-        The file; opened for each read, never held.
+        The file. It is opened for each read and not kept open.
 
     Attributes
     ----------
     path : Path
-        As given.
+        The path as given.
     version, count, sh_degree : int
-        Of the format; Gaussians; SH degree.
+        Format version, number of Gaussians, SH degree.
     settings : dict
         How the file was made.
 
     Raises
     ------
     FormatError
-        When the header breaks the format.
+        If the header does not follow the format.
     """
 
     def __init__(self, path: StrPath) -> None:
@@ -65,7 +65,7 @@ class FgsFile:
 
     @cached_property
     def info(self) -> InfoResult:
-        """What the command `info` says; a file that was cut is decoded for it."""
+        """Result of the command `info`. A file that was cut must be decoded for it, which takes longer."""
         return contents(self.path)
 
     @property
@@ -81,14 +81,14 @@ class FgsFile:
         return tuple(Layer(layer["rows"], layer["bytes"]) for layer in self.info.layers)
 
     def scene(self, layers: int | None = None) -> Scene:
-        """The scene of the first so many layers; by default of all."""
+        """Open the scene of the first `layers` layers. Default: all layers."""
         last = len(self._rows) if layers is None else layers
         if not 1 <= last <= len(self._rows):
             raise InputError(f"layers: expected 1 to {len(self._rows)}, found {layers}")
         return self._part(0, sum(self._rows[:last]))
 
     def layer(self, k: int) -> Scene:
-        """The Gaussians of one layer, counted from 0. Added to those of the layers before it, they refine the scene."""
+        """Open the Gaussians of layer `k`, counted from 0. Added to the layers before it, they refine the scene."""
         if not 0 <= k < len(self._rows):
             raise InputError(f"layer: expected 0 to {len(self._rows) - 1}, found {k}")
         return self._part(sum(self._rows[:k]), sum(self._rows[: k + 1]))
@@ -98,7 +98,7 @@ class FgsFile:
         return verify(self.path)
 
     def trim(self, output: StrPath, max_size: int, *, force: bool = False) -> TrimResult:
-        """Copy as many whole layers as fit into a size to another file."""
+        """Copy as many whole layers as fit into `max_size` bytes to the file `output`."""
         return trim(self.path, output, max_size, force)
 
     def _part(self, start: int, stop: int) -> Scene:
@@ -119,5 +119,5 @@ class FgsFile:
 
 
 def open(path: StrPath) -> FgsFile:
-    """Open a `.fgs` file: its header is read and checked, its values when they are asked for."""
+    """Open a `.fgs` file. Reads and checks the header; values are decoded when they are read."""
     return FgsFile(path)

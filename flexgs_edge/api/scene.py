@@ -1,4 +1,4 @@
-"""A scene in Python: from a file or from arrays; read, written and drawn."""
+"""A scene from a file or from arrays, which can be read, written and drawn."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from flexgs_edge.scene.source import REST_WIDTHS, MemorySource, Planes, SceneSou
 
 
 class Scene:
-    """N Gaussians, checked: finite values, at least one of them. Files are read when values are asked for.
+    """A scene of N Gaussians: at least one, all with finite values. Files are read when values are asked for.
 
-    Made by `Scene.open`, `Scene.from_arrays`, `decode` and `FgsFile`.
+    `Scene.open`, `Scene.from_arrays`, `decode` and `FgsFile` return scenes.
 
     Parameters
     ----------
     checked : CheckedScene
-        The scene, and what its file says about drawing it.
+        The scene, and the settings that its file states.
     """
 
     def __init__(self, checked: CheckedScene) -> None:
@@ -42,9 +42,16 @@ class Scene:
         Parameters
         ----------
         path : path
-            Cameras and photos beside it are found by `compress`, as on the command line.
+            The file or folder. `compress` finds cameras and photos beside it, as on the command line.
         drop_invalid : bool
-            Leave out Gaussians with NaN, infinity or zero quaternions, instead of raising `InputError`.
+            Leave out Gaussians with NaN, infinity or zero quaternions. Default: raise `InputError` for them.
+
+        Raises
+        ------
+        InputError
+            If there is no such file, or its values are invalid.
+        FormatError
+            If the file does not follow its format.
         """
         return cls(load_scene(path, drop_invalid))
 
@@ -61,31 +68,32 @@ class Scene:
         antialiased: bool = False,
         drop_invalid: bool = False,
     ) -> Scene:
-        """A scene of the values that training stores, before exp, sigmoid and normalisation. They are copied.
+        """Make a scene from the values that training stores, before exp, sigmoid and normalisation. Copies the values.
 
         Parameters
         ----------
         means : np.ndarray
-            [N, 3], world. All values become float32; of float64 positions far from zero no digits are lost.
+            [N, 3], world coordinates. Give positions far from zero as float64: they keep all digits. All other values become
+            float32.
         log_scales : np.ndarray
             [N, 3], natural logarithms of the standard deviations.
         quats : np.ndarray
             [N, 4], w x y z, any norm.
         opacity_logits : np.ndarray
-            [N].
+            [N], opacities before the sigmoid.
         sh_dc : np.ndarray
             [N, 3], SH of degree 0.
         sh_rest : np.ndarray, optional
-            [N, K, 3], SH above degree 0: K is 3, 8, 15 or 24. Default: none.
+            [N, K, 3], SH above degree 0. K is 3, 8, 15 or 24 at SH degree 1 to 4. Default: none.
         antialiased : bool
-            The scene was trained with opacities compensated for the dilation.
+            The scene was trained with opacities reduced to make up for the screen-space dilation. Default: no.
         drop_invalid : bool
             See `open`.
 
         Raises
         ------
         InputError
-            Naming the argument, what was expected and what was found.
+            If an argument is invalid. The message names it, what was expected and what was found.
         """
         first = np.asarray(means)
         count = len(first) if first.ndim else 0
@@ -96,7 +104,7 @@ class Scene:
             "quats": _plane(_array("quats", quats, count, (4,)).T),
             "opacity_logits": _plane(_array("opacity_logits", opacity_logits, count, ())[None]),
             "sh_dc": _plane(_array("sh_dc", sh_dc, count, (3,)).T),
-            # Channel by channel: all of red, all of green, all of blue.
+            # Planes hold all coefficients of red, then of green, then of blue.
             "sh_rest": _plane(_rest(rest, count).transpose(2, 1, 0).reshape(3 * rest.shape[1], count)),
         }
         origin = choose_origin(places[:, origin_rows(count)].T.astype(np.float64)) if count else np.zeros(3)
@@ -107,17 +115,17 @@ class Scene:
 
     @property
     def count(self) -> int:
-        """N."""
+        """Number of Gaussians."""
         return self.source.count
 
     @property
     def sh_degree(self) -> int:
-        """0 to 4."""
+        """SH degree, 0 to 4."""
         return self.source.sh_degree
 
     @property
     def antialiased(self) -> bool:
-        """Whether the scene is drawn antialiased, as its file or its model folder says."""
+        """Whether its file or model folder asks to draw the scene antialiased."""
         path, stored = self.checked.path, self.checked.settings
         if "antialiased" in stored:
             return stored["antialiased"] is True
@@ -125,16 +133,16 @@ class Scene:
 
     @property
     def source(self) -> SceneSource:
-        """The values as planes [width, n], by row range: what other functions of the package read."""
+        """The lazy source of the scene. It reads planes [width, n] by row range, for other functions of this package."""
         return self.checked.source
 
     def arrays(self, rows: slice | Sequence[int] | NDArray[np.integer] | None = None) -> Arrays:
-        """The stored values of some Gaussians, in the shapes of `from_arrays`; new arrays at each call.
+        """Read the stored values of some Gaussians, in the shapes of `from_arrays`. Each call returns new arrays.
 
         Parameters
         ----------
         rows : slice or integers, optional
-            Default: all of them.
+            Gaussians to read. Default: all of them.
         """
         source = self.source
         if isinstance(rows, slice):
@@ -148,7 +156,7 @@ class Scene:
         return _arrays(source.read(slice(0, source.count), list(FIELD)), source.origin)
 
     def save(self, path: StrPath, *, force: bool = False) -> None:
-        """Write a `.ply`, `.spz`, `.sog` or `.compressed.ply`, as `decompress` does; a `.fgs` is made by `compress`."""
+        """Write a `.ply`, `.spz`, `.sog` or `.compressed.ply`, as `decompress` does. Use `compress` for a `.fgs`."""
         decompress(self.checked, path, force)
 
     def render(
@@ -160,18 +168,24 @@ class Scene:
         near: float | None = None,
         background: tuple[float, float, float] | None = None,
     ) -> Floats:
-        """Draw one view: [H, W, 3], not clamped. `render_views` draws many, and opens the device once for all of them.
+        """Draw one view. Each call opens the device and loads the scene; `render_views` does so once for many views.
 
         Parameters
         ----------
         camera : Camera
-            World coordinates.
+            The camera, in world coordinates.
         device : str, optional
-            OpenCL device (number, part of its name, `cpu`, `gpu`) or `numpy`.
+            OpenCL device (number, part of its name, `cpu` or `gpu`) or `numpy`. Default: the one that `devices` shows as
+            chosen.
         memory_limit : int, optional
-            Bytes for the whole process.
+            Bytes for the whole process. Default: three quarters of the free memory.
         near, background : optional
-            Default: what the file says, else 0.2 scene units and black.
+            Near plane in scene units, and background colour. Default: as the file states, else 0.2 and black.
+
+        Returns
+        -------
+        np.ndarray
+            [H, W, 3] float32, not clamped to [0, 1].
         """
         options = ViewOptions(
             cameras=NO_CAMERAS, device=device, memory_limit=memory_limit, near=near, background=background
@@ -185,7 +199,7 @@ class Scene:
 
 
 def _array(name: str, values: Numbers, count: int, inner: tuple[int, ...]) -> np.ndarray:
-    """[N, *inner] numbers."""
+    """Convert `values` to an array, and check that it holds [N, *inner] numbers."""
     array = np.asarray(values)
     shape = ("N" if name == "means" else count, *inner)
     if array.shape != (count, *inner):
@@ -196,15 +210,15 @@ def _array(name: str, values: Numbers, count: int, inner: tuple[int, ...]) -> np
 
 
 def _rest(values: np.ndarray, count: int) -> np.ndarray:
-    """[N, K, 3] numbers with a K that is a whole SH degree."""
+    """Check that `values` is [N, K, 3] with a K that belongs to an SH degree."""
     if values.ndim == 3 and 3 * values.shape[1] in REST_WIDTHS:
         return _array("sh_rest", values, count, (values.shape[1], 3))
     raise InputError(f"sh_rest: expected shape [{count}, K, 3] with K of 0, 3, 8, 15 or 24, found {list(values.shape)}")
 
 
 def _plane(values: np.ndarray) -> np.ndarray:
-    """[width, N] f32, a copy of its own."""
-    with np.errstate(over="ignore"):  # infinity is reported by the check of the scene
+    """Copy `values` to a contiguous [width, N] f32 array."""
+    with np.errstate(over="ignore"):  # the check of the scene reports infinity
         return np.array(values, np.float32, order="C")
 
 

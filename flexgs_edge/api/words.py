@@ -1,4 +1,4 @@
-"""Types of the Python API: paths, arrays, and the words of `compress`."""
+"""Types of the Python API: paths, arrays, and the options of `compress`."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ Numbers = NDArray[np.floating[Any]]
 class Arrays(TypedDict):
     """The stored values of N Gaussians: before exp, sigmoid and normalisation.
 
-    `means` is float64 where the scene is far from zero, else float32 as all others are.
+    `means` is float64 if the scene lies far from zero; otherwise all arrays are float32.
     """
 
     means: Numbers
-    """[N, 3], world."""
+    """[N, 3], world coordinates."""
     log_scales: Floats
-    """[N, 3]."""
+    """[N, 3], natural logarithms of the standard deviations."""
     quats: Floats
     """[N, 4], w x y z, any norm."""
     opacity_logits: Floats
-    """[N]."""
+    """[N], opacities before the sigmoid."""
     sh_dc: Floats
-    """[N, 3]."""
+    """[N, 3], SH of degree 0."""
     sh_rest: Floats
-    """[N, K, 3] with K = 0, 3, 8, 15 or 24 at SH degree 0 to 4."""
+    """[N, K, 3], SH above degree 0. K is 0, 3, 8, 15 or 24 at SH degree 0 to 4."""
 
 
 class CompressWords(TypedDict, total=False):
-    """Single options of `compress`, as `CompressOptions` explains them."""
+    """Single options of `compress`. `CompressOptions` explains each."""
 
     ignore_distortion: bool
     holdout: int

@@ -1,4 +1,4 @@
-"""The command line: one group of subcommands, loaded when asked for, and one door out."""
+"""The command line: the group of subcommands, and `main`, which turns errors into messages and exit codes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ COMMANDS = {
     "synth": "Make a large test scene from a small one.",
     "devices": "List the OpenCL devices, and say which one is used.",
 }
-"""Subcommands and the first sentence of their help: spelled out here so that `--help` loads none of them."""
+"""Subcommands and the first sentence of their help. They are repeated here so that `--help` imports no subcommand."""
 
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
@@ -71,9 +71,9 @@ def command() -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Run the command line and leave with its exit code; the only place where errors become messages."""
+    """Run the command line and exit with its code. Only this function turns errors into messages."""
     state = State()
-    with suppress(ValueError):  # not the main thread: whoever runs us there has signals in hand
+    with suppress(ValueError):  # raised outside the main thread, whose owner handles signals
         signal.signal(signal.SIGTERM, _on_terminate)
     try:
         code = command.main(
@@ -87,12 +87,12 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
 
 
 def _on_terminate(number: int, frame: object) -> NoReturn:
-    """End as Ctrl-C does, so that nothing half-written is left behind."""
+    """Stop as Ctrl-C does, so that no partly written file is left behind."""
     raise SystemExit(128 + number)
 
 
 def _exit_code(error: BaseException) -> int:
-    """Say what went wrong on stderr; the exit code that goes with it."""
+    """Print the error on stderr, and return its exit code."""
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else 0
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
@@ -100,7 +100,7 @@ def _exit_code(error: BaseException) -> int:
     if isinstance(error, click.ClickException):
         error.show()
         return InputError.exit_code
-    if isinstance(error, FlexGSError):  # before MemoryError: a BudgetError is one too
+    if isinstance(error, FlexGSError):  # before MemoryError, because a BudgetError is also one
         return _say(f"error: {error}", error.exit_code)
     if isinstance(error, MemoryError):
         return _say(

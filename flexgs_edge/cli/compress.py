@@ -33,7 +33,7 @@ USUAL = (
     "force",
     "quiet",
 )
-"""Options of the first page, in order; `--expert` shows the others too."""
+"""Options that `--help` shows, in order. `--expert` shows the others too."""
 MORE = """\b
 More examples:
   flexgs-edge compress point_cloud.ply -o a.fgs --method paper --score-cache s.npz
@@ -225,7 +225,7 @@ def command(input: str, output: str | None, json_path: str | None, quiet: bool, 
     from flexgs_edge.commands.compress import compress
     from flexgs_edge.run.options import METHOD_ONLY, CompressOptions, check_method
 
-    # An option that is spelled out is meant, even where it says its default.
+    # An option that the user typed counts as given, even if it equals the default.
     source = click.get_current_context().get_parameter_source
     check_method(options["method"], [name for name in METHOD_ONLY if source(name) is ParameterSource.COMMANDLINE])
     result = compress(input, output, CompressOptions(**options), progress)

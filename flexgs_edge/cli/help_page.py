@@ -1,4 +1,4 @@
-"""Help pages: options under headings, and the rarer ones of a command only when `--expert` asks for them."""
+"""Help pages: options under headings. Rarely used options appear only with `--expert`."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ DEVICE = "Memory and device"
 MACHINES = "Memory and machines"
 OUTPUT = "Output"
 METHOD = "Method"
-"""Options that only one `--method` knows get its name behind this heading."""
+"""Heading of options that only one `--method` knows. The name of the method follows it."""
 FAULTS = "Faults"
 HELP = "Help"
 
 _LAST = (VIEWS, EFFORT, DEVICE, MACHINES, OUTPUT, METHOD, f"{METHOD} best", f"{METHOD} paper", FAULTS, HELP)
-"""Order of the headings that commands share; what is a command's own comes before them."""
+"""Order of the headings that commands share. A command's own headings come before them."""
 _NAMES_WIDTH = 22
-"""Columns for the names of options. Longer ones get a line of their own, so that texts keep their width."""
+"""Width of the column of option names. A longer name gets its own line, so that texts keep their width."""
 _EXPERT = "flexgs_edge.expert"
-"""Key in a context's `meta`: `--expert` was given."""
+"""Key in `meta` of a context that says whether `--expert` was given."""
 
 
 class SectionOption(click.Option):
@@ -35,7 +35,7 @@ class SectionOption(click.Option):
         super().__init__(*args, **kwargs)
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """The names and the text; a pair of flags as `--[no-]name`."""
+        """Return the names and the help text. A pair of flags appears as `--[no-]name`."""
         record = super().get_help_record(ctx)
         if record is None or not self.secondary_opts:
             return record
@@ -43,12 +43,12 @@ class SectionOption(click.Option):
 
 
 def option(section: str, *names: str, **kwargs: Any) -> Callable[[Decorated], Decorated]:
-    """A `click.option` under a heading."""
+    """Make a `click.option` that appears under a heading."""
     return click.option(*names, cls=SectionOption, section=section, **kwargs)
 
 
 def stack(*decorators: Callable[[Any], Any]) -> Callable[[Decorated], Decorated]:
-    """Several decorators as one, in the order in which `--help` shows them."""
+    """Combine decorators into one, in the order in which `--help` shows them."""
 
     def apply(function: Decorated) -> Decorated:
         for decorator in reversed(decorators):
@@ -62,11 +62,11 @@ class SectionCommand(click.Command):
     """A command whose `--help` shows options under headings."""
 
     def shown(self, ctx: click.Context) -> Sequence[click.Parameter]:
-        """The options that the page shows, in order."""
+        """Return the options that the page shows, in order."""
         return self.get_params(ctx)
 
     def sections(self, ctx: click.Context) -> dict[str, list[click.Option]]:
-        """Headings in order, and the options under each."""
+        """Return the headings in order, and the options under each."""
         found: dict[str, list[click.Option]] = {}
         for parameter in self.shown(ctx):
             if isinstance(parameter, click.Option) and not parameter.hidden:
@@ -74,11 +74,11 @@ class SectionCommand(click.Command):
         return dict(sorted(found.items(), key=lambda item: _LAST.index(item[0]) if item[0] in _LAST else -1))
 
     def heading(self, parameter: click.Option) -> str:
-        """The heading of an option."""
+        """Return the heading of an option."""
         return getattr(parameter, "section", HELP)
 
     def note(self, heading: str) -> str:
-        """What stands between a heading and its options; empty for nothing."""
+        """Return the text between a heading and its options; empty by default."""
         return ""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -91,14 +91,14 @@ class SectionCommand(click.Command):
 
 
 class ExpertCommand(SectionCommand):
-    """A command with many options: `--help` shows the usual ones, `--expert` all.
+    """A command with many options: `--help` shows the common ones, `--expert` shows all.
 
     Parameters
     ----------
     usual : sequence of str
-        Names of the parameters on the first page, in order.
+        Names of the parameters that `--help` shows, in order.
     more : str
-        What `--expert` shows below the options.
+        Text that `--expert` shows below the options.
     """
 
     def __init__(self, *args: Any, usual: Sequence[str], more: str, **kwargs: Any) -> None:
@@ -119,7 +119,7 @@ class ExpertCommand(SectionCommand):
     def shown(self, ctx: click.Context) -> Sequence[click.Parameter]:
         known = {parameter.name: parameter for parameter in self.get_params(ctx)}
         usual = [known.pop(name) for name in self.usual]
-        # The option that shows more is the last of its heading, after click's own --help.
+        # --expert comes last under its heading, after click's own --help.
         expert = known.pop("expert")
         if not ctx.meta.get(_EXPERT):
             known = {name: each for name, each in known.items() if not isinstance(each, SectionOption)}
@@ -148,14 +148,14 @@ class ExpertCommand(SectionCommand):
 
 
 def _method_only() -> Mapping[str, tuple[str, object]]:
-    # Imports NumPy: only the page that shows the methods' own options pays for it.
+    # Imported here because it loads NumPy, which only the `--expert` page needs.
     from flexgs_edge.run.options import METHOD_ONLY
 
     return METHOD_ONLY
 
 
 def _show_expert(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
-    """Print the whole help and end, as `--help` does with its page."""
+    """Print the help with all options and exit, as `--help` does."""
     if value and not ctx.resilient_parsing:
         ctx.meta[_EXPERT] = True
         click.echo(ctx.get_help(), color=ctx.color)

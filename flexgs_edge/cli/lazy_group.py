@@ -10,12 +10,12 @@ import click
 
 
 class LazyGroup(click.Group):
-    """A group that knows the names and lines of its subcommands, and imports none before it is asked for.
+    """A group that knows the names of its subcommands, and imports a subcommand only to run it.
 
     Parameters
     ----------
     commands_from : tuple
-        The package with a module (with a `command`) for every subcommand, and the overview's line for each name.
+        A package with one module per subcommand, each of which defines `command`; and the overview's line for each name.
     """
 
     def __init__(self, *args: Any, commands_from: tuple[str, Mapping[str, str]], **kwargs: Any) -> None:

@@ -140,16 +140,16 @@ debug_option = option(
     help="Show tracebacks of errors.",
 )
 write_options = stack(json_option, force_option, quiet_option, debug_option)
-"""What every command has."""
+"""Options of every command."""
 run_options = stack(memory_option, device_option, write_options)
-"""What every command has that works on a device and writes something."""
+"""Options of every command that uses a device and writes a file."""
 photos_options = stack(cameras_option, images_option, holdout_option)
-"""Where the views are, and which of them judge."""
+"""Options for cameras, photos and held-out views."""
 study_options = stack(
     photos_options, select_option, drawing_options, base_psnr_option, drop_invalid_option, run_options
 )
-"""What every study has."""
+"""Options of every study."""
 results_option = option(
     OUTPUT, "-o", "--output", metavar="DIR", required=True, help="Folder for the results; made if missing."
 )
-"""Where a study writes."""
+"""Options for the output of a study."""

@@ -1,4 +1,4 @@
-"""How a command speaks: the summary to stdout, everything else to stderr."""
+"""Output of a command: the summary to stdout, everything else to stderr."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from flexgs_edge.progress import Progress
 
 @dataclass
 class State:
-    """What `main` must know after a command has failed."""
+    """Settings that `main` needs after a command has failed."""
 
     debug: bool = False
 
 
 def set_debug(ctx: click.Context, param: click.Parameter, value: bool) -> None:
-    """Note `--debug`, so that `main` prints the traceback of an error."""
+    """Remember `--debug`, so that `main` prints the traceback of an error."""
     if value and isinstance(ctx.obj, State):
         ctx.obj.debug = True
 
 
 def start(quiet: bool, json_path: str | None = None, force: bool = False, report: str | None = None) -> Progress:
-    """Set up the log on stderr and check the JSON file before any work; progress bars for the job."""
+    """Set up the log on stderr, check before any work that the JSON file can be written, and return the progress bars."""
     log = logging.getLogger("flexgs_edge")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("flexgs-edge: %(message)s"))
@@ -45,7 +45,7 @@ def start(quiet: bool, json_path: str | None = None, force: bool = False, report
 
 
 def emit(text: str, record: dict[str, Any], json_path: str | None, force: bool = False) -> None:
-    """The summary to stdout; with `--json -` the JSON takes its place and the summary goes to stderr."""
+    """Print the summary to stdout, and write the JSON. With `--json -` the JSON goes to stdout and the summary to stderr."""
     click.echo(text, nl=False, err=json_path == "-")
     if json_path is None:
         return

@@ -14,7 +14,7 @@ COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 class SizeType(click.ParamType):
-    """Bytes: `1.5MB` (10^6), `512MiB` (2^20) or plain."""
+    """A number of bytes: `1.5MB` (10^6), `512MiB` (2^20) or plain digits."""
 
     name = "SIZE"
 
@@ -26,7 +26,7 @@ class SizeType(click.ParamType):
 
 
 class ColourType(click.ParamType):
-    """Red, green, blue from 0 to 1."""
+    """A colour: red, green and blue from 0 to 1."""
 
     name = "COLOUR"
 
@@ -52,7 +52,7 @@ class ColourType(click.ParamType):
 
 
 class ViewsType(click.ParamType):
-    """Indices of views: `0,8,16`, `0:50:8`, or both mixed."""
+    """Indices of views: a list `0,8,16`, a range `0:50:8`, or a mix of both."""
 
     name = "VIEWS"
 
@@ -69,7 +69,7 @@ class ViewsType(click.ParamType):
                     ctx,
                 )
             start, stop, step = match.groups()
-            # Bounded before the list is made: a typing slip must not fill the memory.
+            # Bound the range before making the list: a typing error must not fill the memory.
             last = min(int(stop), 1_000_000) if stop else int(start) + 1
             chosen.extend(range(int(start), last, int(step or 1)))
         return chosen

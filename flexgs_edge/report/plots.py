@@ -62,7 +62,7 @@ class Series:
     notes : sequence of str
         Text beside each point.
     broken : sequence of float
-        x of points to cross out, because the method failed there. Points without a y are crossed out at the top of the chart.
+        x of points to cross out, where quality counts as broken. Points without a y are crossed out at the top of the chart.
     """
 
     label: str

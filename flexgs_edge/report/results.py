@@ -1,8 +1,8 @@
-"""Records of the jobs that judge quality: what the summary prints, `--json` writes and the tests read.
+"""Results of `compress` and `evaluate`, the commands that measure quality.
 
-Keys of the JSON are the field names below unless a docstring says otherwise; sizes are bytes, times seconds (where the name
-ends in `_ms`, milliseconds), quality dB. null stands for "identical" (PSNRs and fidelity) or "nothing to measure"
-(photos, targets).
+The JSON keys are the field names below, unless a docstring says otherwise. Sizes are bytes and quality is dB. Times are
+seconds, or milliseconds if the name ends in `_ms`. null means "identical" for PSNR and fidelity, and "not measured" for photos
+and targets.
 """
 
 from __future__ import annotations
@@ -23,62 +23,62 @@ from flexgs_edge.units import format_size
 
 @dataclass(frozen=True)
 class CompressResult:
-    """What `compress` did.
+    """Result of `compress`.
 
     Parameters
     ----------
     scene, views : SceneInfo, ViewsInfo or None
-        What went in (`views` is None for a run without cameras).
+        The input scene, and the views; `views` is `None` for a run without cameras.
     output : str or None
-        File written; `None` in a dry run.
+        The file written; `None` in a dry run.
     size : int
-        Bytes of the file (in a dry run: that it would have; the size model is exact).
+        Bytes of the file. A dry run gives the exact size that the file would have.
     count, sh_count : int
-        Gaussians kept, and of these with SH.
+        Gaussians kept, and those of them with SH above degree 0.
     prune_rate, sh_rate : float
-        The choice.
+        Shares of all Gaussians: those removed, and those kept without their SH.
     method, score, select : str
-        As asked for.
+        Options of the run.
     bits : dict
-        Bits by attribute.
+        Bits per attribute (`paper`).
     groups : dict
-        Groups per channel by attribute.
+        Quantization groups per channel, by attribute (`paper`).
     steps : dict or None
-        Grid steps by attribute (`--method best`, which has no bits and groups).
+        Step sizes by attribute (`best`).
     target : str or None
         The target in words; `None` for fixed rates.
     decided_by : str or None
         `drop`, `modelled drop`, `fidelity` or `size`; `None` for fixed rates.
     reached : bool or None
-        Whether the target holds at the decision.
+        Whether the deciding views meet the target; `None` for fixed rates.
     decision_views : str
-        Which views decided: `held-out`, `training` or `none`.
+        The kind of views that decided: `held-out`, `training` or `none`.
     search : SearchResult or None
-        Every step of the search.
+        Every step of the search; `None` for fixed rates.
     sensitivity : tuple of Sensitivity
-        What `--bits auto` measured.
+        Loss per attribute and bit width, as `--bits auto` measured it.
     quality : Quality or None
-        Of the decoded file, over `quality_views` (`None` without cameras).
+        Quality of the decoded file over `quality_views`; `None` without cameras.
     quality_views : str
-        `held-out`, `training` or `none`.
+        The kind of views that `quality` is measured on: `held-out`, `training` or `none`.
     scores_saved : str or None
-        File of scores written.
+        File that the scores were written to.
     score_cache : str or None
         File that keeps the scores between runs.
     scores_reused : bool
-        Whether they were taken from it.
+        Whether the scores came from that file.
     run : RunInfo
-        Times, memory, device.
+        Times, memory and device.
     format : str
         `fgs`, `spz`, `sog` or `compressed.ply`.
     file_sh_degree : int or None
         SH degree of the file.
     scored : Scored or None
-        Poses and unseen Gaussians of a search by measured costs.
+        Scored views and unseen Gaussians of a search by measured costs (`best`).
     training_fidelity : float or None
-        Fidelity of the decoded file on some training poses, where `quality` is of held-out views.
+        Fidelity of the decoded file on some training views, dB. Measured only if `quality` comes from held-out views.
     warnings : tuple of str
-        Reasons to trust the figures less, each with a number.
+        Reasons to trust the figures less. Each names a number and what to do.
     """
 
     scene: SceneInfo
@@ -115,12 +115,12 @@ class CompressResult:
 
     @property
     def ratio(self) -> float:
-        """PLY bytes, as INRIA writes them, for each byte of the file."""
+        """Bytes of the scene as a PLY in INRIA's layout, divided by those of the file."""
         return self.scene.ply_bytes / self.size
 
     @property
     def ratio_without_normals(self) -> float:
-        """The same for a PLY without normals."""
+        """Bytes of the scene as a PLY without normals, divided by those of the file."""
         return self.scene.ply_bytes_without_normals / self.size
 
     def to_json(self) -> dict[str, Any]:
@@ -218,7 +218,7 @@ def _decision_lines(result: CompressResult) -> list[str]:
 
 
 def decided_words(result: CompressResult) -> str:
-    """Which figure decided, and on which views."""
+    """Describe the figure that decided, and the views it was measured on."""
     by = {
         "drop": "the drop against the photos",
         "modelled drop": "the modelled drop (no photos decide: error against the original's renders)",
@@ -235,7 +235,7 @@ def decided_words(result: CompressResult) -> str:
 
 @dataclass(frozen=True)
 class EvaluateResult:
-    """What `evaluate` found: a scene against a reference, over `quality_views`."""
+    """Result of `evaluate`: the quality of a scene against its original, over `quality_views`."""
 
     scene: SceneInfo
     reference: SceneInfo

@@ -1,4 +1,4 @@
-"""Records of a run that every result holds: times and memory, the scene, the views."""
+"""Records that every result holds: times and memory, the scene, the views."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from typing import Any
 
 @dataclass(frozen=True)
 class RunInfo:
-    """What a run took, and on what it ran.
+    """Times, memory and device of a run.
 
     Parameters
     ----------
     seconds : float
-        Whole run.
+        Wall seconds of the whole run.
     stages : dict
-        Seconds by stage, in order.
+        Wall seconds by stage, in order of first entry.
     startup_seconds, compile_seconds : float
-        Opening the device, and building kernels (part of the stages that first needed them).
+        Seconds to open the device, and to build kernels. The stages that first needed them include both.
     memory_limit, peak_memory : int
-        The limit, and the largest resident memory of the process. With scratch files that counts their pages too, which the
-        kernel leaves there as long as nobody needs the room.
+        The limit, and the largest resident memory of the process, bytes. With scratch files the peak includes their cached
+        pages, which the operating system keeps until it needs the memory.
     peak_anonymous, scratch : int or None
-        The largest resident memory without a file behind it (sampled) and the most bytes in scratch files; `None` for runs
-        without scratch files.
+        The largest sampled resident memory that no file backs, and the most bytes in scratch files. `None` without scratch
+        files.
     device : dict or None
-        What ran the kernels; `None` when nothing was rendered.
+        The device that ran the kernels; `None` if nothing was drawn.
     """
 
     seconds: float
@@ -39,7 +39,7 @@ class RunInfo:
     scratch: int | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Seconds are rounded to milliseconds."""
+        """Return the record as JSON values, with seconds rounded to milliseconds."""
         return {
             "seconds": round(self.seconds, 3),
             "stages": {name: round(seconds, 3) for name, seconds in self.stages.items()},
@@ -55,7 +55,7 @@ class RunInfo:
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """A scene that went in."""
+    """An input scene."""
 
     path: str
     count: int
@@ -71,7 +71,7 @@ class SceneInfo:
 
 @dataclass(frozen=True)
 class ViewsInfo:
-    """The views of a run: how many there are, how they were split, and where they came from."""
+    """The views of a run: their number, their split, and where they came from."""
 
     cameras: str
     images: str | None

@@ -9,18 +9,18 @@ from flexgs_edge.goals.steps import Step
 from flexgs_edge.goals.target import Target
 from flexgs_edge.report.html import render
 
-# As wide as a phone: on larger screens the chart grows, and its words with it, instead of becoming unreadable on small ones.
+# As wide as a phone, so that text stays readable there. On larger screens the chart and its text grow together.
 WIDTH, HEIGHT = 360, 230
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44, WIDTH - 12, 14, HEIGHT - 38
 
 
 def step_chart(steps: Sequence[Step], chosen: Step, target: Target) -> str:
-    """Size against the figure that judges, a mark a step; empty with fewer than two steps that were measured.
+    """Draw file size against the deciding figure, with one mark per step.
 
-    Identical renders have no place on a scale in dB.
+    Returns an empty string if fewer than two steps can be shown. Steps with identical renders have no place on a scale in dB.
     """
     judge = target.figure
-    # The chosen step may be equal to others in all its figures: it is found by identity.
+    # Find the chosen step by identity: other steps may have equal figures.
     points = [(s.size, at, s) for s in steps if s.measurement and (at := s.measurement.figure(judge)) is not None]
     if len(points) < 2:
         return ""
@@ -63,7 +63,7 @@ def _unit(most: float) -> tuple[int, str]:
 
 
 def nice_range(values: Sequence[float], most: int = 5) -> tuple[float, float, list[float]]:
-    """Ends of an axis that holds all values with some room, and at most `most` + 1 round ticks within.
+    """Choose the ends of an axis with a margin around all values, and at most `most` + 1 round ticks.
 
     >>> nice_range([0.0, 1.0])
     (-0.08, 1.08, [0.0, 0.2, 0.4, 0.6, 0.8, 1.0])

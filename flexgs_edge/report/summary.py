@@ -1,4 +1,4 @@
-"""Lines of the text that people read, which several records share."""
+"""Lines of the printed summary that several results share."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
 from flexgs_edge.units import format_mib
 
-if TYPE_CHECKING:  # `trim` and `verify` start without kernels
+if TYPE_CHECKING:  # so that `trim` and `verify` start without kernels
     from flexgs_edge.quality.view_quality import Quality
 
 
 def scene_lines(label: str, scene: SceneInfo) -> list[str]:
-    """A scene that went in, with its notes."""
+    """Describe an input scene and its notes."""
     lines = [line(label, f"{scene.path}: {scene.count} Gaussians, SH degree {scene.sh_degree}")]
     return lines + [line("note", note) for note in scene.notes]
 
 
 def view_lines(views: ViewsInfo | None) -> list[str]:
-    """The views, where they came from, and their notes."""
+    """Describe the views, where they came from, and their notes."""
     if views is None:
         return [line("views", "none")]
     split = f"{views.total} views of {views.width}x{views.height} ({views.train} training, {views.held_out} held out)"
@@ -28,7 +28,7 @@ def view_lines(views: ViewsInfo | None) -> list[str]:
 
 
 def quality_lines(quality: Quality, where: str) -> list[str]:
-    """Drop, fidelity and the worst view; `where` says of which views."""
+    """Describe drop, fidelity and the worst view; `where` names the views that were measured."""
     lines = []
     if quality.drop is not None:
         also = (
@@ -65,7 +65,7 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
 
 
 def run_lines(run: RunInfo) -> list[str]:
-    """Seconds by stage, memory and device."""
+    """Describe seconds by stage, memory and device."""
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in run.stages.items())
     lines = [line("took", f"{run.seconds:.1f} s ({stages})")]
     lines.append(line("memory", memory_words(run)))
@@ -75,7 +75,7 @@ def run_lines(run: RunInfo) -> list[str]:
 
 
 def memory_words(run: RunInfo) -> str:
-    """Peak and limit; with scratch files what they took, and the peak of what cannot go there."""
+    """Describe peak memory and its limit. With scratch files, also their bytes and the peak of memory that no file backs."""
     words = f"peak {format_mib(run.peak_memory)} of a limit of {format_mib(run.memory_limit)}"
     if run.scratch is None:
         return words
@@ -85,27 +85,27 @@ def memory_words(run: RunInfo) -> str:
 
 
 def device_words(device: dict[str, object]) -> str:
-    """What ran the kernels, in a line."""
+    """Describe the device that ran the kernels, in one line."""
     if device.get("backend") == "numpy":
         return "NumPy twins (--device numpy): same results as OpenCL, far slower"
     return f"{device.get('name')} ({device.get('platform')})"
 
 
 def decibel(value: float | None) -> str:
-    """A figure in dB; `None` is that of identical pictures."""
+    """Format a figure in dB; `None` means identical pictures."""
     return "identical" if value is None else f"{value:.3f}"
 
 
 def similar(value: float | None) -> str:
-    """An SSIM or LPIPS; `None` was not measured."""
+    """Format an SSIM or LPIPS; `None` means not measured."""
     return "-" if value is None else f"{value:.4f}"
 
 
 def line(label: str, words: str) -> str:
-    """A line of a summary, with its label in a column of its own."""
+    """Format a line of the summary, with its label in the first column."""
     return f"{label + ':':<12} {words}"
 
 
 def text(lines: list[str]) -> str:
-    """Lines as a text."""
+    """Join lines to a text."""
     return "\n".join(lines) + "\n"

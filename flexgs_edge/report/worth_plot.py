@@ -1,4 +1,4 @@
-"""The picture of `info --errors`: what every channel of a file is worth."""
+"""Draw the picture of `info --errors`: what each channel of a file is worth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SUFFIXES = (".png", ".svg")
 
 
 def check_picture(path: str, force: bool) -> None:
-    """Raise `InputError` for a picture that could not be made: asked before any work."""
+    """Raise `InputError` if the picture cannot be written. Call this before any work starts."""
     if Path(path).suffix.lower() not in SUFFIXES:
         raise InputError(f"--picture {path}: expected a name that ends in {' or '.join(SUFFIXES)}")
     require_matplotlib()
@@ -21,14 +21,14 @@ def check_picture(path: str, force: bool) -> None:
 
 
 def write_picture(found: WorthResult, path: str, force: bool) -> None:
-    """Draw what `commands.worth` found: a dot a change, its modelled drop, and the share of the bytes that it saves."""
+    """Draw a dot for each change: its modelled drop, and the share of the file's bytes that it saves."""
     png, svg = picture(worth_chart(found))
     with atomic_write(path, force) as file:
         file.write(png if Path(path).suffix.lower() == ".png" else svg)
 
 
 def worth_chart(found: WorthResult) -> DotChart:
-    """The chart as plain data."""
+    """Return the chart as a record."""
     changes, size = found.changes, found.info.size
     groups = list(dict.fromkeys(item.channel for item in changes))
     kinds = list(dict.fromkeys(item.change for item in changes))

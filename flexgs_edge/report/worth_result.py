@@ -1,4 +1,4 @@
-"""The record of `info --errors`: what every channel of a file is worth."""
+"""Result of `info --errors`: what each channel of a file is worth."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from flexgs_edge.report.run_info import ViewsInfo
 from flexgs_edge.units import format_size
 
 ONE_LESS, DROPPED = "one bit less", "dropped"
-"""What is done to a channel."""
+"""The two changes that we make to a channel."""
 
 
 @dataclass(frozen=True)
 class WorthChange:
-    """A channel with less in it: the bytes of the file that it saves, fidelity and modelled drop (dB).
+    """A reduced channel: the bytes it saves in the file, fidelity and modelled drop, dB.
 
-    The fidelity is `None` where nothing changes.
+    The fidelity is `None` if no render changes.
     """
 
     channel: str
@@ -29,18 +29,18 @@ class WorthChange:
 
 @dataclass(frozen=True)
 class WorthResult:
-    """What a file holds, and what each channel of it is worth.
+    """Contents of a file, and what each of its channels is worth.
 
     Parameters
     ----------
     info : InfoResult
-        As `info` finds it.
+        Result of `info`.
     views : ViewsInfo
-        All views that there are.
+        All views of the run.
     used, kind : int, str
-        How many were drawn, and which: `held-out` or `training`.
+        Number and kind of the views drawn: `held-out` or `training`.
     base_psnr : float
-        PSNR of the original that the modelled drop starts from, dB.
+        Assumed PSNR of the original against its photos, for the modelled drop, dB.
     changes : tuple of WorthChange
         In the order of the channels.
     """
@@ -53,7 +53,7 @@ class WorthResult:
     changes: tuple[WorthChange, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """The record for machines: that of `info`, and `errors`."""
+        """Return the record of `info` as JSON values, with the key `errors` added."""
         views = {**self.views.to_json(), "used": self.used, "kind": self.kind}
         changes = [asdict(change) for change in self.changes]
         return {**self.info.to_json(), "errors": {"views": views, "base_psnr": self.base_psnr, "changes": changes}}
@@ -63,7 +63,7 @@ class WorthResult:
         return self.info.summary() + self.table()
 
     def table(self) -> str:
-        """The part of the summary that says what each channel is worth."""
+        """Return the part of the summary about what each channel is worth."""
         items = {(item.channel, item.change): item for item in self.changes}
         rows: list[tuple[str, ...]] = [("", *("saves", "fidelity", "drop") * 2)]
         for channel in dict.fromkeys(item.channel for item in self.changes):
