@@ -55,7 +55,7 @@ def compress(
     cameras : Cameras or path, optional
         Cameras, a camera file, `auto` or `none`. Default: the cameras beside the scene, else `auto`.
     images : path or sequence of np.ndarray, optional
-        Folder of photos, `none`, or one array [H, W, 3] or [H, W, 4] (with alpha) per camera. Arrays are in the order of
+        Folder of photos, `none`, or one array [H, W, 3] or [H, W, 4] per camera. Arrays are in the order of
         `cameras`; for cameras from a file, in order of name. Default: the photos beside the scene, if its own cameras are
         used.
     **words

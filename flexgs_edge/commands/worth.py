@@ -47,8 +47,8 @@ def worth(
     Returns
     -------
     WorthResult
-        The result of `info`, the views, and a record for each change of `reduced_scenes`: bytes saved, fidelity (dB; None if
-        nothing changes) and modelled drop (dB).
+        The result of `info`, the views, and a record for each change of `reduced_scenes`. A record holds the bytes saved, the
+        fidelity (dB, None if no render changes) and the modelled drop (dB).
     """
     options = replace(options or ViewOptions(), images=None, **words)
     place = Path(path)

@@ -153,8 +153,8 @@ class CompressOptions(ViewOptions):
     best_effort : bool
         If the target cannot be met, write the closest result. Default: raise `TargetError`.
     unseen : str
-        What to do with Gaussians that no training view sees (`best`): `keep` them without view-dependent colour (the
-        default), `drop` them, or keep the most visible share, such as `20%`.
+        What to do with Gaussians that no training view sees (`best`): `keep`, `drop`, or a share such as `20%`, which keeps
+        the most visible ones. Default: `keep`, without view-dependent colour.
     views_margin : bool
         Also score generated camera views: closer, farther and in between (`best`). Slower, slightly larger files. Default: no.
     refit : bool
