@@ -13,7 +13,8 @@ def devices(device: str | None = None) -> DevicesResult:
     Parameters
     ----------
     device : str, optional
-        Device to choose: a number, part of a name, `cpu` or `gpu`. Default: the best one that works.
+        Device to choose: a number, part of a name, `cpu` or `gpu`. Default: the first GPU that works, else
+        a processor.
 
     Returns
     -------
