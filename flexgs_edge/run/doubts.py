@@ -29,7 +29,7 @@ UNSEEN_SHARE = 0.01
 class TrainingPoses:
     """Compares a finished file with the original on some training views.
 
-    The figures of a run come from other views; these only show whether the result fits the scored views too closely.
+    The figures of a run come from other views. Training views only show whether the result fits the scored views too closely.
 
     Parameters
     ----------
