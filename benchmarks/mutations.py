@@ -40,16 +40,22 @@ class Tests:
 
 
 RENDER = Tests(
-    ("tests/test_render_reference.py", "tests/test_score.py", "tests/test_kernels_dequantize.py"),
+    (
+        "tests/render/test_render_reference.py",
+        "tests/methods/paper/test_scores.py",
+        "tests/kernels/test_kernels_dequantize.py",
+    ),
     "{form}",
-    ("tests/test_kernels_twins.py", "tests/test_kernels_arithmetic.py"),
+    ("tests/kernels/test_kernels_twins.py", "tests/kernels/test_kernels_arithmetic.py"),
     "{form}",
     golden=True,
 )
-BACKWARD = Tests(("tests/test_backward.py",), "float64", ("tests/test_backward.py",), "descents and {form}")
-SIMILARITY = Tests(("tests/test_ssim.py",), "scikit", ("tests/test_ssim.py",), "scikit")
-CODER = Tests((), "", ("tests/test_codec_kernel.py",), "same and {form}")
-GOLDEN = ("tests/test_golden_fox.py",)
+BACKWARD = Tests(
+    ("tests/kernels/test_backward.py",), "float64", ("tests/kernels/test_backward.py",), "descents and {form}"
+)
+SIMILARITY = Tests(("tests/quality/test_ssim.py",), "scikit", ("tests/quality/test_ssim.py",), "scikit")
+CODER = Tests((), "", ("tests/codec/v2/test_codec_kernel.py",), "same and {form}")
+GOLDEN = ("tests/render/test_golden_fox.py",)
 
 
 @dataclass(frozen=True)
@@ -259,8 +265,10 @@ def workplace() -> Iterator[Path]:
 def run_tests(place: Path, files: tuple[str, ...], keywords: str) -> str | None:
     """The first test that fails on the kernels in `place`, or None."""
     environment = {**os.environ, "FLEXGS_KERNEL_DIR": str(place / "cl_kernels"), "POCL_CACHE_DIR": str(place / "pocl")}
-    there = [file for file in files if (ROOT / file).is_file()]
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--no-cov", "-k", keywords, *there]
+    missing = [file for file in files if not (ROOT / file).is_file()]
+    if missing:
+        raise LookupError(f"no {', '.join(missing)}: bring the tests of the mutations up to date")
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--no-cov", "-k", keywords, *files]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     failed = re.search(r"^(?:FAILED|ERROR) tests/(.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
     if done.returncode not in (0, 1) or (done.returncode == 1 and not failed):
@@ -312,8 +320,8 @@ def table(rows: list[tuple[Mutation, tuple[str | None, ...]]]) -> str:
 
 
 def _test(name: str) -> str:
-    """The name of a test without its parameters."""
-    return f"`{name.partition('[')[0]}`"
+    """The name of a test without its folder and its parameters."""
+    return f"`{name.partition('[')[0].rpartition('/')[2]}`"
 
 
 def main() -> int:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.mutations import MUTATIONS, TABLE, Mutation, kernel_folder, run_tests
+from benchmarks.mutations import GOLDEN, MUTATIONS, TABLE, Mutation, kernel_folder, run_tests
 
 FEW = ("sign of the conic's B", "no near plane", "fused multiply-add in dequantize")
 QUICK = {
-    "sign of the conic's B": ("tests/test_render_reference.py", "test_tilts and w16 and inside"),
-    "no near plane": ("tests/test_render_reference.py", "test_near_plane and w16"),
-    "fused multiply-add in dequantize": ("tests/test_kernels_dequantize.py", "w16"),
+    "sign of the conic's B": ("tests/render/test_render_reference.py", "test_tilts and w16 and inside"),
+    "no near plane": ("tests/render/test_render_reference.py", "test_near_plane and w16"),
+    "fused multiply-add in dequantize": ("tests/kernels/test_kernels_dequantize.py", "w16"),
 }
 
 
@@ -20,6 +20,11 @@ QUICK = {
 def test_the_text_is_there(mutation: Mutation, tmp_path: Path) -> None:
     """Kernels change; a mutation whose text is gone would prove nothing."""
     assert kernel_folder(tmp_path, mutation).is_dir()
+
+
+def test_the_tests_are_there(repository: Path) -> None:
+    files = {file for mutation in MUTATIONS for file in (*mutation.tests.reference, *mutation.tests.twins)}
+    assert files and all((repository / file).is_file() for file in (*files, *GOLDEN))
 
 
 @pytest.mark.parametrize("name", FEW)
