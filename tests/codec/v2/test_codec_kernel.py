@@ -96,8 +96,8 @@ GRIDS = {
     "raw bits": (make_grid(1500, 4, steps=FINE), 700),
     "escapes": (with_outliers(make_grid(3001, 3)), 1500),
     "both": (with_outliers(make_grid(1201, 3, steps=FINE)), CHUNK_ROWS),
-    "same cells": (make_grid(4000, 1, step_sizes=replace(STEPS, position=2.0)), CHUNK_ROWS),
-    "one cell": (make_grid(600, 1, step_sizes=replace(STEPS, position=1000.0)), CHUNK_ROWS),
+    "same cells": (make_grid(4000, 1, steps=replace(STEPS, position=2.0)), CHUNK_ROWS),
+    "one cell": (make_grid(600, 1, steps=replace(STEPS, position=1000.0)), CHUNK_ROWS),
 }
 
 
