@@ -5,12 +5,17 @@ Every function draws its choices from a given `random.Random`, so that the same 
 
 from __future__ import annotations
 
+import gzip
+import io
 import json
 import random
 import re
 import struct
+import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+import zstandard
 
 from flexgs_edge.codec.header import Section
 from flexgs_edge.codec.v1.header import HEADER_STEP
@@ -63,6 +68,49 @@ def mutate_bytes(draw: random.Random, data: bytes) -> bytes:
     return bytes(made)
 
 
+def mutate_sparse(draw: random.Random, data: bytes) -> bytes:
+    """Change any bytes, but most often some around a byte that is not zero, of the first ones half of the time.
+
+    For files with large headers that are nearly empty.
+    """
+    if draw.random() < 0.3:
+        return mutate_bytes(draw, data)
+    places = [at for at, byte in enumerate(data) if byte]
+    at = draw.choice(places[: draw.choice((48, len(places)))])
+    start, stop = max(0, at - 4), at + 12
+    return data[:start] + _same_size(draw, data[start:stop]) + data[stop:]
+
+
+def mutate_spz(draw: random.Random, data: bytes) -> bytes:
+    """Change what a `.spz` holds once it is unpacked, and pack it again: its first bytes half of the time."""
+    if data.startswith(b"NGSP"):
+        return _mutate_frames(draw, data)
+    inner = gzip.decompress(data)
+    if draw.random() < 0.5:
+        return gzip.compress(_same_size(draw, inner[:16]) + inner[16:], 1)
+    return gzip.compress(mutate_bytes(draw, inner), 1)
+
+
+def _mutate_frames(draw: random.Random, data: bytes) -> bytes:
+    """Change the content of one frame of version 4, and correct its sizes in the table; or the header and the table."""
+    place, count = struct.unpack_from("<I", data, 16)[0], data[15]
+    if draw.random() < 0.5:
+        end = place + 16 * count
+        return _same_size(draw, data[:end]) + data[end:]
+    at, chosen, table, frames = place + 16 * count, draw.randrange(count), b"", b""
+    for index in range(count):
+        packed, size = struct.unpack_from("<QQ", data, place + 16 * index)
+        frame = data[at : at + packed]
+        if index == chosen:
+            content = mutate_bytes(draw, zstandard.ZstdDecompressor().decompress(frame))
+            frame = zstandard.ZstdCompressor().compress(content)
+            size = draw.choice((size, len(content)))
+        table += struct.pack("<QQ", len(frame), size)
+        frames += frame
+        at += packed
+    return data[:place] + table + frames
+
+
 def mutate_text(draw: random.Random, data: bytes) -> bytes:
     """Replace, move or double words and lines of a text (or of a PLY's header), or change any bytes."""
     if draw.random() < 0.3:
@@ -103,6 +151,46 @@ def mutate_json(draw: random.Random, data: bytes) -> bytes:
         except (KeyError, IndexError):
             continue  # an earlier change removed it
     return json.dumps(record).encode()
+
+
+def mutate_glb(draw: random.Random, data: bytes) -> bytes:
+    """Change the JSON or the buffer of a `.glb`, and correct the lengths of its chunks."""
+    size = struct.unpack_from("<I", data, 12)[0]
+    text, buffer = data[20 : 20 + size], data[28 + size :]
+    if draw.random() < 0.7:
+        text = mutate_json(draw, text)
+    else:
+        buffer = mutate_bytes(draw, buffer)
+    text, buffer = text + b" " * (-len(text) % 4), buffer + b"\0" * (-len(buffer) % 4)
+    head = struct.pack("<4I", 2, 28 + len(text) + len(buffer), len(text), 0x4E4F534A)
+    return b"glTF" + head + text + struct.pack("<2I", len(buffer), 0x004E4942) + buffer
+
+
+def mutate_zipped_json(draw: random.Random, data: bytes) -> bytes:
+    """Change the JSON text of a zip, and pack it again with the right checksums."""
+    return _repacked(data, lambda names: next(name for name in names if name.endswith(".json")), mutate_json, draw)
+
+
+def mutate_zipped_piece(draw: random.Random, data: bytes) -> bytes:
+    """Change the bytes of a file of a zip that is no JSON text, and pack it again with the right checksums."""
+    return _repacked(
+        data, lambda names: draw.choice([name for name in names if not name.endswith(".json")]), mutate_bytes, draw
+    )
+
+
+def _repacked(
+    data: bytes,
+    choose: Callable[[list[str]], str],
+    mutate: Callable[[random.Random, bytes], bytes],
+    draw: random.Random,
+) -> bytes:
+    place = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(place, "w") as new:
+        chosen = choose(old.namelist())
+        for info in old.infolist():
+            piece = old.read(info)
+            new.writestr(zipfile.ZipInfo(info.filename), mutate(draw, piece) if info.filename == chosen else piece)
+    return place.getvalue()
 
 
 def mutate_sealed(draw: random.Random, data: bytes, sections: Sequence[Section]) -> bytes:

@@ -29,11 +29,22 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.damage import mutate_bytes, mutate_json, mutate_sealed, mutate_text
+from benchmarks.damage import (
+    mutate_bytes,
+    mutate_glb,
+    mutate_json,
+    mutate_sealed,
+    mutate_sparse,
+    mutate_spz,
+    mutate_text,
+    mutate_zipped_json,
+    mutate_zipped_piece,
+)
 from benchmarks.harness import ROOT
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.codec.open_fgs import open_fgs, read_header, verify
 from flexgs_edge.errors import FlexGSError, FormatError
+from flexgs_edge.io.exchange import read_foreign
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.memory.process import peak_rss
 from flexgs_edge.scene.check import check_scene
@@ -75,6 +86,11 @@ def read_container(place: Path) -> str:
 def read_ply(place: Path) -> str:
     """Read a PLY."""
     return read_all(PlySource(place))
+
+
+def read_other(place: Path) -> str:
+    """Read a scene in another program's format."""
+    return read_all(read_foreign(place))
 
 
 def read_views(place: Path) -> str:
@@ -135,6 +151,18 @@ KINDS = (
     Kind("cameras.json, transforms.json", ("cameras.json", "transforms.json"), mutate_json, read_views, 10_000),
     Kind("COLMAP", ("text/cameras.txt", "text/images.txt", "binary/cameras.bin", "binary/images.bin"), mutate_text, read_views,
          10_000, folder=True),
+    Kind("glTF", ("splats.gltf",), mutate_json, read_other, 100_000),
+    Kind("GLB", ("splats.glb",), mutate_bytes, read_other, 100_000),
+    Kind("repacked GLB", ("splats.glb",), mutate_glb, read_other, 100_000),
+    Kind("SPZ", ("first.spz", "second.spz", "third.spz", "fourth.spz"), mutate_bytes, read_other, 100_000),
+    Kind("SPZ, repacked", ("first.spz", "second.spz", "third.spz", "fourth.spz"), mutate_spz, read_other, 100_000),
+    Kind("splat", ("tiny.splat",), mutate_bytes, read_other, 100_000),
+    Kind("ksplat", ("plain.ksplat", "packed.ksplat"), mutate_sparse, read_other, 100_000),
+    Kind("compressed PLY", ("tiny.compressed.ply",), mutate_text, read_other, 100_000),
+    Kind("SOG zip", ("version2.sog", "version1.sog"), mutate_bytes, read_other, 100_000),
+    Kind("SOG meta.json", ("version2.sog", "version1.sog"), mutate_zipped_json, read_other, 100_000),
+    Kind("SOG pictures", ("version2.sog", "version1.sog"), mutate_zipped_piece, read_other, 100_000),
+    Kind("lod-meta.json", ("streamed/lod-meta.json",), mutate_json, read_other, 100_000),
 )  # fmt: skip
 
 

@@ -27,6 +27,19 @@ if ! command -v chromium >/dev/null && ! command -v google-chrome >/dev/null; th
   apt_install chromium 2>/dev/null || say "no browser here: the tests of report pages are skipped"
 fi
 
+# Independent programs that read the files we write. Without npm their tests are skipped.
+node_packages=(@playcanvas/splat-transform@2.7.1 gltf-validator@2.0.0-dev.3.10)
+if ! command -v npm >/dev/null; then
+  say "no npm here: the tests with other programs' readers are skipped"
+elif [ "$(cat .node/packages 2>/dev/null)" != "${node_packages[*]}" ]; then
+  say "npm install ${node_packages[*]}"
+  if npm install --silent --prefix .node --ignore-scripts --no-audit --no-fund --no-save "${node_packages[@]}"; then
+    printf '%s' "${node_packages[*]}" >.node/packages
+  else
+    say "npm could not install them: the tests with other programs' readers are skipped"
+  fi
+fi
+
 if [ $# -eq 0 ]; then
   rm -f .coverage .coverage.* # a killed run leaves these
   # Most of the suite is Python in one thread, so two processes help. Each takes whole files, so that fixtures are made once.

@@ -13,6 +13,7 @@ from .api.words import Arrays as Arrays
 from .api.words import CompressWords as CompressWords
 from .cameras.camera import Camera as Camera
 from .cameras.read import read_cameras as read_cameras
+from .commands.compress_all import compress_all as compress_all
 from .commands.decompress import decompress as decompress
 from .commands.devices import devices as devices
 from .commands.evaluate import evaluate as evaluate
@@ -32,6 +33,8 @@ from .errors import TargetError as TargetError
 from .io.ply import write_ply as write_ply
 from .kernels.choose_device import list_devices as list_devices
 from .progress import Progress as Progress
+from .report.batch_result import BatchItem as BatchItem
+from .report.batch_result import BatchResult as BatchResult
 from .report.file_results import DecompressResult as DecompressResult
 from .report.file_results import DevicesResult as DevicesResult
 from .report.file_results import RenderResult as RenderResult

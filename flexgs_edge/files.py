@@ -1,4 +1,4 @@
-"""Write result files and folders so that each gets its name only when it is complete."""
+"""Check files before they are read, and write results so that each gets its name only when it is complete."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import errno
 import os
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,6 +15,46 @@ from typing import BinaryIO
 from flexgs_edge.errors import BudgetError, InputError
 
 DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+_SPECIAL = {
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFDIR: "a folder",
+}
+
+
+def check_readable(path: str | os.PathLike[str], name: str | None = None) -> None:
+    """Check that a path is a file. It is not opened: a pipe without a writer would wait for ever.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    name : str, optional
+        The path for messages. Default: `path`.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is not a regular one.
+    """
+    name = os.fspath(path) if name is None else name
+    try:
+        kind = stat.S_IFMT(os.stat(path).st_mode)
+    except FileNotFoundError as error:
+        if os.path.islink(path):
+            raise InputError(f"{name}: a link to {os.readlink(path)}, which does not exist") from error
+        raise InputError(f"{name}: no such file or folder") from error
+    except OSError as error:  # such as a name that is too long, or a folder without permission to enter
+        raise InputError(f"{name}: cannot read it ({error.strerror})") from error
+    except ValueError as error:  # a name with a zero byte
+        raise InputError(f"{name!r}: cannot be the name of a file") from error
+    if kind != stat.S_IFREG:
+        found = _SPECIAL.get(kind, "a special file")
+        raise InputError(f"{name}: expected a file, found {found}; write what it holds to a file first")
 
 
 def check_writable(path: str | os.PathLike[str], force: bool = False) -> Path:

@@ -46,3 +46,22 @@ def format_size(size: int) -> str:
 def format_mib(size: int) -> str:
     """A memory limit for people, rounded up to whole MiB: `512MiB`. `parse_size` reads it back."""
     return f"{-(-size // 2**20)}MiB"
+
+
+def smaller_words(size: int, of: int) -> str:
+    """How much smaller or larger `size` bytes are than `of` bytes, in percent.
+
+    >>> smaller_words(250, 1000), smaller_words(1423, 1000)
+    ('75.0 % smaller', '42.3 % larger')
+    """
+    share = 100.0 * (1.0 - size / of)
+    return f"{share:.1f} % smaller" if share >= 0 else f"{-share:.1f} % larger"
+
+
+def times_words(ratio: float, digits: int = 2) -> str:
+    """How many times smaller or larger a file is that goes `ratio` times into another.
+
+    >>> times_words(4.0), times_words(1 / 3, 1)
+    ('4.00 times smaller', '3.0 times larger')
+    """
+    return f"{ratio:.{digits}f} times smaller" if ratio >= 1 else f"{1 / ratio:.{digits}f} times larger"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Generator, Iterator
 from dataclasses import replace
@@ -12,7 +13,6 @@ from typing import Any
 import pytest
 
 from fits import use_fit
-from flexgs_edge.io import converter
 from flexgs_edge.methods.best.effort import EFFORTS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -50,6 +50,24 @@ def fox_dir(scenes_dir: Path) -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def wild() -> Path:
+    """Files that other programs wrote, outside the repository: FLEXGS_WILD, by default `../shared/wild`."""
+    folder = Path(os.environ.get("FLEXGS_WILD", REPOSITORY.parent / "shared" / "wild"))
+    if not folder.is_dir():
+        pytest.skip(f"no files of other programs at {folder}: set FLEXGS_WILD to a folder that has them")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def node_modules() -> Path:
+    """Programs of the npm registry that read splat files: FLEXGS_NODE_MODULES, by default `.node/node_modules`."""
+    folder = Path(os.environ.get("FLEXGS_NODE_MODULES", REPOSITORY / ".node" / "node_modules"))
+    if not folder.is_dir() or shutil.which("node") is None:
+        pytest.skip(f"no node, or no packages at {folder}: deploy/test.sh installs them where npm is there")
+    return folder
+
+
 @pytest.fixture
 def compact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Views hold what they show, with room for few rows at first, in chunks of 64 rows."""
@@ -62,12 +80,6 @@ def short_searches() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(EFFORTS, "fast", replace(EFFORTS["fast"], steps=1, close=1.0))
         yield
-
-
-@pytest.fixture
-def without_converter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine that lacks the package which converts scenes."""
-    monkeypatch.setattr(converter, "CONVERTER", "gaussforge_that_nobody_has")
 
 
 @pytest.fixture

@@ -126,7 +126,7 @@ def decode(file: bytes | bytearray | memoryview | StrPath) -> Scene:
         If the file does not follow the format.
     """
     if isinstance(file, (str, os.PathLike)):
-        return Scene(checked_scene(open_fgs(file), Path(file)))
+        return Scene(replace(checked_scene(open_fgs(file), Path(file)), file_bytes=os.stat(file).st_size))
     # A container opens its file for each read, so bytes need a file as long as the source lives.
     folder = tempfile.TemporaryDirectory(prefix="flexgs-")
     try:

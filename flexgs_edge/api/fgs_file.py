@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -108,11 +108,11 @@ class FgsFile:
         if start == stop:
             raise InputError(f"{self.path}: this layer is empty")
         source = whole.source.select(np.arange(start, stop))
-        return Scene(CheckedScene(self.path, source, source.count, whole.settings))
+        return Scene(CheckedScene(self.path, source, source.count, source.sh_degree, whole.settings))
 
     @cached_property
     def _whole(self) -> CheckedScene:
-        return checked_scene(open_fgs(self.path), self.path)
+        return replace(checked_scene(open_fgs(self.path), self.path), file_bytes=self.path.stat().st_size)
 
     def __repr__(self) -> str:
         return f"FgsFile({str(self.path)!r}: version {self.version}, {self.count} Gaussians)"

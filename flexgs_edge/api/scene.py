@@ -12,6 +12,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import choose_origin, origin_rows
+from flexgs_edge.io.reading import Reading
 from flexgs_edge.run.companions import companions_of
 from flexgs_edge.run.inputs import CheckedScene, checked_scene, load_scene
 from flexgs_edge.run.open_bench import open_bench
@@ -36,7 +37,15 @@ class Scene:
         self.checked = checked
 
     @classmethod
-    def open(cls, path: StrPath, *, drop_invalid: bool = False) -> Scene:
+    def open(
+        cls,
+        path: StrPath,
+        *,
+        drop_invalid: bool = False,
+        frame: str | None = None,
+        lod: int | None = None,
+        sh_degree: int | None = None,
+    ) -> Scene:
         """Open a scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`) or a model folder.
 
         Parameters
@@ -45,6 +54,13 @@ class Scene:
             The file or folder. `compress` finds cameras and photos beside it, as on the command line.
         drop_invalid : bool
             Leave out Gaussians with NaN, infinity or zero quaternions. Default: raise `InputError` for them.
+        frame : str, optional
+            Directions of the file's axes, such as `RUB` (x right, y up, z back). The scene has them in RDF. Default: as the
+            file says, else as its format has it.
+        lod : int, optional
+            Level of detail of a streamed scene, 0 is the finest. Default: the finest that is there.
+        sh_degree : int, optional
+            Leave out SH above this degree. Default: keep all.
 
         Raises
         ------
@@ -53,7 +69,7 @@ class Scene:
         FormatError
             If the file does not follow its format.
         """
-        return cls(load_scene(path, drop_invalid))
+        return cls(load_scene(path, drop_invalid, Reading.of(frame, lod, sh_degree)))
 
     @classmethod
     def from_arrays(
@@ -111,7 +127,8 @@ class Scene:
         planes["means"] = _plane(places.astype(np.float64) - origin[:, None] if origin.any() else places)
         source = MemorySource(planes, origin=origin)
         checked = checked_scene(source, drop_invalid=drop_invalid)
-        return cls(CheckedScene(None, checked.source, count, {"antialiased": True} if antialiased else {}))
+        settings = {"antialiased": True} if antialiased else {}
+        return cls(CheckedScene(None, checked.source, count, checked.source.sh_degree, settings))
 
     @property
     def count(self) -> int:

@@ -43,7 +43,11 @@ class CompressWords(TypedDict, total=False):
     background: tuple[float, float, float] | None
     extent: str | None
     antialiased: bool | None
+    up: tuple[float, float, float] | None
     drop_invalid: bool
+    frame: str | None
+    lod: int | None
+    sh_degree: int | None
     memory_limit: int | None
     device: str | None
     method: str
@@ -67,6 +71,7 @@ class CompressWords(TypedDict, total=False):
     views_margin: bool
     refit: bool
     distil: int | None
+    spz_version: int
     layers: int
     scratch: str | None
     resume: bool

@@ -1,4 +1,4 @@
-"""A scene in small, for placing cameras: its robust middle and extent, a grid of matter, and a sample of rows to be seen.
+"""A scene in small, for placing cameras: where its parts lie, a grid of matter, and a sample of rows to be seen.
 
 All positions are relative to the source's origin.
 """
@@ -12,25 +12,29 @@ from typing import Protocol
 
 import numpy as np
 
+from flexgs_edge.cameras.matter import Matter, spread_matter
 from flexgs_edge.constants import SH_C1, SH_C2, SH_C3
-from flexgs_edge.errors import InputError
 
-SAMPLE_ROWS = 1 << 16
-"""Rows for middle, extent and grid."""
-WITNESSES = 1500
+SAMPLE_ROWS = 1 << 15
+"""Rows for parts, grid and ground."""
+WITNESSES = 1200
 """Rows that judge candidates (the witnesses)."""
-GRID = 40
-"""Cells of the matter grid along its longest side."""
 BOX = (0.01, 0.99)
 """Quantiles of the positions that the grid spans."""
+BOX_REACH = 20.0
+"""The grid ends at so many half sides of the box of the first part."""
 BULK = (0.05, 0.95)
-"""Quantiles of the positions for middle and extent."""
-MARCH = 24
-"""Steps of a line of sight through the grid."""
-SPREAD_POINTS = 16
-"""Points over which the matter of a splat is spread if it is wider than a cell."""
-SKIN = 3.0
-"""Cells at the end of a line of sight that belong to the surface it looks at."""
+"""Quantiles of the positions for the middle and the box of a part."""
+OWN_SIZE = 2.0
+"""The box of a part reaches so many usual deviations beyond its positions: a single splat has a box too."""
+SMALLER = 0.5
+"""The core is the half of the matter that is nearest to the middle, if its box is smaller than this share of the whole."""
+RESTS = 3
+"""So often we look for a cluster in what remains outside a core."""
+APART = 3.0
+"""A cluster is a part of its own if it is so many times farther from all others than their extents together."""
+PRECISION = 1e-5
+"""Smallest half side of a box over its distance from the origin: float32 positions have 7 digits."""
 SH_FLOOR = 0.01
 """Rows with a weaker view-dependent colour, on average, do not tell directions."""
 
@@ -47,128 +51,231 @@ class Gaussians(Protocol):
         """Read some rows: {field: [width, n] f32}."""
 
 
-@dataclass
-class Witnesses:
-    """A scene in small.
+@dataclass(frozen=True)
+class Part:
+    """The box of some of the Gaussians: all of them, a dense core, or a cluster apart.
 
     Attributes
     ----------
     middle : np.ndarray
         [3] f64, opacity-weighted median.
     half : np.ndarray
-        [3] f64, half the sides of the box from the 5 % to the 95 % quantile.
-    corner, cell : np.ndarray, float
-        [3] f64 first corner and side of the grid's cells.
-    depth : np.ndarray
-        [x + 2, y + 2, z + 2] f64, optical depth of a cell along its side; a rim of empty cells.
-    smooth : np.ndarray
-        [-1] f64, `depth` averaged over 3 cells each way: lines of sight in steps of some cells do not miss thin walls.
+        [3] f64, half the sides of the box from the 5 % to the 95 % quantile, and some deviations more.
+    """
+
+    middle: np.ndarray
+    half: np.ndarray
+
+    @property
+    def extent(self) -> float:
+        """Half the diagonal of the box, scene units."""
+        return float(np.sqrt((self.half * self.half).sum()))
+
+
+@dataclass(frozen=True)
+class Witnesses:
+    """A scene in small.
+
+    Attributes
+    ----------
+    parts : list of Part
+        Boxes that cameras may stand in and around. The first is that of the whole scene.
+    matter : Matter
+        Optical density on a grid.
+    sample : Splats
+        Every k-th row, at most SAMPLE_ROWS.
+    share : float
+        Rows of the scene that a witness stands for.
     means : np.ndarray
         [3, M] f64.
     weights : np.ndarray
         [M] f64, opacities.
     sizes : np.ndarray
         [M] f64, geometric mean of the two largest deviations.
+    faces : np.ndarray
+        [3, 3, M] f64, the splat's axes (columns), each times the two deviations across it.
+    skin : np.ndarray
+        [M] f64, what belongs to the witness' own surface, scene units.
     sh : np.ndarray
         [3, K, M] f64, coefficients of degrees 1 to 3 over their root mean square over all directions.
     tells : np.ndarray
         [M] bool, rows whose SH tell from where they were trained.
     """
 
-    middle: np.ndarray
-    half: np.ndarray
-    corner: np.ndarray
-    cell: float
-    depth: np.ndarray
-    smooth: np.ndarray
+    parts: list[Part]
+    matter: Matter
+    sample: Splats
+    share: float
     means: np.ndarray
     weights: np.ndarray
     sizes: np.ndarray
+    faces: np.ndarray
+    skin: np.ndarray
     sh: np.ndarray
     tells: np.ndarray
 
     @property
-    def extent(self) -> float:
-        """Half the diagonal of the box, scene units."""
-        return float(np.linalg.norm(self.half))
+    def whole(self) -> Part:
+        """The box of the whole scene."""
+        return self.parts[0]
 
     def thinned(self, step: int) -> Witnesses:
         """A copy with every `step`-th witness."""
         part = slice(None, None, step)
         return replace(
             self,
+            share=self.share * self.weights.size / max(1, self.weights[part].size),
             means=self.means[:, part],
             weights=self.weights[part],
             sizes=self.sizes[part],
+            faces=self.faces[:, :, part],
+            skin=self.skin[part],
             sh=self.sh[:, :, part],
             tells=self.tells[part],
         )
 
-    def optical_depth(self, points: np.ndarray) -> np.ndarray:
-        """[n] f64, optical depth of the cells at `points` ([3, n]); 0 outside the grid."""
-        places = (points - self.corner[:, None]) / self.cell + 1
-        x, y, z = (np.clip(line, 0, n - 1).astype(np.int64) for line, n in zip(places, self.depth.shape))
-        found: np.ndarray = self.depth[x, y, z]
-        return found
+    def areas(self, lines: np.ndarray) -> np.ndarray:
+        """[P, M] f64, what each witness covers across `lines` ([3, P, M], unit vectors), in deviations squared."""
+        total = np.zeros(lines.shape[1:])
+        for axis in range(3):
+            x, y, z = self.faces[:, axis]
+            total += (lines[0] * x + lines[1] * y + lines[2] * z) ** 2
+        areas: np.ndarray = np.sqrt(total)
+        return areas
 
-    def transmittance(self, eye: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """[n] f64, the share of light from `ends` ([3, n]) that reaches `eye` ([3])."""
-        shape = np.array(self.depth.shape)
-        start = (eye - self.corner) / self.cell + 1
-        lines = (ends - eye[:, None]) / self.cell
-        length = np.linalg.norm(lines, axis=0)
-        # From the point where the line enters the grid to where it leaves it, or to the surface it looks at.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            sides = np.stack([-start[:, None] / lines, (shape - start)[:, None] / lines])
-        sides = np.where(np.isnan(sides), 0.0, sides)
-        first = np.clip(sides.min(axis=0).max(axis=0), 0.0, 1.0)
-        last = np.minimum(sides.max(axis=0).min(axis=0), 1 - SKIN / np.maximum(length, SKIN))
-        inside = np.maximum(last - first, 0.0)
-        steps = first + inside * ((np.arange(MARCH) + 0.5) / MARCH)[:, None]
-        x, y, z = (np.floor(begin + line * steps).astype(np.int64) for begin, line in zip(start, lines))
-        cells = np.take(self.smooth, (x * shape[1] + y) * shape[2] + z, mode="clip")
-        clear: np.ndarray = np.exp(-cells.mean(axis=0) * inside * length)
-        return clear
+    def transmittance(self, eyes: np.ndarray) -> np.ndarray:
+        """[P, M] f64, the share of light from each witness that reaches `eyes` ([3, P])."""
+        return self.matter.transmittance(eyes, self.means, self.skin)
 
     def agreement(self, eye: np.ndarray) -> np.ndarray:
         """[M] f64, view-dependent colour towards `eye` over its mean over all directions.
 
         It is 1 for rows that do not tell directions.
         """
+        if not self.tells.any():
+            return np.ones(self.weights.size)
         lines = self.means - eye[:, None]
-        lines /= np.maximum(np.linalg.norm(lines, axis=0), 1e-12)
+        lines /= np.maximum(np.sqrt((lines * lines).sum(axis=0)), 1e-300)
         basis = sh_basis(lines, self.sh.shape[1])
-        strength = np.sqrt(np.square(np.einsum("ckm,km->cm", self.sh, basis)).sum(axis=0))
+        strength = np.sqrt(np.square((self.sh * basis).sum(axis=1)).sum(axis=0))
         return np.where(self.tells, np.minimum(strength, 3.0), 1.0)
 
 
-def gather_witnesses(source: Gaussians) -> Witnesses:
-    """Read a sample of a scene (every k-th row, at most 65536).
+@dataclass(frozen=True)
+class Splats:
+    """A sample of rows.
 
-    Raises
-    ------
-    InputError
-        If the Gaussians have no extent.
+    Attributes
+    ----------
+    means : np.ndarray
+        [3, n] f64.
+    opacity : np.ndarray
+        [n] f64.
+    deviations : np.ndarray
+        [3, n] f64, along the splat's axes.
+    turns : np.ndarray
+        [3, 3, n] f64, columns are the splat's axes.
     """
+
+    means: np.ndarray
+    opacity: np.ndarray
+    deviations: np.ndarray
+    turns: np.ndarray
+
+    @staticmethod
+    def read(source: Gaussians, rows: np.ndarray) -> Splats:
+        """Read `rows` of a scene."""
+        planes = source.read(rows, ["means", "opacity_logits", "log_scales", "quats"])
+        logits = np.clip(planes["opacity_logits"][0].astype(np.float64), -40, 40)
+        # Clipped well inside float64's exponents, so that squares and products stay finite.
+        deviations = np.exp(np.clip(planes["log_scales"].astype(np.float64), -40, 40))
+        opacity = 1 / (1 + np.exp(-logits))
+        return Splats(planes["means"].astype(np.float64), opacity, deviations, rotations(planes["quats"]))
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """[n] f64, geometric mean of the two largest deviations."""
+        ordered = np.sort(self.deviations, axis=0)
+        sizes: np.ndarray = np.sqrt(ordered[1] * ordered[2])
+        return sizes
+
+
+def gather_witnesses(source: Gaussians) -> Witnesses:
+    """Read a sample of a scene: every k-th row. Any scene with at least one Gaussian will do."""
     rows = np.arange(0, source.count, max(1, -(-source.count // SAMPLE_ROWS)))
-    sample = source.read(rows, ["means", "opacity_logits", "log_scales", "quats"])
-    means = sample["means"].astype(np.float64)
-    opacity = 1 / (1 + np.exp(-sample["opacity_logits"][0].astype(np.float64)))
-    # Clipped well inside float64's exponents, so that squares and products stay finite.
-    deviations = np.exp(np.sort(np.clip(sample["log_scales"].astype(np.float64), -40, 40), axis=0))
-    sizes = np.sqrt(deviations[1] * deviations[2])
-    low, middle, high = weighted_quantiles(means, opacity, (BULK[0], 0.5, BULK[1]))
-    half = (high - low) / 2
-    floor = max(float(half.max()), float(np.median(sizes)))
-    if not floor > 0:
-        raise InputError(f"{source.name}: automatic cameras: the Gaussians have no extent; give cameras")
-    corner, cell, depth = _grid(sample, opacity, deviations, source.count / rows.size)
+    sample = Splats.read(source, rows)
+    sizes = sample.sizes
+    parts = find_parts(sample.means, sizes, sample.opacity)
+    near = _nearest_half(sample.means, sample.opacity, parts[0].middle)
+    core = part_of(sample.means[:, near], sizes[near], sample.opacity[near])
+    matter = spread_matter(
+        sample.means,
+        sample.turns * sample.deviations,
+        sample.opacity * (source.count / rows.size),
+        _grid_box(sample, parts[0]),
+        (core.middle, core.extent),
+    )
     picked = np.arange(0, rows.size, max(1, -(-rows.size // WITNESSES)))
     sh, tells = _directions(source, rows[picked])
+    means = sample.means[:, picked]
+    a, b, c = sample.deviations[:, picked]
+    faces = sample.turns[:, :, picked] * np.stack([b * c, a * c, a * b])
     return Witnesses(
-        middle, np.maximum(half, 0.05 * floor), corner, cell, depth, _smooth(depth),
-        means[:, picked], opacity[picked], sizes[picked], sh, tells,
+        parts, matter, sample, source.count / picked.size,
+        means, sample.opacity[picked], sizes[picked], faces, matter.skin(means), sh, tells,
     )  # fmt: skip
+
+
+def find_parts(means: np.ndarray, sizes: np.ndarray, weights: np.ndarray) -> list[Part]:
+    """The whole scene, its core if that is much smaller, then clusters far apart.
+
+    A trained scene often has a dense middle, which cameras went around, and a thin background that reaches far. A box
+    of the whole does not show where the middle is.
+    """
+    whole = part_of(means, sizes, weights)
+    parts, chosen = [whole], np.arange(weights.size)
+    for turn in range(1 + RESTS):
+        part = part_of(means[:, chosen], sizes[chosen], weights[chosen])
+        near = _nearest_half(means[:, chosen], weights[chosen], part.middle)
+        half = chosen[near]
+        for box in (part, part_of(means[:, half], sizes[half], weights[half])):
+            if box.extent < SMALLER * whole.extent and (turn == 0 or all(_apart(box, other) for other in parts[1:])):
+                parts.append(box)
+                break
+        chosen = chosen[~near]
+        if not chosen.size:
+            break
+    return parts
+
+
+def _apart(one: Part, other: Part) -> bool:
+    away = one.middle - other.middle
+    return math.sqrt(float((away * away).sum())) > APART * (one.extent + other.extent)
+
+
+def part_of(means: np.ndarray, sizes: np.ndarray, weights: np.ndarray) -> Part:
+    """The box of some Gaussians: `means` [3, n], `sizes` and `weights` [n]."""
+    low, middle, high = weighted_quantiles(means, weights, (BULK[0], 0.5, BULK[1]))
+    half = (high - low) / 2 + OWN_SIZE * float(weighted_quantiles(sizes[None], weights, (0.5,))[0, 0])
+    least = max(0.05 * float(half.max()), PRECISION * float(np.abs(middle).max()))
+    return Part(middle, np.maximum(half, least))
+
+
+def _nearest_half(means: np.ndarray, weights: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """[n] bool, the Gaussians nearest to the middle that have half the weight."""
+    away = means - middle[:, None]
+    order = np.argsort((away * away).sum(axis=0), kind="stable")
+    total = np.cumsum(weights[order])
+    near = np.zeros(weights.size, bool)
+    near[order[: int(np.searchsorted(total, 0.5 * total[-1])) + 1]] = True
+    return near
+
+
+def _grid_box(sample: Splats, whole: Part) -> tuple[np.ndarray, np.ndarray]:
+    low, high = weighted_quantiles(sample.means, np.ones(sample.opacity.size), BOX)
+    low, high = np.minimum(low, whole.middle - whole.half), np.maximum(high, whole.middle + whole.half)
+    reach = BOX_REACH * float(whole.half.max())
+    return np.maximum(low, whole.middle - reach), np.minimum(high, whole.middle + reach)
 
 
 def weighted_quantiles(values: np.ndarray, weights: np.ndarray, shares: Sequence[float]) -> np.ndarray:
@@ -180,40 +287,6 @@ def weighted_quantiles(values: np.ndarray, weights: np.ndarray, shares: Sequence
         at = np.searchsorted(total, np.asarray(shares) * total[-1])
         result[:, row] = line[places[np.minimum(at, len(places) - 1)]]
     return result
-
-
-def _grid(
-    sample: dict[str, np.ndarray], opacity: np.ndarray, deviations: np.ndarray, share: float
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """First corner, cell side, and optical depth of each cell along its side, with a rim of empty cells.
-
-    The matter of a splat is its opacity times its mean cross-section. If a splat is wider than a cell, its matter is
-    spread over points drawn from it. It is cut if even these would fill more than a cell each. Each row stands for
-    `share` rows.
-    """
-    means = sample["means"].astype(np.float64)
-    low, high = np.quantile(means, BOX, axis=1)
-    cell = max(float((high - low).max()) / GRID, 1e-9 * float(np.abs(means).max()), 1e-30)
-    shape = np.floor((high - low) / cell).astype(np.int64) + 2
-    low = low - cell / 2
-    a, b, c = deviations
-    matter = opacity * 2 * math.pi / 3 * (a * b + b * c + a * c) * share / (cell * cell)
-    wide = c > cell
-    depth = np.zeros(tuple(int(n) for n in shape))
-
-    def add(points: np.ndarray, amounts: np.ndarray) -> None:
-        index = np.floor((points - low[:, None]) / cell).astype(np.int64)
-        inside = ((index >= 0) & (index < shape[:, None])).all(axis=0)
-        np.add.at(depth, tuple(index[:, inside]), amounts[inside])
-
-    add(means[:, ~wide], matter[~wide])
-    axes = rotations(sample["quats"][:, wide]) * np.exp(
-        np.clip(sample["log_scales"][:, wide].astype(np.float64), -40, 40)
-    )
-    part = np.minimum(matter[wide] / SPREAD_POINTS, opacity[wide] * share)
-    for offset in np.random.default_rng(0).normal(size=(SPREAD_POINTS, 3)):
-        add(means[:, wide] + np.einsum("xyn,y->xn", axes, offset), part)
-    return low, cell, np.pad(depth, 1)
 
 
 def rotations(quats: np.ndarray) -> np.ndarray:
@@ -229,13 +302,6 @@ def rotations(quats: np.ndarray) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-def _smooth(depth: np.ndarray) -> np.ndarray:
-    """[-1] f64, the mean over 3 cells along each axis; the rim is empty, so that nothing wraps around."""
-    for axis in range(3):
-        depth = (np.roll(depth, 1, axis) + depth + np.roll(depth, -1, axis)) / 3
-    return depth.reshape(-1)
 
 
 def _directions(source: Gaussians, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

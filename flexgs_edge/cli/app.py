@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import signal
 import sys
@@ -16,7 +15,8 @@ import click
 from flexgs_edge._version import __version__
 from flexgs_edge.cli.lazy_group import LazyGroup
 from flexgs_edge.cli.talk import State
-from flexgs_edge.errors import FlexGSError, InputError
+from flexgs_edge.errors import InputError
+from flexgs_edge.run.failure import failure_of
 
 COMMANDS = {
     "compress": "Make a scene smaller: to a quality or to a size.",
@@ -32,8 +32,6 @@ COMMANDS = {
     "devices": "List the OpenCL devices, and say which one is used.",
 }
 """Subcommands and the first sentence of their help. They are repeated here so that `--help` imports no subcommand."""
-
-_DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 @click.group(
@@ -100,21 +98,8 @@ def _exit_code(error: BaseException) -> int:
     if isinstance(error, click.ClickException):
         error.show()
         return InputError.exit_code
-    if isinstance(error, FlexGSError):  # before MemoryError, because a BudgetError is also one
-        return _say(f"error: {error}", error.exit_code)
-    if isinstance(error, MemoryError):
-        return _say(
-            "error: out of memory: set --memory-limit to less than the machine has, so that work is cut into parts", 5
-        )
-    if isinstance(error, OSError) and error.errno in _DISK_FULL:
-        return _say(f"error: the disk is full ({error}); free some space or write elsewhere", 5)
-    if isinstance(error, OSError) and error.filename is not None:
-        return _say(f"error: {error.filename}: {error.strerror}", InputError.exit_code)
-    name = type(error).__name__
-    return _say(
-        f"internal error: {name}: {error}; this is a fault of flexgs-edge: please report it with the output of --debug",
-        1,
-    )
+    found = failure_of(error)
+    return _say(found.line, found.exit_code)
 
 
 def _say(text: Any, code: int) -> int:

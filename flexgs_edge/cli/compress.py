@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
 from flexgs_edge.cli import shared_options, talk, value_types
 from flexgs_edge.cli.help_page import EFFORT, MACHINES, METHOD, OUTPUT, VIEWS, ExpertCommand, option
+
+if TYPE_CHECKING:
+    from flexgs_edge.progress import Progress
+    from flexgs_edge.report.batch_result import BatchResult
+    from flexgs_edge.run.options import CompressOptions
 
 REACH = "What to reach (give one target; default: --max-drop 1.0)"
 USUAL = (
@@ -45,11 +50,21 @@ More examples:
       draws views in two processes
   flexgs-edge compress big.ply -o big.fgs --memory-limit 1GiB --scratch /data/tmp --resume
       for a scene larger than memory; goes on after an interruption
+  flexgs-edge compress scans/ garden/ -o small/ --format .spz
+      every scene that lies in scans, and the model folder garden
+
+\b
+Several scenes:
+  A folder stands for the scenes directly in it: files, model folders, SOG folders.
+  Targets hold for each scene. A scene that fails does not stop the others.
+  a.ply becomes OUT/a.fgs. Scenes of the same name keep their suffix (a.ply.fgs,
+  a.spz.fgs), then get their folders' names in front (x-a.ply.fgs, y-a.ply.fgs).
+  --json writes one list. Exit code 2: a scene failed. 1: by a fault of ours.
 """
 
 
 @click.command(cls=ExpertCommand, usual=USUAL, more=MORE)
-@shared_options.scene_argument
+@click.argument("inputs", metavar="INPUT...", type=click.Path(), nargs=-1, required=True)
 @option(
     REACH,
     "--max-drop",
@@ -72,8 +87,15 @@ More examples:
     help="With one of the two above: no view may lose more.",
 )
 @option(REACH, "--max-size", type=value_types.SIZE, help="Best quality in at most this size, such as 8MB or 8MiB.")
-@option(REACH, "--min-ratio", metavar="R", type=float, help="Best quality in a file R times smaller than the .ply.")
+@option(
+    REACH,
+    "--min-ratio",
+    metavar="R",
+    type=float,
+    help="Best quality in 1/R of the scene's bytes as a .ply.",
+)
 @option(REACH, "--best-effort", is_flag=True, help="If the target cannot be met, write the closest result.")
+@shared_options.reading_options
 @shared_options.photos_options
 @option(
     VIEWS,
@@ -115,7 +137,14 @@ More examples:
     help="Draw views in N processes here (local:N) or on a Dask cluster, such as tcp://HOST:8786. Needs "
     "pip install 'flexgs-edge[cluster]'. The bytes stay the same.",
 )
-@option(OUTPUT, "-o", "--output", metavar="OUT", help="File to write: .fgs, .spz, .sog or .compressed.ply.")
+@option(OUTPUT, "-o", "--output", metavar="OUT", help="File (.fgs, others: docs/formats.md), or a folder OUT/.")
+@option(
+    OUTPUT,
+    "--format",
+    metavar="SUFFIX",
+    help="Format of the files in a folder OUT/, such as .spz. Default: .fgs.",
+)
+@shared_options.spz_version_option
 @option(
     OUTPUT,
     "--layers",
@@ -205,28 +234,56 @@ More examples:
     help="Ranges of each channel. More: better, larger files. Default: one for about 512 Gaussians.",
 )
 @shared_options.run_options
-def command(input: str, output: str | None, json_path: str | None, quiet: bool, **options: Any) -> None:
+def command(
+    inputs: tuple[str, ...], output: str | None, format: str | None, json_path: str | None, quiet: bool, **options: Any
+) -> None:
     """Make a scene smaller: to a quality or to a size.
 
     INPUT is a .ply, .fgs, .spz, .sog or .compressed.ply file, or the folder that 3DGS training writes. Cameras and photos
-    beside it are used.
+    beside it are used. Several scenes, or a folder of them, are written to a folder OUT/.
 
     \b
     Examples:
       flexgs-edge compress point_cloud.ply -o scene.fgs
       flexgs-edge compress output/garden -o garden.fgs --images data/garden/images_4
       flexgs-edge compress point_cloud.ply -o scene.fgs --max-size 8MB
-      flexgs-edge compress point_cloud.ply -o scene.fgs --effort fast  # faster, larger
-      flexgs-edge compress point_cloud.ply -o scene.spz  # needs flexgs-edge[formats]
+      flexgs-edge compress a.ply b.ply scans/ -o small/ --effort fast  # faster, larger
     Measured times and sizes: docs/results/speed.md
     Exit code 3: the target cannot be met; the message names the closest result.
     """
     progress = talk.start(quiet, json_path, options["force"], options["report"])
     from flexgs_edge.commands.compress import compress
+    from flexgs_edge.run.batch import is_batch, single_output
     from flexgs_edge.run.options import METHOD_ONLY, CompressOptions, check_method
 
     # An option that the user typed counts as given, even if it equals the default.
     source = click.get_current_context().get_parameter_source
     check_method(options["method"], [name for name in METHOD_ONLY if source(name) is ParameterSource.COMMANDLINE])
-    result = compress(input, output, CompressOptions(**options), progress)
-    talk.emit(result.summary(), result.to_json(), json_path, options["force"])
+    settings = CompressOptions(**options)
+    if is_batch(inputs, output):
+        _compress_all(inputs, output, settings, format, progress, json_path)
+        return
+    result = compress(inputs[0], single_output(output, format, settings.dry_run), settings, progress)
+    talk.emit(result.summary(), result.to_json(), json_path, settings.force)
+
+
+def _compress_all(
+    inputs: tuple[str, ...],
+    output: str | None,
+    settings: CompressOptions,
+    format: str | None,
+    progress: Progress,
+    json_path: str | None,
+) -> None:
+    """Compress several scenes. What is done is told even if the run is interrupted."""
+    from flexgs_edge.commands.compress_all import compress_all
+
+    so_far: list[BatchResult] = []
+    try:
+        result = compress_all(inputs, output, settings, progress, format, so_far.append)
+    except (KeyboardInterrupt, SystemExit):
+        for last in so_far[-1:]:
+            talk.emit(last.summary(), last.to_json(), json_path, settings.force)
+        raise
+    talk.emit(result.summary(), result.to_json(), json_path, settings.force)
+    click.get_current_context().exit(result.exit_code)

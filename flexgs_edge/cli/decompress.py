@@ -15,8 +15,10 @@ from flexgs_edge.cli import help_page, shared_options, talk
     "--output",
     metavar="OUT",
     required=True,
-    help="File to write: .ply, .spz, .sog or .compressed.ply.",
+    help="File to write: .ply, .spz, .sog, .compressed.ply, .splat or .glb.",
 )
+@shared_options.spz_version_option
+@shared_options.reading_options
 @help_page.option(
     help_page.DEVICE,
     "--device",
@@ -29,6 +31,10 @@ from flexgs_edge.cli import help_page, shared_options, talk
 def command(
     input: str,
     output: str,
+    spz_version: int,
+    frame: str | None,
+    lod: int | None,
+    sh_degree: int | None,
     device: str | None,
     memory_limit: int | None,
     force: bool,
@@ -43,8 +49,8 @@ def command(
     A .ply has INRIA's layout: x y z, normals (zero), colours, opacity, scales and rotations, as 32-bit floats, little endian.
     Gaussians without view-dependent colour get zeros for it.
 
-    Formats of other programs need pip install 'flexgs-edge[formats]', and round values in their own ways. To make such a file
-    smaller, and to see what is lost, use compress.
+    Formats of other programs round values in their own ways. To make such a file smaller, and to see what is lost, use
+    compress.
 
     \b
     Examples:
@@ -55,6 +61,8 @@ def command(
     """
     talk.start(quiet, json_path, force)
     from flexgs_edge.commands.decompress import decompress
+    from flexgs_edge.io.reading import Reading
 
-    result = decompress(input, output, force, memory_limit, device)
+    reading = Reading.of(frame, lod, sh_degree)
+    result = decompress(input, output, force, memory_limit, device, reading, spz_version)
     talk.emit(result.summary(), result.to_json(), json_path, force)

@@ -9,6 +9,7 @@ import click
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
+INPUT = "Input"
 VIEWS = "Views"
 EFFORT = "Effort"
 DEVICE = "Memory and device"
@@ -19,7 +20,7 @@ METHOD = "Method"
 FAULTS = "Faults"
 HELP = "Help"
 
-_LAST = (VIEWS, EFFORT, DEVICE, MACHINES, OUTPUT, METHOD, f"{METHOD} best", f"{METHOD} paper", FAULTS, HELP)
+_LAST = (INPUT, VIEWS, EFFORT, DEVICE, MACHINES, OUTPUT, METHOD, f"{METHOD} best", f"{METHOD} paper", FAULTS, HELP)
 """Order of the headings that commands share. A command's own headings come before them."""
 _NAMES_WIDTH = 22
 """Width of the column of option names. A longer name gets its own line, so that texts keep their width."""

@@ -22,6 +22,7 @@ from flexgs_edge.cli import help_page, shared_options, talk, value_types
     help="Views to draw, counted from 0 in order of name: a list such as 0,8,16, or START:STOP:STEP such as 0:50:8. "
     "Default: all.",
 )
+@shared_options.reading_options
 @shared_options.drawing_options
 @shared_options.drop_invalid_option
 @shared_options.run_options

@@ -21,6 +21,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
     help="gs: opacity * volume^0.1 * pixels hit. meson: volume^0.1 * summed weights.",
 )
 @shared_options.photos_options
+@shared_options.reading_options
 @shared_options.drawing_options
 @shared_options.drop_invalid_option
 @shared_options.run_options

@@ -4,12 +4,45 @@ from __future__ import annotations
 
 import click
 
-from flexgs_edge.cli.help_page import DEVICE, FAULTS, OUTPUT, VIEWS, option, stack
+from flexgs_edge.cli.help_page import DEVICE, FAULTS, INPUT, OUTPUT, VIEWS, option, stack
 from flexgs_edge.cli.talk import set_debug
-from flexgs_edge.cli.value_types import COLOUR, SIZE
+from flexgs_edge.cli.value_types import AXIS, COLOUR, SIZE
 from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, DEFAULT_NEAR, MAX_VIEW_WIDTH
 
 scene_argument = click.argument("input", metavar="INPUT", type=click.Path())
+reading_options = stack(
+    option(
+        INPUT,
+        "--frame",
+        metavar="XYZ",
+        help="Where the axes of the file point, if it breaks the rule of its format: R or L, U or D, F or B, such as RUB. "
+        "Default: as the file or its format says (docs/formats.md).",
+    ),
+    option(
+        INPUT,
+        "--lod",
+        metavar="N",
+        type=int,
+        help="Level of a streamed scene (lod-meta.json), 0 is the finest. Default: the finest that is there.",
+    ),
+    option(
+        INPUT,
+        "--sh-degree",
+        metavar="N",
+        type=int,
+        help="Leave out view-dependent colour (SH) above degree N. Default: keep all.",
+    ),
+)
+"""Options of every command that reads a scene with its values."""
+spz_version_option = option(
+    OUTPUT,
+    "--spz-version",
+    metavar="3|4",
+    type=int,
+    default=3,
+    show_default=True,
+    help="Version of a .spz. Older programs read only 3.",
+)
 cameras_option = stack(
     option(
         VIEWS,
@@ -23,6 +56,13 @@ cameras_option = stack(
         "--ignore-distortion",
         is_flag=True,
         help="Use cameras with lens distortion as if they had none. Their photos are not compared. Default: refuse them.",
+    ),
+    option(
+        VIEWS,
+        "--up",
+        type=AXIS,
+        help="Up of automatic views: x, -x, y, -y, z, -z, or three numbers such as 0,-1,0.2. It is a direction in the frame "
+        "of the .ply that decompress writes. Default: what the scene shows, else -y.",
     ),
 )
 images_option = option(
@@ -65,7 +105,8 @@ drawing_options = stack(
         "--near",
         metavar="Z",
         type=float,
-        help=f"Near plane: Gaussians closer than Z scene units are not drawn. Default: the file's, else {DEFAULT_NEAR}.",
+        help=f"Near plane: Gaussians closer than Z scene units are not drawn. Default: the file's, else {DEFAULT_NEAR}, "
+        "or less for automatic views of small scenes.",
     ),
     option(
         VIEWS,

@@ -35,6 +35,9 @@ def start(quiet: bool, json_path: str | None = None, force: bool = False, report
     log.handlers = [handler]
     log.setLevel(logging.WARNING if quiet else logging.INFO)
     log.propagate = False
+    context = click.get_current_context(silent=True)
+    state = None if context is None else context.find_object(State)
+    logging.getLogger(f"{log.name}.tracebacks").setLevel(logging.DEBUG if state and state.debug else logging.WARNING)
     if json_path not in (None, "-"):
         from flexgs_edge.files import check_writable
 
@@ -44,7 +47,7 @@ def start(quiet: bool, json_path: str | None = None, force: bool = False, report
     return Progress(enabled=False if quiet else None)
 
 
-def emit(text: str, record: dict[str, Any], json_path: str | None, force: bool = False) -> None:
+def emit(text: str, record: dict[str, Any] | list[Any], json_path: str | None, force: bool = False) -> None:
     """Print the summary to stdout, and write the JSON. With `--json -` the JSON goes to stdout and the summary to stderr."""
     click.echo(text, nl=False, err=json_path == "-")
     if json_path is None:

@@ -1,7 +1,8 @@
-"""Types of option values: sizes, colours, views."""
+"""Types of option values: sizes, colours, directions, views."""
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -51,6 +52,30 @@ class ColourType(click.ParamType):
         return numbers[0], numbers[1], numbers[2]
 
 
+class AxisType(click.ParamType):
+    """A direction: an axis such as `-y`, or three numbers such as `0,-1,0.2`."""
+
+    name = "AXIS"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float, float]:
+        if isinstance(value, tuple):
+            return value
+        match = re.fullmatch(r"([+-]?)([xyz])", value.strip().lower())
+        if match is not None:
+            length = -1.0 if match[1] == "-" else 1.0
+            x, y, z = (length if axis == match[2] else 0.0 for axis in "xyz")
+            return x, y, z
+        try:
+            numbers = [float(part) for part in value.split(",")]
+        except ValueError:
+            numbers = []
+        if len(numbers) != 3 or not all(math.isfinite(number) for number in numbers) or not any(numbers):
+            self.fail(f"{value!r}: expected x, -x, y, -y, z, -z, or three numbers, not all zero: 0,-1,0.2", param, ctx)
+        return numbers[0], numbers[1], numbers[2]
+
+
 class ViewsType(click.ParamType):
     """Indices of views: a list `0,8,16`, a range `0:50:8`, or a mix of both."""
 
@@ -75,4 +100,4 @@ class ViewsType(click.ParamType):
         return chosen
 
 
-SIZE, COLOUR, VIEWS = SizeType(), ColourType(), ViewsType()
+SIZE, COLOUR, AXIS, VIEWS = SizeType(), ColourType(), AxisType(), ViewsType()

@@ -14,10 +14,12 @@ from flexgs_edge.codec.v2 import container as v2
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import InputError
+from flexgs_edge.files import check_readable
 
 
 def file_version(path: str | os.PathLike[str]) -> int:
     """2 for files of version 2, else 1: the reader of version 1 then says what is wrong with other files."""
+    check_readable(path)
     try:
         with open(path, "rb") as file:
             start = file.read(10)

@@ -16,6 +16,7 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.doubts import doubts
 from flexgs_edge.run.inputs import ScenePlace, scene_info
+from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import CompressOptions
@@ -88,8 +89,12 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
     options, plan, views, search = run.options, run.plan, run.views, made.search
     assert plan is not None
     scored = search.scored if search else None
-    held_out = made.quality.fidelity if made.quality is not None and made.trained is not None else None
+    held_out = None
+    if made.quality is not None and made.trained is not None:
+        held_out = measurement_of(made.quality).figure("fidelity")
     warnings = doubts(views, scored, run.scene.input_count, made.trained, held_out) if views else ()
+    reached = search.reached if search and options.fixed is None else None
+    warnings += _rounding_doubts(run, reached)
     for warning in warnings:
         LOG.warning("warning: %s", warning)
     return CompressResult(
@@ -109,7 +114,7 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
         steps=made.step_sizes.to_json() if made.step_sizes is not None else None,
         target=plan.target.describe() if plan.target else None,
         decided_by=plan.decided_by,
-        reached=search.reached if search and options.fixed is None else None,
+        reached=reached,
         decision_views=plan.kind_of(plan.decide, views),
         search=search,
         sensitivity=made.sensitivity,
@@ -123,5 +128,16 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
         file_sh_degree=made.sh_degree,
         scored=scored,
         training_fidelity=made.trained,
-        warnings=warnings,
+        warnings=(*run.doubts, *warnings),
+    )
+
+
+def _rounding_doubts(run: Run[CompressOptions], reached: bool | None) -> tuple[str, ...]:
+    """Warn if the default target was missed because another program's format rounds more coarsely than it allows."""
+    format, plan = run.output.format, run.plan
+    if format is None or reached is not False or run.options.targets or plan is None or plan.target is None:
+        return ()
+    return (
+        f"{plan.target.describe()} (the default) is out of reach of {format.suffix}, which rounds too coarsely for this scene. "
+        "The closest result was written. A .fgs rounds as finely as the target asks.",
     )

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_writable
-from flexgs_edge.io.converter import check_converter, converter_bytes
 from flexgs_edge.io.exchange import write_foreign
-from flexgs_edge.io.formats import FORMATS, format_of
+from flexgs_edge.io.formats import WRITTEN, written_format
 from flexgs_edge.io.ply import inria_dtype, write_ply
+from flexgs_edge.io.reading import AS_WRITTEN, Reading, Writing
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.report.file_results import DecompressResult
 from flexgs_edge.run.clock import Stopwatch
@@ -29,6 +30,8 @@ def decompress(
     force: bool = False,
     memory_limit: int | None = None,
     device: str | None = None,
+    reading: Reading = AS_WRITTEN,
+    spz_version: int = 3,
 ) -> DecompressResult:
     """Decode a scene to a PLY in INRIA's layout, or convert it to another format.
 
@@ -44,6 +47,10 @@ def decompress(
         Overwrite `output` if it exists. Default: raise `InputError`.
     memory_limit : int, optional
         Bytes for the whole process. Default: three quarters of the free memory.
+    reading : Reading, optional
+        Frame, level of detail and SH degree.
+    spz_version : {3, 4}
+        Version of a `.spz`.
     device : str, optional
         Device that decodes: a processor as `devices` lists it, or `numpy`. Default: see `decoder`.
 
@@ -59,29 +66,30 @@ def decompress(
     FormatError
         If the input does not follow its format.
     """
-    format = format_of(output)
+    format = written_format(output)
     if format is None and Path(output).suffix.lower() != ".ply":
-        raise InputError(f"-o {output}: expected a name that ends in .ply, {', '.join(FORMATS)}")
-    if format is not None:
-        check_converter(output)
+        raise InputError(f"-o {output}: expected a name that ends in .ply, {', '.join(WRITTEN)}")
     check_writable(output, force)
+    writing = Writing(spz_version)
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(memory_limit)
     with clock.stage("open"):
-        scene = load_scene(input)
+        scene = load_scene(input, reading=reading)
+        budget.take("the file's values", scene.held_bytes)
+    antialiased = scene.settings.get("antialiased") is True
     backend = None
     if format is None:
         backend = decoder(device, scene.source, budget, clock)
     with clock.stage("write"):
         if format is not None:
-            budget.require("the converter", converter_bytes(format, scene.source.count))
-            notes = write_foreign(output, scene.source, force=force)
+            budget.require(f"writing a {format.suffix}", format.memory * scene.source.count)
+            notes = write_foreign(output, scene.source, force=force, writing=replace(writing, antialiased=antialiased))
         else:
             row = inria_dtype(scene.source.sh_degree).itemsize
             rows = budget.rows("decoding", WRITE_COPIES * row, minimum=min(scene.source.count, 1024), most=65536)
             with ahead(scene.source, budget, backend):
                 notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
-        if scene.settings.get("antialiased") is True:
+        if antialiased and not (format is not None and format.marks_antialiased):
             notes = (*notes, ANTIALIASED_NOTE)
     size = os.stat(output).st_size
     return DecompressResult(scene_info(scene), os.fspath(output), size, run_info(budget, clock, backend), notes)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.report.info_result import InfoResult
-from flexgs_edge.run.open_scene import open_scene
+from flexgs_edge.run.open_scene import check_fgs, is_fgs, open_file
 
 
 def info(path: str | os.PathLike[str]) -> InfoResult:
@@ -25,28 +25,25 @@ def info(path: str | os.PathLike[str]) -> InfoResult:
         Counts, settings, and the bytes of every channel of a `.fgs`.
     """
     place = Path(path)
-    if place.suffix.lower() == ".fgs":
+    if is_fgs(place):
         # Imported here because it loads the coder, which a .ply does not need.
         from flexgs_edge.run.contents import contents
 
-        if place.is_file():
-            return contents(place)
+        check_fgs(place)
+        return contents(place)
     return _scene_info(place)
 
 
 def _scene_info(path: Path) -> InfoResult:
     # Imported here because they load cameras, options and other formats, which a .fgs does not need.
-    from flexgs_edge.io.formats import format_of
     from flexgs_edge.run.companions import companions_of
 
-    source = open_scene(path)
-    beside = companions_of(path)
-    place = Path(source.name)
-    foreign = format_of(place)
+    opened = open_file(path)
+    source, beside = opened.source, companions_of(path)
     return InfoResult(
         path=source.name,
-        format=(foreign.suffix if foreign else place.suffix.lower()).lstrip("."),
-        size=os.stat(place).st_size,
+        format=opened.suffix.lstrip("."),
+        size=opened.bytes,
         count=source.count,
         sh_count=source.sh_count,
         sh_degree=source.sh_degree,
@@ -55,5 +52,7 @@ def _scene_info(path: Path) -> InfoResult:
         notes=tuple(source.notes),
         cameras=None if beside.cameras is None else os.fspath(beside.cameras),
         images=None if beside.images is None else os.fspath(beside.images),
-        antialiased=getattr(source, "settings", {}).get("antialiased", beside.antialiased),
+        antialiased=source.settings.get("antialiased", beside.antialiased),
+        format_version=opened.version,
+        frame=opened.frame.name,
     )

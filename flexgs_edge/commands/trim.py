@@ -12,6 +12,7 @@ from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_writable
 from flexgs_edge.report.file_results import TrimResult
+from flexgs_edge.run.open_scene import check_fgs
 
 
 def trim(
@@ -51,6 +52,7 @@ def trim(
     check_writable(output, force)
     if Path(input).suffix.lower() != ".fgs":
         raise InputError(f"{input}: expected a .fgs file: only these have layers to cut at")
+    check_fgs(Path(input))
     header = read_header(input)
     if file_version(input) != 2:
         raise InputError(

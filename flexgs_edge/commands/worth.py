@@ -48,7 +48,7 @@ def worth(
     -------
     WorthResult
         The result of `info`, the views, and a record for each change of `reduced_scenes`. A record holds the bytes saved, the
-        fidelity (dB, None if no render changes) and the modelled drop (dB).
+        fidelity (dB, None if no render changes) and the modelled drop (dB), both over the pixels that the file covers.
     """
     options = replace(options or ViewOptions(), images=None, **words)
     place = Path(path)
@@ -76,7 +76,8 @@ def worth(
             saved, less = item.make()
             with renderer.load(less) as drawn:
                 quality = judge.compare(drawn)
-            fidelity = None if quality.fidelity is None else round(quality.fidelity, 4)
-            changes.append(WorthChange(item.channel, item.change, saved, fidelity, round(quality.modelled_drop, 6)))
+            fidelity = None if quality.covered_fidelity is None else round(quality.covered_fidelity, 4)
+            drop = round(quality.covered_modelled_drop, 6)
+            changes.append(WorthChange(item.channel, item.change, saved, fidelity, drop))
     kind = Plan.kind_of(chosen, views)
     return WorthResult(found, views_info(views), len(chosen), kind, base, tuple(changes))

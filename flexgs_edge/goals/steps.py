@@ -131,10 +131,13 @@ def step_words(step: Step, target: Target | None) -> str:
     return f"{step.phase}: prune {step.choice.prune / 1000:g}, SH {step.choice.sh / 1000:g}: {figure}, {step.seconds:.1f} s"
 
 
-def out_of_reach(target: Target, closest: Step) -> TargetError:
-    """The error to raise if no point holds; it names the closest point."""
+def out_of_reach(target: Target, closest: Step, rows: int | None = None) -> TargetError:
+    """The error to raise if no point holds; it names the closest point, and says if a scene of `rows` has one Gaussian there."""
+    last = ""
+    if rows is not None and target.limit_bytes is not None and rows - closest.choice.pruned(rows) == 1:
+        last = ", with one Gaussian left"
     return TargetError(
         f"{target.describe()} cannot be reached: the closest point is {target.report(closest.size, closest.measurement)} "
-        f"(prune rate {closest.choice.prune / 1000:g}, SH rate {closest.choice.sh / 1000:g}); "
+        f"(prune rate {closest.choice.prune / 1000:g}, SH rate {closest.choice.sh / 1000:g}{last}); "
         f"relax the target, or take that point with --best-effort"
     )

@@ -21,6 +21,22 @@ IDENTICAL_DB = 200.0
 
 
 @dataclass(frozen=True)
+class Covered:
+    """Fidelity and modelled drop over the part of the pictures that the original covers, in dB.
+
+    Parameters
+    ----------
+    fidelity : float or None
+        PSNR against the original's renders; `None` if they are identical.
+    modelled_drop : float
+        Drop modelled from that error.
+    """
+
+    fidelity: float | None
+    modelled_drop: float
+
+
+@dataclass(frozen=True)
 class Measurement:
     """Quality of one point of a search, means over the views that decide, in dB.
 
@@ -34,22 +50,28 @@ class Measurement:
         Drop modelled from the error against the original's renders.
     worst : Measurement or None
         Quality of the worst view alone.
+    covered : Covered or None
+        The same figures over covered pixels, which decide in place of the plain ones; `None` if the plain ones decide.
     """
 
     drop: float | None
     fidelity: float | None
     modelled_drop: float
     worst: Measurement | None = None
+    covered: Covered | None = None
 
     def figure(self, figure: Figure) -> float | None:
-        """The figure of this name, dB; `None` if renders are identical or photos are missing."""
-        return {"drop": self.drop, "modelled drop": self.modelled_drop, "fidelity": self.fidelity}[figure]
+        """The figure of this name that decides, dB; `None` if renders are identical or photos are missing."""
+        if figure == "drop":
+            return self.drop
+        decides = self if self.covered is None else self.covered
+        return decides.fidelity if figure == "fidelity" else decides.modelled_drop
 
     def loss(self, figure: Figure) -> float:
-        """The figure of this name as a number that grows as quality falls."""
-        if figure == "fidelity":
-            return -IDENTICAL_DB if self.fidelity is None else -self.fidelity
+        """The figure of this name that decides, as a number that grows as quality falls."""
         value = self.figure(figure)
+        if figure == "fidelity":
+            return -IDENTICAL_DB if value is None else -value
         if value is None:
             raise InputError("the drop against photos was asked to decide, but there are no photos")
         return value
@@ -131,7 +153,8 @@ class MinFidelity:
 
     def report(self, size: int, measurement: Measurement | None) -> str:
         assert measurement is not None
-        fidelity = "identical" if measurement.fidelity is None else f"{measurement.fidelity:.3f} dB"
+        found = measurement.figure("fidelity")
+        fidelity = "identical" if found is None else f"{found:.3f} dB"
         return f"fidelity {fidelity} at {format_size(size)}"
 
 

@@ -1,37 +1,38 @@
-"""The table of other programs' formats, and the choice of a format by file name."""
+"""The table of other programs' formats: suffixes, frames, readers, writers, and what searches need to know of them."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from flexgs_edge.errors import InputError
+from flexgs_edge.io.frames import LUF, RDF, RUB, Frame
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of the converter.
+    """A format.
 
     Parameters
     ----------
     suffix : str
-        End of file names, with its dot.
-    name : str
-        The converter's name of the format.
+        End of file names, with its dot; or a whole file name.
+    reader : str
+        `module:function` of `read(path, name, reading)`, which returns a source in the file's frame. `name` is the user's path.
+        Imported only when a file needs it, so start-up stays fast.
+    writer : str or None
+        `module:function` of `write(file, source, writing)`, which writes a source in the file's frame to an open binary file.
+        `None`: only read.
+    frame : Frame
+        Directions of the axes in files of this format.
     reach : float
         Largest coordinate that it holds, scene units.
     max_degree : int
         Highest SH degree.
-    sorted : bool
-        Rows must come in an order in which neighbours are near each other: 256 rows share a range, and the converter
-        does not sort. Unsorted positions would be several times worse.
-    shuffled : bool
-        The converter sorts rows by itself.
-    probed : bool
-        The converter may write SH in another order than it reads them (see `_sh_places`).
-    finer_sh : bool
-        We write the SH again with a finer step than the converter's (see `flexgs_edge.io.spz`).
     one_degree : bool
         Only a lower SH degree of the whole scene saves bytes; SH that are zero take as much as others.
     row_bytes : float
@@ -39,41 +40,77 @@ class Format:
     sh_bytes : float
         Bytes of SH among them.
     memory : int
-        Most bytes a Gaussian that the converter holds.
+        Most bytes a Gaussian that writing and reading back hold.
+    marks_antialiased : bool
+        Whether its files can say that a model is antialiased.
     """
 
     suffix: str
-    name: str
+    reader: str
+    writer: str | None = None
+    frame: Frame = RDF
     reach: float = float("inf")
     max_degree: int = 3
-    sorted: bool = False
-    shuffled: bool = False
-    probed: bool = False
-    finer_sh: bool = False
     one_degree: bool = False
     row_bytes: float = 20.0
     sh_bytes: float = 5.0
-    memory: int = 1024
+    memory: int = 512
+    marks_antialiased: bool = False
+
+    def read(self, *arguments: Any) -> Any:
+        """Call the reader."""
+        return _function(self.reader)(*arguments)
+
+    def write(self, *arguments: Any) -> None:
+        """Call the writer."""
+        assert self.writer is not None
+        _function(self.writer)(*arguments)
+
+    @property
+    def word(self) -> str:
+        """The format in records: its suffix without the dot."""
+        return self.suffix.lstrip(".")
 
 
+def _function(place: str) -> Callable[..., Any]:
+    module, _, name = place.partition(":")
+    found: Callable[..., Any] = getattr(import_module(module), name)
+    return found
+
+
+_IO = "flexgs_edge.io"
 FORMATS: dict[str, Format] = {
     format.suffix: format
     for format in (
-        # Positions are 24-bit numbers with 12 bits behind the point.
-        Format(".spz", "spz", reach=2.0**11 - 2.0**-12, finer_sh=True, row_bytes=22.0, sh_bytes=5.5),
-        Format(".sog", "sog", shuffled=True, row_bytes=39.7, sh_bytes=27.4, memory=2048),
+        Format(
+            ".spz", f"{_IO}.spz:read_spz", f"{_IO}.spz_writer:write_spz", RUB, reach=2.0**23 - 1,
+            max_degree=4, row_bytes=22.0, sh_bytes=5.5, marks_antialiased=True,
+        ),
+        Format(
+            ".sog", f"{_IO}.sog:read_sog", f"{_IO}.sog_writer:write_sog",
+            row_bytes=24.0, sh_bytes=11.0, memory=1024, marks_antialiased=True,
+        ),
+        Format("lod-meta.json", f"{_IO}.streamed_sog:read_streamed_sog"),
+        Format("meta.json", f"{_IO}.sog:read_sog_folder"),
         # 16 bytes, 45 bytes of SH, and 72 bytes for each chunk of 256 rows.
         Format(
-            ".compressed.ply",
-            "compressed.ply",
-            sorted=True,
-            probed=True,
-            one_degree=True,
-            row_bytes=61.3,
-            sh_bytes=45.0,
+            ".compressed.ply", f"{_IO}.compressed_ply:read_compressed_ply", f"{_IO}.compressed_ply:write_compressed_ply",
+            one_degree=True, row_bytes=61.3, sh_bytes=45.0,
         ),
+        Format(
+            ".splat", f"{_IO}.splat:read_splat", f"{_IO}.splat:write_splat",
+            max_degree=0, one_degree=True, row_bytes=32.0, sh_bytes=0.0,
+        ),
+        Format(".ksplat", f"{_IO}.ksplat:read_ksplat"),
+        Format(
+            ".glb", f"{_IO}.gltf:read_gltf", f"{_IO}.glb_writer:write_glb", LUF,
+            one_degree=True, row_bytes=232.0, sh_bytes=180.0, memory=1024,
+        ),
+        Format(".gltf", f"{_IO}.gltf:read_gltf", frame=LUF),
     )
-}
+}  # fmt: skip
+WRITTEN: tuple[str, ...] = tuple(suffix for suffix, format in FORMATS.items() if format.writer)
+"""Suffixes that can be written."""
 
 
 def format_of(path: str | os.PathLike[str]) -> Format | None:
@@ -82,9 +119,9 @@ def format_of(path: str | os.PathLike[str]) -> Format | None:
     return next((format for suffix, format in FORMATS.items() if name.endswith(suffix)), None)
 
 
-def required_format(path: str | os.PathLike[str]) -> Format:
-    """The format of a file name; raises `InputError` if there is none."""
+def written_format(path: str | os.PathLike[str]) -> Format | None:
+    """The format that a file of this name is written in, or None; raises `InputError` for formats that are only read."""
     format = format_of(path)
-    if format is None:
-        raise InputError(f"{path}: expected a file ending in {', '.join(FORMATS)}")
+    if format is not None and format.writer is None:
+        raise InputError(f"-o {path}: {format.suffix} files are only read; write one of {', '.join(WRITTEN)}")
     return format

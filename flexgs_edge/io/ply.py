@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 
 from flexgs_edge.errors import FormatError, InputError
-from flexgs_edge.files import atomic_write
+from flexgs_edge.files import atomic_write, check_readable
 from flexgs_edge.io.ply_layout import SMOOTHING, PlyHeader, gaussian_layout, read_header, smoothing_of
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
@@ -38,8 +38,8 @@ class PlySource(SceneSource):
 
     Binary files are read by row ranges. plyfile loads ascii files as a whole, and also files with lists in or before
     the vertices. `choose_origin` takes the origin from a sample of the positions. We subtract it in float64, before
-    positions are rounded to float32. Mip-Splatting's `filter_3D` is applied to scales and opacities; `settings` then
-    name the model as antialiased.
+    positions are rounded to float32. Mip-Splatting's `filter_3D` is applied to scales and opacities. `settings` name
+    the model as antialiased if it has one, or as a comment of Brush or Postshot says.
 
     Parameters
     ----------
@@ -47,6 +47,8 @@ class PlySource(SceneSource):
         The file; it must not change while the source is in use (checked at every read).
     block_rows : int, optional
         Rows that are read at a time.
+    name : str, optional
+        The path for messages. Default: `path`.
 
     Raises
     ------
@@ -57,23 +59,30 @@ class PlySource(SceneSource):
         bytes.
     """
 
-    def __init__(self, path: str | os.PathLike[str], block_rows: int = BLOCK_ROWS) -> None:
+    def __init__(self, path: str | os.PathLike[str], block_rows: int = BLOCK_ROWS, name: str | None = None) -> None:
         self.path = Path(path)
-        self.name = os.fspath(path)
+        self.name = os.fspath(path) if name is None else name
+        check_readable(self.path, self.name)
         try:
             with open(self.path, "rb") as file:
-                header = read_header(self.path, file)
+                header = read_header(self.name, file)
                 stamp = _stamp(file)
             self.sh_degree, self.notes = gaussian_layout(header)
             self.comments = header.comments
             self._smoothed = smoothing_of(header)
-            self.settings: dict[str, Any] = {"antialiased": True} if self._smoothed else {}
-            header.check_size(stamp[1])
-            self._rows: _RowReader = (
-                _FileRows(header, stamp, block_rows) if header.plain else _ArrayRows(_load_whole(header), block_rows)
-            )
+            antialiased = self._smoothed or header.antialiased
+            self.settings: dict[str, Any] = {} if antialiased is None else {"antialiased": antialiased}
+            behind = header.check_size(stamp[1])
+            self._rows: _RowReader
+            if header.plain:
+                self._rows = _FileRows(self.path, header, stamp, block_rows)
+            else:
+                rows, behind = _load_whole(self.path, header)
+                self._rows, self.held_bytes = _ArrayRows(rows, block_rows), rows.nbytes
+            if behind:
+                self.notes += (f"{behind} bytes behind the data ignored",)
         except OSError as error:
-            raise InputError(f"{path}: cannot read the scene ({error.strerror})") from error
+            raise InputError(f"{self.name}: cannot read the scene ({error.strerror})") from error
         self.count = header.vertex.count
         self.sh_count = self.count if self.sh_degree else 0
         self.origin = np.zeros(3)  # the sample is of world positions
@@ -83,9 +92,10 @@ class PlySource(SceneSource):
         """[n, 3] f64: world positions of `origin_rows`."""
         rows = origin_rows(self.count)
         sample = np.empty((rows.size, 3))
-        for part, block in self._rows.blocks(rows):
-            for axis, name in enumerate(FIELD["means"].ply):
-                sample[part, axis] = block[name]
+        with np.errstate(invalid="ignore"):  # a signalling NaN
+            for part, block in self._rows.blocks(rows):
+                for axis, name in enumerate(FIELD["means"].ply):
+                    sample[part, axis] = block[name]
         return sample
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
@@ -183,8 +193,8 @@ class _ArrayRows:
 class _FileRows:
     """Rows of a file, read block by block."""
 
-    def __init__(self, header: PlyHeader, stamp: tuple[int, int, int], block_rows: int) -> None:
-        self.path, self.stamp = header.path, stamp
+    def __init__(self, path: Path, header: PlyHeader, stamp: tuple[int, int, int], block_rows: int) -> None:
+        self.path, self.name, self.stamp = path, header.name, stamp
         self.offset, self.dtype = header.vertex_offset, header.vertex_dtype
         self.block_rows = block_rows
 
@@ -195,7 +205,7 @@ class _FileRows:
         try:
             with open(self.path, "rb", buffering=0) as file:
                 if _stamp(file) != self.stamp:
-                    raise InputError(f"{self.path}: the file was changed after it was opened; start again")
+                    raise InputError(f"{self.name}: the file was changed after it was opened; start again")
                 block = np.empty(min(size, self.block_rows) * (1 if isinstance(rows, slice) else _SPAN), self.dtype)
                 for start in range(0, size, self.block_rows):
                     part = slice(start, min(start + self.block_rows, size))
@@ -205,7 +215,7 @@ class _FileRows:
                     else:
                         yield part, self._list(file, rows[part], block)
         except OSError as error:
-            raise InputError(f"{self.path}: cannot read the scene ({error.strerror})") from error
+            raise InputError(f"{self.name}: cannot read the scene ({error.strerror})") from error
 
     def _list(self, file: BinaryIO, rows: np.ndarray, block: np.ndarray) -> np.ndarray:
         low, high = int(rows.min()), int(rows.max())
@@ -236,7 +246,7 @@ class _FileRows:
         while done < len(view):
             got = file.readinto(view[done:])  # type: ignore[attr-defined]
             if not got:
-                raise FormatError(f"{self.path}: truncated while being read, at row {first}")
+                raise FormatError(f"{self.name}: truncated while being read, at row {first}")
             done += got
         return block
 
@@ -276,22 +286,23 @@ class _HeaderThenData:
         return self.file.readline().decode("ascii", "replace")
 
 
-def _load_whole(header: PlyHeader) -> np.ndarray:
-    """Load the rows of `vertex` by plyfile, for files that need it; they stay in memory as long as the source."""
+def _load_whole(path: Path, header: PlyHeader) -> tuple[np.ndarray, int]:
+    """Load the rows of `vertex` by plyfile, for files that need it; they stay in memory as long as the source.
+
+    Also returns the number of bytes behind the last element.
+    """
     # plyfile is GPL-3: imported only for the files that need it.
     from plyfile import PlyData, PlyParseError
 
     try:
-        with open(header.path, "rb") as file:
+        with open(path, "rb") as file:
             file.seek(header.data_offset)
             stream = _HeaderThenData(header, file)
             rows: np.ndarray = PlyData.read(stream, mmap=False)["vertex"].data
-            rest = len(file.read() if header.order else file.read().strip())
+            rest = os.fstat(file.fileno()).st_size - file.tell() if header.order else len(file.read().strip())
     except (PlyParseError, ValueError, UnicodeDecodeError, OverflowError, MemoryError) as error:
-        raise FormatError(f"{header.path}: {error}") from error
-    if rest:
-        raise FormatError(f"{header.path}: {rest} bytes too many after the last element")
-    return rows
+        raise FormatError(f"{header.name}: {error}") from error
+    return rows, rest
 
 
 def write_ply(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -83,6 +82,8 @@ class PlyHeader:
 
     Attributes
     ----------
+    name : str
+        The user's path, for messages.
     order : str
         Byte order, "<" or ">"; "" for ascii.
     elements : list of Element
@@ -91,13 +92,16 @@ class PlyHeader:
         First byte of the data.
     comments : tuple of str
         Comments that this program wrote.
+    antialiased : bool or None
+        What a comment of Brush or Postshot says; `None` without one.
     """
 
-    path: Path
+    name: str
     order: str
     elements: list[Element]
     data_offset: int
     comments: tuple[str, ...] = ()
+    antialiased: bool | None = None
 
     @property
     def vertex(self) -> Element:
@@ -106,7 +110,7 @@ class PlyHeader:
             if element.name == "vertex":
                 return element
         names = ", ".join(element.name for element in self.elements) or "none"
-        raise FormatError(f"{self.path}: no element 'vertex'; found {names}")
+        raise FormatError(f"{self.name}: no element 'vertex'; found {names}")
 
     @property
     def before(self) -> list[Element]:
@@ -140,17 +144,22 @@ class PlyHeader:
         """One row of `vertex` in the file, for plain files."""
         return np.dtype([(p.name, self.order + p.type) for p in self.vertex.properties])
 
-    def check_size(self, size: int) -> None:
+    def check_size(self, size: int) -> int:
         """Compare the claims of the header with the file's `size` in bytes (exactly for binary files without lists).
+
+        Returns
+        -------
+        int
+            Bytes behind the data; 0 where lists or text leave them unknown.
 
         Raises
         ------
         FormatError
-            If data are missing, or there are too many bytes.
+            If data are missing.
         """
         for element in self.elements:
             if element.count and not element.properties:
-                raise FormatError(f"{self.path}: element {element.name!r} has {element.count} rows without properties")
+                raise FormatError(f"{self.name}: element {element.name!r} has {element.count} rows without properties")
         # In ascii, a value takes at least one character and a separator; the last value may lack the separator.
         exact = bool(self.order) and all(element.scalar for element in self.elements)
         least = sum(e.count * (e.row_size if self.order else 2 * len(e.properties)) for e in self.elements)
@@ -159,35 +168,31 @@ class PlyHeader:
         if found + (not self.order) < least:
             promised = f"{'' if exact else 'at least '}{least} bytes"
             raise FormatError(
-                f"{self.path}: truncated: the header promises {claims}, {promised} from byte {self.data_offset}; "
+                f"{self.name}: truncated: the header promises {claims}, {promised} from byte {self.data_offset}; "
                 f"found {found}"
             )
-        if exact and found > least:
-            raise FormatError(
-                f"{self.path}: {found - least} bytes too many: the header promises {claims}, {least} bytes "
-                f"from byte {self.data_offset}; found {found}"
-            )
+        return found - least if exact else 0
 
 
-def read_header(path: Path, file: BinaryIO) -> PlyHeader:
-    """Parse the header of the PLY `file`, which must be at its start.
+def read_header(name: str, file: BinaryIO) -> PlyHeader:
+    """Parse the header of the PLY `file`, which must be at its start; messages call it `name`.
 
     Raises
     ------
     FormatError
         If the header breaks the format; the message names the line and what was expected there.
     """
-    number, order, elements, comments = 0, None, list[Element](), list[str]()
+    number, order, elements, comments, antialiased = 0, None, list[Element](), list[str](), None
     while True:
         number += 1
         raw = file.readline(_HEADER_LIMIT + 1 - min(file.tell(), _HEADER_LIMIT))
         words = raw.decode("ascii", "replace").split()
-        place = f"{path}: header line {number}"
+        place = f"{name}: header line {number}"
         if number == 1:
             if raw.rstrip(b"\r\n") != b"ply":
-                raise FormatError(f"{path}: not a PLY file: expected 'ply' in the first line, found {raw[:16]!r}")
+                raise FormatError(f"{name}: not a PLY file: expected 'ply' in the first line, found {raw[:16]!r}")
         elif not raw.endswith(b"\n"):
-            raise FormatError(f"{path}: the header has no 'end_header' line (looked at {file.tell()} bytes)")
+            raise FormatError(f"{name}: the header has no 'end_header' line (looked at {file.tell()} bytes)")
         elif words[:1] == ["end_header"]:
             break
         elif words[:1] == ["format"]:
@@ -200,11 +205,28 @@ def read_header(path: Path, file: BinaryIO) -> PlyHeader:
             elements[-1].properties.append(_property(place, words, elements[-1]))
         elif words[:2] == ["comment", PROGRAM]:
             comments.append(" ".join(words[1:]))
-        elif words and words[0] not in ("comment", "obj_info"):
+        elif words[:1] == ["comment"]:
+            said = _antialiased(words[1:])
+            antialiased = antialiased if said is None else said
+        elif words and words[0] != "obj_info":
             raise FormatError(f"{place}: expected format, element, property, comment or end_header, found {words[0]!r}")
     if order is None:
-        raise FormatError(f"{path}: the header has no 'format' line; expected one of {', '.join(_FORMATS)}")
-    return PlyHeader(path, order, elements, file.tell(), tuple(comments))
+        raise FormatError(f"{name}: the header has no 'format' line; expected one of {', '.join(_FORMATS)}")
+    return PlyHeader(name, order, elements, file.tell(), tuple(comments), antialiased)
+
+
+def _antialiased(words: list[str]) -> bool | None:
+    """Whether a comment says that the model is antialiased; `None` if it says neither. Upper and lower case are the same.
+
+    Brush writes `SplatRenderMode: mip` or `default`, Postshot `antialiased 1` or `0`. The last such comment holds.
+    """
+    known = {
+        ("splatrendermode:", "mip"): True,
+        ("splatrendermode:", "default"): False,
+        ("antialiased", "1"): True,
+        ("antialiased", "0"): False,
+    }
+    return known.get((words[0].lower(), words[1].lower())) if len(words) == 2 else None
 
 
 def _format(place: str, words: list[str], order: str | None) -> str:
@@ -251,16 +273,15 @@ def gaussian_layout(header: PlyHeader) -> tuple[int, tuple[str, ...]]:
     """
     vertex = header.vertex
     by_name = {p.name: p for p in vertex.properties}
-    degree = _sh_degree(header.path, by_name)
+    degree = _sh_degree(header.name, by_name)
     needed = [name for f in FIELDS for name in f.ply_names(degree)]
     missing = [name for name in needed if name not in by_name]
     if missing:
-        hint = "; compressed PLY files must be expanded first" if "packed_position" in by_name else ""
-        raise FormatError(f"{header.path}: element 'vertex' lacks the properties {_list(missing)}{hint}")
+        raise FormatError(f"{header.name}: element 'vertex' lacks the properties {_list(missing)}")
     wrong = [name for name in needed if by_name[name].length or not by_name[name].type.startswith("f")]
     if wrong:
         kind = "a list" if by_name[wrong[0]].length else f"type {by_name[wrong[0]].type}"
-        raise FormatError(f"{header.path}: property {wrong[0]!r} is {kind}; expected float or double")
+        raise FormatError(f"{header.name}: property {wrong[0]!r} is {kind}; expected float or double")
     smoothed = smoothing_of(header)
     known = {*needed, *_SILENT, *((SMOOTHING,) if smoothed else ())}
     extra = [name for name in by_name if name not in known]
@@ -278,11 +299,11 @@ def smoothing_of(header: PlyHeader) -> bool:
     return any(p.name == SMOOTHING and p.length is None and p.type.startswith("f") for p in header.vertex.properties)
 
 
-def _sh_degree(path: Path, by_name: dict[str, Property]) -> int:
-    found = sum(name.startswith("f_rest_") for name in by_name)
+def _sh_degree(name: str, by_name: dict[str, Property]) -> int:
+    found = sum(each.startswith("f_rest_") for each in by_name)
     if found not in REST_WIDTHS:
         expected = ", ".join(f"{3 * sh_rest_count(d)} (degree {d})" for d in range(MAX_SH_DEGREE + 1))
-        raise FormatError(f"{path}: {found} properties f_rest_*; expected {expected}")
+        raise FormatError(f"{name}: {found} properties f_rest_*; expected {expected}")
     return REST_WIDTHS[found]
 
 

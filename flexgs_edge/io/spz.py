@@ -1,110 +1,318 @@
-"""Write the SH of `.spz` files again, with a finer step than the converter's.
-
-The format stores each coefficient as a byte, (code - 128) / 128, and leaves the rounding to the writer. The converter
-keeps 5 bits of degree 1 and 4 bits of the others, which causes nearly all of the loss. SH come last in the stream, so
-we copy the stream and replace them. Layout: magic, version, count, SH degree, 12 bits behind the point, flags and a
-zero (16 bytes); then arrays with these bytes a Gaussian: positions 9, opacity 1, colour 3, scales 3, rotation 3
-(version 2) or 4 (version 3), and SH by Gaussian, coefficient, channel. All of it is one gzip stream.
-"""
+"""Read `.spz` files, versions 1 to 4."""
 
 from __future__ import annotations
 
-import gzip
+import io
 import os
-import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+import zstandard
 
-from flexgs_edge.errors import InputError
-from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.errors import FormatError
+from flexgs_edge.io.codes import rest_of_unit, with_largest
+from flexgs_edge.io.decoded import DecodedSource, opacity_logits
+from flexgs_edge.io.frames import Frame
+from flexgs_edge.io.kinds import GZIP_MAGIC
+from flexgs_edge.io.reading import AS_WRITTEN, Reading
+from flexgs_edge.io.spz_layout import (
+    ANTIALIASED,
+    COLOUR_SCALE,
+    EXTENDED,
+    FIRST_PLAIN,
+    HEADER,
+    MAGIC,
+    PLAIN_HEADER,
+    ROTATION_MASK,
+    SCALE_OFFSET,
+    SCALE_STEPS,
+    SIZES,
+    SpzHeader,
+    parse_extensions,
+    parse_header,
+)
+from flexgs_edge.scene.source import Rows
 
-SH_STEP = 8
-"""Step of the codes, in units of 1/128: half of the converter's own step above degree 1. A smaller step costs more
-bytes than it is worth: docs/results/tuning.md#sh_step"""
-CONVERTER_STEP = 16
-_HEADER = struct.Struct("<IIIBBBB")
-_MAGIC = 0x5053474E
-_ROW = {2: 19, 3: 20}
-"""Bytes of a Gaussian without SH, for each version of the format."""
-_BLOCK = 1 << 20
+_BLOCK = 1 << 18
+"""Packed bytes read at a time."""
+_PIECE = 1 << 20
+"""Unpacked bytes asked for at a time."""
+_TAIL = 1 << 20
+"""Most bytes behind the arrays; extensions have a few."""
+_MOST_PACKED = 1032
+"""Bytes that one byte can unpack to: what deflate reaches. Version 4 has the same limit, as in the reference program."""
 
 
-def is_antialiased(path: str | os.PathLike[str]) -> bool:
-    """Whether a file calls its model antialiased; the converter drops this flag.
+class SpzSource(DecodedSource):
+    """A `.spz`: its codes, decoded when they are read.
 
-    It is bit 0 of byte 14 of the header. From version 4 on, the header is plain; before, it lies inside gzip.
+    Parameters
+    ----------
+    name : str
+        The user's path, for messages.
+    header : SpzHeader
+        What the file says.
+    arrays : list of np.ndarray
+        [bytes] u8 each, unpacked, in the order of `header.widths`.
+    frame : Frame or None
+        The frame that the file states.
+    notes : tuple of str
+        On what was left out.
     """
-    with open(path, "rb") as file:
-        start = file.read(16)
-    if start[:2] == b"\x1f\x8b":
-        with gzip.open(path) as unpacked:
-            start = unpacked.read(16)
-    return start[:4] == b"NGSP" and len(start) == 16 and bool(start[14] & 1)
+
+    def __init__(
+        self, name: str, header: SpzHeader, arrays: list[np.ndarray], frame: Frame | None, notes: tuple[str, ...]
+    ) -> None:
+        super().__init__(name, header.count, header.sh_degree, sum(array.nbytes for array in arrays))
+        self.header, self.frame, self.notes = header, frame, notes
+        self.version = header.version
+        if header.flags & ANTIALIASED:
+            self.settings = {"antialiased": True}
+        self._codes = {
+            field: array.reshape(header.count, width)
+            for array, (field, width) in zip(arrays, header.widths.items(), strict=True)
+        }
+
+    def decode(self, rows: Rows, field: str) -> np.ndarray:
+        """See `DecodedSource.decode`."""
+        codes = self._codes[field][rows]
+        if field == "means":
+            return _positions(codes, self.header)
+        if field == "opacity_logits":
+            return opacity_logits(codes.T / 255.0)
+        if field == "sh_dc":
+            return (codes.T / 255.0 - 0.5) / COLOUR_SCALE
+        if field == "log_scales":
+            return codes.T / SCALE_STEPS - SCALE_OFFSET
+        if field == "quats":
+            return _first_three(codes) if codes.shape[1] == 3 else _smallest_three(codes)
+        # Colour channels vary fastest in the file, and slowest here.
+        turned = codes.reshape(len(codes), -1, 3).transpose(2, 1, 0).reshape(codes.shape[1], -1)
+        return (turned - np.float32(128)) / np.float32(128)
 
 
-def refine_sh(coded: Path, source: SceneSource, finished: Path, chunk_rows: int = 16384) -> None:
-    """Copy a `.spz` that the converter made of `source`, with SH rounded to `SH_STEP` instead.
+def read_spz(path: Path, name: str, reading: Reading) -> SpzSource:
+    """Open a `.spz`; see `Format.reader`.
 
     Raises
     ------
-    InputError
-        If the file has another layout: the converter then is of another version.
+    FormatError
+        If the file breaks the format or unpacks to more than its header says.
     """
+    with open(path, "rb") as file:
+        return parse_spz(file, name, reading)
+
+
+def spz_source(data: bytes, name: str) -> SpzSource:
+    """Read a `.spz` that is a part of another file; messages call it `name`."""
+    return parse_spz(io.BytesIO(data), name)
+
+
+def parse_spz(file: BinaryIO, name: str, reading: Reading = AS_WRITTEN) -> SpzSource:
+    """Read a `.spz` from an open file."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    head = file.read(HEADER.size)
+    file.seek(0)
+    if head.startswith(GZIP_MAGIC):
+        return _one_stream(_Gunzip(file, name), size * _MOST_PACKED, name, reading, ())
+    if not head.startswith(MAGIC):
+        raise FormatError(
+            f"{name}: not a .spz: expected the bytes of gzip (versions 1 to 3) or {MAGIC!r} (version 4) at byte 0; "
+            f"found {head[:8]!r}"
+        )
+    if parse_header(name, head).version >= FIRST_PLAIN:
+        return _packed_arrays(file, size, name, reading)
+    note = "not packed by gzip, against the specification; read as it is"
+    return _one_stream(_Plain(file), size, name, reading, (note,))
+
+
+class _Plain:
+    """A stream that lacks its gzip layer."""
+
+    behind = 0
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.read = file.read
+
+    def check_end(self) -> None:
+        """Nothing tells where it ends."""
+
+
+class _Gunzip:
+    """A gzip stream, unpacked only as far as it is read."""
+
+    def __init__(self, file: BinaryIO, name: str) -> None:
+        self.file, self.name = file, name
+        self._stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
+        self._done = 0
+
+    @property
+    def behind(self) -> int:
+        """Bytes of the file behind the stream; known when the stream has ended."""
+        at = self.file.tell()
+        return len(self._stream.unused_data) + self.file.seek(0, os.SEEK_END) - at
+
+    def read(self, size: int) -> bytes:
+        """The next bytes; fewer than `size` only at the end."""
+        found = bytearray()
+        while len(found) < size and not self._stream.eof:
+            packed = self._stream.unconsumed_tail or self.file.read(_BLOCK)
+            try:
+                piece = self._stream.decompress(packed, size - len(found))
+            except zlib.error as error:
+                raise FormatError(
+                    f"{self.name}: damaged: gzip fails after {self._done} unpacked bytes ({error})"
+                ) from error
+            if not piece and not packed:
+                break
+            found += piece
+            self._done += len(piece)
+        return bytes(found)
+
+    def check_end(self) -> None:
+        """Raise `FormatError` if the file ends before the stream."""
+        if not self._stream.eof:
+            raise FormatError(
+                f"{self.name}: truncated: the gzip stream has no end after {self._done} unpacked bytes; "
+                "is the file complete?"
+            )
+
+
+def _gathered(read: Callable[[int], bytes], size: int) -> np.ndarray:
+    """[at most `size`] u8; memory is taken as bytes arrive, since a claim may be false."""
+    found = bytearray()
+    while len(found) < size and (piece := read(min(size - len(found), _PIECE))):
+        found += piece
+    return np.frombuffer(found, np.uint8)
+
+
+def _one_stream(stream: _Plain | _Gunzip, most: int, name: str, reading: Reading, notes: tuple[str, ...]) -> SpzSource:
+    """Versions 1 to 3; `most` is what the file's size allows, unpacked."""
+    head = stream.read(HEADER.size)
+    if head[:4] != MAGIC:
+        raise FormatError(
+            f"{name}: not a .spz: expected {MAGIC!r} at the start of the unpacked data, found {head[:8]!r}"
+        )
+    header = parse_header(name, head)
+    wanted = header.count * header.row_bytes
+    _check_claim(name, header, most - HEADER.size, wanted)
+    data = _gathered(stream.read, wanted)
+    if len(data) < wanted:
+        raise FormatError(f"{name}: truncated: {_claim(header, wanted)}; found {len(data)}; is the file complete?")
+    tail = stream.read(_TAIL)
+    if len(tail) == _TAIL:
+        raise FormatError(f"{name}: {_claim(header, wanted)}; more than {_TAIL} bytes follow")
+    stream.check_end()
+    frame = None
+    if header.flags & EXTENDED:
+        frame, left_out = parse_extensions(name, tail, reading.frame)
+        notes, tail = notes + left_out, b""
+    ignored = len(tail) + stream.behind
+    cuts = header.count * np.cumsum(list(header.widths.values()))[:-1]
+    return SpzSource(name, header, np.split(data, cuts), frame, notes + _ignored(ignored))
+
+
+def _packed_arrays(file: BinaryIO, size: int, name: str, reading: Reading) -> SpzSource:
+    """Version 4."""
+    if size < PLAIN_HEADER.size:
+        raise FormatError(f"{name}: truncated: expected a header of {PLAIN_HEADER.size} bytes, found {size}")
+    head = file.read(PLAIN_HEADER.size)
+    header = parse_header(name, head)
+    *_, arrays, place = PLAIN_HEADER.unpack(head)
+    widths = header.widths
+    wanted = header.count * header.row_bytes
+    # Files without Gaussians have no arrays at all.
+    if arrays != (len(widths) if header.count else 0):
+        raise FormatError(f"{name}: byte 15, number of arrays: expected {len(widths)}, found {arrays}")
+    if not header.count:
+        return SpzSource(name, header, [np.zeros(0, np.uint8)] * len(widths), None, ())
+    end = place + arrays * SIZES.size
+    if not PLAIN_HEADER.size <= place <= end <= size:
+        raise FormatError(
+            f"{name}: byte 16, place of the table: expected {PLAIN_HEADER.size} to {size - arrays * SIZES.size}, "
+            f"found {place}; is the file complete?"
+        )
+    _check_claim(name, header, size * _MOST_PACKED, wanted)
+    extensions = file.read(place - PLAIN_HEADER.size) if header.flags & EXTENDED else b""
+    frame, notes = parse_extensions(name, extensions, reading.frame)
+    file.seek(place)
+    table = list(SIZES.iter_unpack(file.read(arrays * SIZES.size)))
+    left = size - end
+    for index, ((packed, unpacked), (field, width)) in enumerate(zip(table, widths.items(), strict=True)):
+        if unpacked != width * header.count:
+            raise FormatError(
+                f"{name}: byte {place + index * SIZES.size + 8}, size of {field}: expected {width * header.count} bytes, "
+                f"found {unpacked}"
+            )
+        if packed > left:
+            raise FormatError(
+                f"{name}: truncated: the table promises {packed} bytes of {field}; found {left}; is the file complete?"
+            )
+        left -= packed
+    parts = [
+        _unzstd(name, field, file.read(packed), unpacked)
+        for (packed, unpacked), field in zip(table, widths, strict=True)
+    ]
+    return SpzSource(name, header, parts, frame, notes + _ignored(left))
+
+
+def _unzstd(name: str, field: str, packed: bytes, size: int) -> np.ndarray:
+    """[size] u8, the content of one zstd frame."""
     try:
-        with (
-            gzip.open(coded) as old,
-            open(finished, "xb") as file,
-            # No name and no time in the gzip header, so that the same scene gives the same bytes.
-            gzip.GzipFile(filename="", mode="wb", compresslevel=9, fileobj=file, mtime=0) as new,
-        ):
-            _copy(old, new, source, chunk_rows)
-    except (EOFError, struct.error, zlib.error, gzip.BadGzipFile) as error:
-        raise _unknown(f"{error}") from error
+        reader = zstandard.ZstdDecompressor().stream_reader(packed)
+        found = _gathered(reader.read, size)
+        more = reader.read(1)
+    except zstandard.ZstdError as error:
+        raise FormatError(f"{name}: damaged: the zstd frame of {field} does not unpack ({error})") from error
+    if len(found) < size or more:
+        holds = f"more than {size}" if more else f"{len(found)}"
+        raise FormatError(f"{name}: {field}: expected {size} bytes, the zstd frame holds {holds}")
+    return found
 
 
-def _copy(old: gzip.GzipFile, new: gzip.GzipFile, source: SceneSource, chunk_rows: int) -> None:
-    head = old.read(_HEADER.size)
-    magic, version, count, degree, *_ = _HEADER.unpack(head)
-    if magic != _MAGIC or version not in _ROW or (count, degree) != (source.count, source.sh_degree):
-        raise _unknown(f"version {version}, {count} Gaussians of SH degree {degree}")
-    new.write(head)
-    left = _ROW[version] * count
-    while left:
-        block = old.read(min(left, _BLOCK))
-        if not block:
-            raise _unknown(f"{left} bytes are missing before the SH")
-        new.write(block)
-        left -= len(block)
-    width = source.width("sh_rest")
-    for rows in source.chunks(chunk_rows):
-        size = (rows.stop - rows.start) * width
-        found = np.frombuffer(old.read(size), np.uint8)
-        # [n, K, 3], from planes that are stored channel by channel.
-        values = source.read(rows, ["sh_rest"])["sh_rest"].reshape(3, width // 3, -1).transpose(2, 1, 0)
-        codes = sh_codes(values).reshape(-1)
-        # The converter rounded the same numbers, so larger differences mean another order or other signs.
-        if found.size != size or np.abs(found.astype(int) - codes).max(initial=0) > (CONVERTER_STEP + SH_STEP) // 2:
-            raise _unknown("SH are not where they were expected")
-        new.write(codes.astype(np.uint8).tobytes())
-    if old.read(1):
-        raise _unknown("bytes after the SH")
+def _claim(header: SpzHeader, wanted: int) -> str:
+    return f"the header promises {header.count} Gaussians of SH degree {header.sh_degree}, {wanted} bytes"
 
 
-def sh_codes(values: np.ndarray) -> np.ndarray:
-    """Bytes of SH coefficients, as int64; 128 stands for zero.
-
-    >>> sh_codes(np.array([0.0, 0.07, -2.0, 5.0])).tolist()
-    [128, 136, 0, 248]
-    """
-    top = (255 - 128) // SH_STEP
-    steps = np.clip(np.rint(values.astype(np.float64) * (128 / SH_STEP)), -128 // SH_STEP, top)
-    return 128 + SH_STEP * steps.astype(np.int64)
+def _check_claim(name: str, header: SpzHeader, most: int, wanted: int) -> None:
+    if wanted > most:
+        raise FormatError(
+            f"{name}: truncated: {_claim(header, wanted)}; a file of this size can hold {max(most, 0)} at most; "
+            "is it complete?"
+        )
 
 
-def _unknown(found: str) -> InputError:
-    return InputError(
-        f"the converter's .spz is not of a kind that this program knows ({found}): use gaussforge 0.6, or write "
-        "another format"
-    )
+def _ignored(size: int) -> tuple[str, ...]:
+    return (f"{size} bytes behind the data ignored",) if size else ()
+
+
+def _positions(codes: np.ndarray, header: SpzHeader) -> np.ndarray:
+    """[3, n]: float16 in version 1, else integers of 24 bits with a sign."""
+    if header.version == 1:
+        return np.ascontiguousarray(codes).view("<f2").T.astype(np.float32)
+    parts = codes.reshape(len(codes), 3, 3).astype(np.int32)
+    # The third byte is shifted to the top and back, so that its sign fills the word.
+    fixed = parts[..., 0] | (parts[..., 1] << 8) | ((parts[..., 2] << 24) >> 8)
+    return np.ldexp(fixed.T.astype(np.float32), -header.fraction_bits)
+
+
+def _first_three(codes: np.ndarray) -> np.ndarray:
+    """[4, n] w x y z of versions 1 and 2: x, y and z are stored, and w is not negative."""
+    axis = codes.T / 127.5 - 1
+    return np.concatenate([rest_of_unit(axis), axis])
+
+
+def _smallest_three(codes: np.ndarray) -> np.ndarray:
+    """[4, n] w x y z from version 3 on: all but the largest are stored, in the order x y z w."""
+    words = np.ascontiguousarray(codes).view("<u4")[:, 0]
+    largest = (words >> 30).astype(np.int64)
+    smaller = np.empty((3, len(words)))
+    for place in range(3):
+        part = (words >> np.uint32(10 * (2 - place))) & np.uint32(2 * ROTATION_MASK + 1)
+        size = (part & ROTATION_MASK) * (np.sqrt(0.5) / ROTATION_MASK)
+        smaller[place] = np.where(part > ROTATION_MASK, -size, size)
+    return with_largest(largest, smaller)[[3, 0, 1, 2]]

@@ -1,4 +1,9 @@
-"""Quality of one view, and its means over all evaluated views."""
+"""Quality of one view, and its means over all evaluated views.
+
+Plain figures count every pixel alike. Covered figures divide the same squared errors by the pixels that the original
+covers: each pixel counts by the original's alpha there. Empty background then cannot dilute an error, and errors outside
+the original's silhouette still count. Both are equal where the original fills the picture.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +18,9 @@ from flexgs_edge.quality.psnr import drop, mean_psnr, modelled_drop, mse, psnr
 
 Distance = Callable[[np.ndarray, np.ndarray], float | None]
 """Distance of two [H, W, 3] images; `None` if it is not defined for them."""
+LEAST_COVERAGE = 0.1
+"""The worst view by covered figures has at least this share of the mean coverage. Views that see a few faint pixels have
+large errors relative to them, and nobody would see these."""
 Similarities = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | None]]
 """Similarities of pairs of [H, W, 3] images, all of one size."""
 
@@ -33,6 +41,8 @@ class ViewQuality:
         SSIM against the original's render, against the photo, and of the original against the photo.
     lpips_original, lpips_photo, original_lpips : float or None
         LPIPS of the same three pairs; `None` unless it was asked for.
+    coverage : float
+        Share of the picture that the original covers, 0 to 1: the mean over the pixels of its accumulated alpha.
     """
 
     name: str
@@ -45,6 +55,17 @@ class ViewQuality:
     lpips_original: float | None = None
     lpips_photo: float | None = None
     original_lpips: float | None = None
+    coverage: float = 1.0
+
+    @property
+    def covered_error(self) -> float | None:
+        """Squared error against the original's render, per covered pixel and channel; `None` if the original covers nothing."""
+        return self.error / self.coverage if self.coverage else None
+
+    @property
+    def covered_fidelity(self) -> float | None:
+        """PSNR from `covered_error`, dB; also `None` if the original covers nothing."""
+        return psnr(self.covered_error or 0.0)
 
     @property
     def fidelity(self) -> float | None:
@@ -79,10 +100,13 @@ class Quality:
         One record for each view, sorted by name.
     base_psnr : float
         Assumed PSNR of the original against photos, for the modelled drop, dB.
+    covered_decides : bool
+        The covered figures decide: there are no photos. Default: the plain figures decide.
     """
 
     views: tuple[ViewQuality, ...]
     base_psnr: float = DEFAULT_BASE_PSNR
+    covered_decides: bool = False
 
     def _mean(self, name: str) -> float | None:
         return mean_psnr([getattr(view, name) for view in self.views])
@@ -118,6 +142,38 @@ class Quality:
         return modelled_drop(self.error, self.base_psnr)
 
     @property
+    def coverage(self) -> float:
+        """Mean coverage of the views."""
+        return math.fsum(view.coverage for view in self.views) / max(len(self.views), 1)
+
+    @property
+    def covered_error(self) -> float:
+        """Squared error of all views over their covered pixels: `error` divided by `coverage`.
+
+        Each view counts by its coverage, so that a view of a few faint pixels cannot decide. If no view covers anything,
+        it is the plain error.
+        """
+        return self.error / (self.coverage or 1.0)
+
+    @property
+    def covered_fidelity(self) -> float | None:
+        """Mean of the views' covered fidelity, weighted by their coverage, dB; `None` if every covered view is identical."""
+        found = [(view.coverage, view.covered_fidelity) for view in self.views]
+        known = [(weight, value) for weight, value in found if value is not None]
+        total = math.fsum(weight for weight, _ in known)
+        return math.fsum(weight * value for weight, value in known) / total if known else None
+
+    @property
+    def deciding_error(self) -> float:
+        """The mean squared error that decides: `covered_error` or `error`."""
+        return self.covered_error if self.covered_decides else self.error
+
+    @property
+    def covered_modelled_drop(self) -> float:
+        """Modelled drop in dB, from `covered_error`."""
+        return modelled_drop(self.covered_error, self.base_psnr)
+
+    @property
     def identical(self) -> int:
         """Number of views with a render identical to the original's."""
         return sum(view.error == 0.0 for view in self.views)
@@ -139,9 +195,18 @@ class Quality:
 
     @property
     def by_loss(self) -> list[int]:
-        """Indices of the views, the worst first: by drop if all have photos, else by error."""
+        """Indices of the views, the worst first: by drop if all have photos, else by the error that decides.
+
+        If covered figures decide, views with hardly any coverage come last (`LEAST_COVERAGE`).
+        """
         drops = [view.drop for view in self.views]
-        losses = [view.error if None in drops else drop or 0.0 for view, drop in zip(self.views, drops)]
+        if None not in drops:
+            losses = [drop or 0.0 for drop in drops]
+        elif not self.covered_decides:
+            losses = [view.error for view in self.views]
+        else:
+            least = LEAST_COVERAGE * self.coverage
+            losses = [(view.covered_error or 0.0) if view.coverage >= least else -1.0 for view in self.views]
         return sorted(range(len(losses)), key=lambda index: -losses[index])
 
     @property
@@ -173,6 +238,7 @@ def compare_view(
     original_error: float | None = None,
     ssims: Similarities | None = None,
     lpips: Distance | None = None,
+    coverage: float = 1.0,
 ) -> ViewQuality:
     """Measure the quality of one render.
 
@@ -190,6 +256,8 @@ def compare_view(
         Measures the similarity of all pairs of images; by default SSIM is left out.
     lpips : callable, optional
         Measures a distance of all pairs of images; left out by default. LPIPS takes seconds for each pair.
+    coverage : float
+        Share of the picture that the original covers. Default: all of it.
     """
     if photo is not None and original_error is None:
         original_error = mse(original, photo)
@@ -208,4 +276,5 @@ def compare_view(
         lpips_original=lpips(image, original) if lpips else None,
         lpips_photo=lpips(image, photo) if lpips and photo is not None else None,
         original_lpips=lpips(original, photo) if lpips and photo is not None else None,
+        coverage=coverage,
     )

@@ -113,6 +113,7 @@ class Renderer:
         """Largest share of its rows that a scene has shown in a compact view so far."""
         self._ahead = ViewsAhead(backend, self.fit.ahead)
         self._buffers: ViewBuffers | None = None
+        self._drawn: _View | None = None
         self._aimed: Any = None
         self._words = np.empty(0, np.uint32)
 
@@ -189,6 +190,15 @@ class Renderer:
         """The last drawn view, also if it was drawn for sums, in the layout of `render_planes`."""
         assert self._buffers is not None
         return self.backend.read(self._buffers.image)
+
+    def drawn_coverage(self) -> float:
+        """Share of the last drawn view that its splats cover: the mean over its pixels of 1 - transmittance, in [0, 1].
+
+        It has the same bits for all forms of a scene (whole, in chunks, compact) and for the twins.
+        """
+        assert self._drawn is not None
+        self._blend(self._drawn, "blend", again=True, finish=False)
+        return self._drawn.buffers.coverage()
 
     def add_statistics(self, scene: DeviceScene, camera: Camera, statistics: Statistics) -> None:
         """Add the hits and weights of every row in one view to `statistics`."""
@@ -314,8 +324,9 @@ class Renderer:
         count = scene.count if self.view_rows is None else len(self.view_rows)
         shown, pairs = self._sort(count, buffers)
         self.splats_shown = shown
-        batches = [(0, shown)] if pairs <= buffers.capacity else self._batches(buffers, shown)
-        return _View(buffers, camera, batches, count)
+        batches = [(0, shown)] if pairs <= buffers.capacity else buffers.batches(shown)
+        self._drawn = _View(buffers, camera, batches, count)
+        return self._drawn
 
     def _project(self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers) -> None:
         self.backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
@@ -344,15 +355,20 @@ class Renderer:
             self.release()
             self._buffers = buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
 
-    def _blend(self, view: _View, blend: str, extra: tuple[Any, ...] = (), again: bool = False) -> None:
-        """Blend all batches. With `again`, a single batch reuses the tile lists that are still there."""
+    def _blend(
+        self, view: _View, blend: str, extra: tuple[Any, ...] = (), again: bool = False, finish: bool = True
+    ) -> None:
+        """Blend all batches. With `again`, a single batch reuses the tile lists that are still there.
+
+        Without `finish`, the image stays as it is, and colour and transmittance are left in the view's `state`.
+        """
         backend, buffers, camera = self.backend, view.buffers, view.camera
         for index, (start, stop) in enumerate(view.batches):
             if not (again and len(view.batches) == 1):
                 self._list_tiles(buffers, camera, start, stop - start)
             backend.launch(
                 blend, (buffers.tiles,), buffers.tiles_x, backend.tile_blocks, camera.width, camera.height,
-                int(index > 0), int(index == len(view.batches) - 1), *self.background,
+                int(index > 0), int(finish and index == len(view.batches) - 1), *self.background,
                 buffers.ends, buffers.pairs, buffers.records, buffers.state, buffers.image, *extra,
             )  # fmt: skip
 
@@ -404,17 +420,6 @@ class Renderer:
             (keys_a, ids_a), (keys_b, ids_b) = (keys_b, ids_b), (keys_a, ids_a)
         return shown, pairs
 
-    def _batches(self, buffers: ViewBuffers, shown: int) -> list[tuple[int, int]]:
-        """Split the depth order into batches whose pairs fit the buffer."""
-        order = self.backend.read(buffers.sorted[0][1], np.empty(shown, np.uint32))
-        ends = np.cumsum(self.backend.read(buffers.bounds)[order], dtype=np.int64)
-        batches, start, done = [], 0, 0
-        while start < shown:
-            stop = int(np.searchsorted(ends, done + buffers.capacity, side="right"))
-            batches.append((start, stop))
-            start, done = stop, int(ends[stop - 1])
-        return batches
-
     def _list_tiles(self, buffers: ViewBuffers, camera: Camera, start: int, count: int) -> None:
         backend, blocks = self.backend, self.backend.tile_blocks
         ids = buffers.sorted[0][1]
@@ -433,7 +438,7 @@ class Renderer:
         self._words = np.empty(0, np.uint32)
         if self._buffers is not None:
             self._buffers.release()
-            self._buffers = None
+            self._buffers = self._drawn = None
         if self._aimed is not None:
             self._aimed.release()
             self._aimed = None

@@ -21,6 +21,9 @@ from flexgs_edge.render.fit import (
     view_shapes,
 )
 
+TILES_AT_ONCE = 1024
+"""Tiles whose state is copied to the host at a time."""
+
 
 def view_size(backend: Backend, camera: Camera) -> ViewSize:
     """The size of a view's buffers, apart from their rows."""
@@ -96,6 +99,30 @@ class ViewBuffers:
         made = self._backend.array(shape, dtype)
         self.arrays.append(made)
         return made
+
+    def batches(self, shown: int) -> list[tuple[int, int]]:
+        """Split the depth order of `shown` splats into batches whose pairs fit."""
+        order = self._backend.read(self.sorted[0][1], np.empty(shown, np.uint32))
+        ends = np.cumsum(self._backend.read(self.bounds)[order], dtype=np.int64)
+        batches, start, done = [], 0, 0
+        while start < shown:
+            stop = int(np.searchsorted(ends, done + self.capacity, side="right"))
+            batches.append((start, stop))
+            start, done = stop, int(ends[stop - 1])
+        return batches
+
+    def coverage(self) -> float:
+        """Mean over the view's pixels of 1 - transmittance, from `state` after the last batch.
+
+        A pixel that has ended keeps its transmittance with the sign flipped. Those outside the picture have -1.
+        """
+        covered = 0.0
+        for first in range(0, self.tiles, TILES_AT_ONCE):
+            part = np.empty((min(TILES_AT_ONCE, self.tiles - first), *self.state.shape[1:]), np.float32)
+            self._backend.read(self.state, part, first * part[0].size)
+            covered += float(np.sum(1.0 - np.abs(part[:, 3]).astype(np.float64)))
+        _, width, height = self.key
+        return covered / (width * height)
 
     def reference_arrays(self) -> tuple[Any, Any]:
         """The target image (f16) and the residual against it (f32), allocated at the first call."""

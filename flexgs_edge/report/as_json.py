@@ -10,7 +10,7 @@ from flexgs_edge.goals.target import Measurement
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 
 
-def json_text(record: dict[str, Any]) -> str:
+def json_text(record: dict[str, Any] | list[Any]) -> str:
     """Format a record as `--json` and reports write it."""
     return json.dumps(record, indent=2, allow_nan=False) + "\n"
 
@@ -26,6 +26,7 @@ def step_json(step: Step) -> dict[str, Any]:
         "drop": rounded(found.drop if found else None),
         "fidelity": rounded(found.fidelity if found else None),
         "modelled_drop": rounded(found.modelled_drop if found else None),
+        **_covered_json(found),
         "worst": _worst_json(found.worst) if found and found.worst else None,
         "holds": step.holds,
         "estimated": step.estimated,
@@ -38,6 +39,16 @@ def _worst_json(worst: Measurement) -> dict[str, float | None]:
         "drop": rounded(worst.drop),
         "fidelity": rounded(worst.fidelity),
         "modelled_drop": rounded(worst.modelled_drop),
+        **_covered_json(worst),
+    }
+
+
+def _covered_json(found: Measurement | None) -> dict[str, float | None]:
+    """The figures over covered pixels; null where the plain ones decide."""
+    covered = None if found is None else found.covered
+    return {
+        "covered_fidelity": rounded(covered.fidelity if covered else None),
+        "covered_modelled_drop": rounded(covered.modelled_drop if covered else None),
     }
 
 
@@ -51,6 +62,10 @@ def quality_json(quality: Quality) -> dict[str, Any]:
         "drop": rounded(quality.drop),
         "fidelity": rounded(quality.fidelity),
         "modelled_drop": rounded(quality.modelled_drop),
+        "coverage": rounded(quality.coverage, 6),
+        "covered_fidelity": rounded(quality.covered_fidelity),
+        "covered_modelled_drop": rounded(quality.covered_modelled_drop),
+        "covered_decides": quality.covered_decides,
         "base_psnr": quality.base_psnr,
         "psnr": rounded(quality.psnr),
         "original_psnr": rounded(quality.original_psnr),
@@ -71,6 +86,8 @@ def _view_json(view: ViewQuality) -> dict[str, Any]:
         "name": view.name,
         "drop": rounded(view.drop),
         "fidelity": rounded(view.fidelity),
+        "coverage": rounded(view.coverage, 6),
+        "covered_fidelity": rounded(view.covered_fidelity),
         "psnr": rounded(view.psnr),
         "original_psnr": rounded(view.original_psnr),
         "ssim": rounded(view.ssim_photo, 5),

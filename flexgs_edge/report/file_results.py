@@ -9,7 +9,7 @@ from flexgs_edge._version import __version__
 from flexgs_edge.codec.header import Section
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
 from flexgs_edge.report.summary import line, run_lines, scene_lines, text, view_lines
-from flexgs_edge.units import format_mib, format_size
+from flexgs_edge.units import format_mib, format_size, times_words
 
 if TYPE_CHECKING:
     from flexgs_edge.kernels.choose_device import DeviceInfo
@@ -27,12 +27,14 @@ class DecompressResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
+        ratio = self.scene.ratio_of(self.size)
         return {
             "program": f"flexgs-edge {__version__}",
             "command": "decompress",
             "input": self.scene.to_json(),
             "output": self.output,
             "size": self.size,
+            "ratio_of_input": None if ratio is None else round(ratio, 4),
             "notes": list(self.notes),
             "run": self.run.to_json(),
         }
@@ -41,6 +43,11 @@ class DecompressResult:
         """Return the text that the command prints."""
         lines = scene_lines("scene", self.scene)
         lines.append(line("wrote", f"{self.output}, {self.size} bytes ({format_size(self.size)})"))
+        if self.scene.bytes is not None:
+            change = (
+                "as large as" if self.size == self.scene.bytes else f"{times_words(self.scene.bytes / self.size)} than"
+            )
+            lines.append(line("size", f"{change} the input's {format_size(self.scene.bytes)}"))
         lines += [line("note", note) for note in self.notes]
         return text([*lines, *run_lines(self.run)])
 

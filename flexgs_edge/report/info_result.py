@@ -19,9 +19,9 @@ class InfoResult:
     path : str
         The file; for a model folder, its latest scene.
     format : str
-        `fgs`, `ply`, `spz`, `sog` or `compressed.ply`.
+        `fgs`, `ply`, `spz`, `sog`, `compressed.ply`, ...: by the file's first bytes, if they tell.
     size : int
-        Bytes of the file.
+        Bytes of the file, or of all files that are read.
     count, sh_count, sh_degree : int
         Gaussians, those that may have SH above degree 0, and the SH degree.
     origin : tuple of float
@@ -47,7 +47,11 @@ class InfoResult:
     cameras, images : str or None
         Cameras and photos beside a file of another format.
     antialiased : bool or None
-        Whether a file of another format, or its model folder, asks for antialiased drawing.
+        Whether a file of another format, or its model folder, asks for antialiased drawing; `None`: neither says so.
+    format_version : int or None
+        Version of another format, if the file states one.
+    frame : str or None
+        Directions of the axes in a file of another format, such as `RUB`; it is read into RDF.
     """
 
     path: str
@@ -69,6 +73,8 @@ class InfoResult:
     cameras: str | None = None
     images: str | None = None
     antialiased: bool | None = None
+    format_version: int | None = None
+    frame: str | None = None
 
     @property
     def ratio(self) -> float | None:
@@ -105,6 +111,8 @@ class InfoResult:
                 "cameras": self.cameras,
                 "images": self.images,
                 "antialiased": self.antialiased,
+                "format_version": self.format_version,
+                "frame": self.frame,
                 "notes": list(self.notes),
             }
         record |= {
@@ -127,7 +135,8 @@ class InfoResult:
 
     def summary(self) -> str:
         """Return the text that the command prints."""
-        version = "" if self.version is None else f" version {self.version}"
+        number = self.format_version if self.version is None else self.version
+        version = "" if number is None else f" version {number}"
         lines = [f"{self.path}: {self.format}{version}, {self.size} bytes ({format_size(self.size)})"]
         with_sh = "" if self.version is None else f", {self.sh_count} of them with SH"
         lines.append(f"Gaussians:   {self.count}{with_sh}, SH degree {self.sh_degree}")
@@ -141,8 +150,10 @@ class InfoResult:
         if self.version is None:
             for word, beside in (("cameras:", self.cameras), ("images:", self.images)):
                 lines.append(f"{word:<12} {beside or 'none beside it'}")
-            if self.antialiased:
-                lines.append("antialiased: yes")
+            turned = "" if self.frame in (None, "RDF") else ", turned into RDF (x right, y down, z forward)"
+            lines.append(f"axes:        {self.frame}{turned}")
+            said = {True: "yes", False: "no", None: "not said"}[self.antialiased]
+            lines.append(f"antialiased: {said}")
         lines += [f"note:        {note}" for note in self.notes]
         if self.layers is not None:
             lines += _layer_lines(self.layers, self.cut_from)

@@ -15,7 +15,7 @@ from flexgs_edge.report.run_info import RunInfo, SceneInfo
 from flexgs_edge.report.search_chart import step_chart
 from flexgs_edge.report.summary import device_words, memory_words
 from flexgs_edge.report.tones import ERROR_SCALE, css_ramp
-from flexgs_edge.units import format_size
+from flexgs_edge.units import format_size, times_words
 
 FEW_ROWS = 16
 """With more steps than this, their table is folded up. With more views, their table scrolls."""
@@ -26,18 +26,22 @@ def compress_page(result: CompressResult, material: Material) -> str:
     quality, search, target = result.quality, result.search, material.target
     name = _name(result.output or result.scene.path)
     done, became = ("would be", "would become") if result.output is None else ("is", "became")
-    lead = f"{format_size(result.scene.ply_bytes)} of PLY {became} {format_size(result.size)}."
+    given = result.scene.bytes
+    if given is None or result.scene.plain:
+        given = result.scene.ply_bytes
+    kind = " of PLY" if result.scene.plain else ""
+    lead = f"{format_size(given)}{kind} {became} {format_size(result.size)}."
     if quality is not None:
         lead += f" {_loss_words(quality, result.quality_views)}"
     tiles = [
-        (f"{result.ratio:.2f}\u00d7", "smaller"),
-        (format_size(result.size), f"file, of {format_size(result.scene.ply_bytes)}"),
+        _times_tile(given / result.size),
+        (format_size(result.size), f"file, of {format_size(given)}"),
         *_quality_tiles(quality),
         (f"{100 * result.count / max(result.scene.count, 1):.1f} %", f"{count(result.count)} Gaussians kept"),
     ]
     return render(
         "compress.html",
-        title=f"{name} {done} {result.ratio:.1f} times smaller",
+        title=f"{name} {done} {times_words(given / result.size, 1)}",
         lead=lead,
         tiles=tiles,
         left="original",
@@ -53,7 +57,8 @@ def evaluate_page(result: EvaluateResult, material: Material) -> str:
     """Return the page of an `evaluate`, as HTML."""
     tiles, contents = _quality_tiles(result.quality), material.contents
     if contents is not None and contents.get("ratio"):
-        tiles.insert(0, (f"{contents['ratio']:.2f}\u00d7", f"smaller: {format_size(contents['size'])}"))
+        times, word = _times_tile(contents["ratio"])
+        tiles.insert(0, (times, f"{word}: {format_size(contents['size'])}"))
     tiles.append((count(result.scene.count), f"Gaussians, of {count(result.reference.count)}"))
     scenes = _scene_facts("scene", result.scene) + _scene_facts("against", result.reference)
     return render(
@@ -101,7 +106,10 @@ def _loss_words(quality: Quality, kind: str) -> str:
         if quality.drop < 0:  # compression can smooth noise
             return f"Against the photos PSNR rose by {-quality.drop:.2f} dB ({over})."
         return f"Against the photos {quality.drop:.2f} dB of PSNR were lost ({over})."
-    return f"Its renders have a PSNR of {quality.fidelity:.2f} dB against the original's ({over}); there are no photos."
+    return (
+        f"Its renders have a PSNR of {_decibel(quality.covered_fidelity)} against the original's, over what the original covers "
+        f"({over}); there are no photos."
+    )
 
 
 def _quality_tiles(quality: Quality | None) -> list[tuple[str, str]]:
@@ -110,12 +118,21 @@ def _quality_tiles(quality: Quality | None) -> list[tuple[str, str]]:
     tiles = []
     if quality.drop is not None:
         tiles.append((f"{quality.drop:.2f} dB", "drop against the photos"))
+    elif quality.covered_decides:
+        words = f"modelled drop over what the original covers, from {quality.base_psnr:g} dB"
+        tiles.append((f"{quality.covered_modelled_drop:.2f} dB", words))
     else:
         tiles.append((f"{quality.modelled_drop:.2f} dB", f"modelled drop, from {quality.base_psnr:g} dB"))
-    tiles.append(("identical" if quality.fidelity is None else f"{quality.fidelity:.2f} dB", "fidelity"))
+    tiles.append((_decibel(quality.fidelity), "fidelity"))
+    covered = f"fidelity over what the original covers, {100 * quality.coverage:.3g} % of the pictures"
+    tiles.append((_decibel(quality.covered_fidelity), covered))
     if quality.ssim_original is not None:
         tiles.append((f"{quality.ssim_original:.4f}", "SSIM against the original"))
     return tiles
+
+
+def _decibel(value: float | None) -> str:
+    return "identical" if value is None else f"{value:.2f} dB"
 
 
 def _channel_rows(contents: Mapping[str, Any]) -> list[tuple[str, int, list[object]]]:
@@ -137,8 +154,7 @@ def _channel_rows(contents: Mapping[str, Any]) -> list[tuple[str, int, list[obje
 def _compress_facts(result: CompressResult) -> list[tuple[str, object]]:
     facts = _scene_facts("scene", result.scene)
     facts.append(("file", result.output or "none (dry run)"))
-    ratios = f"{result.ratio:.2f} times smaller ({result.ratio_without_normals:.2f} than a PLY without normals)"
-    facts.append(("size", f"{count(result.size)} bytes, {ratios}"))
+    facts.append(("size", f"{count(result.size)} bytes{_size_words(result)}"))
     kept = f"{count(result.count)} of {count(result.scene.count)} Gaussians, {count(result.sh_count)} with SH"
     facts.append(("kept", f"{kept} (prune rate {result.prune_rate:g}, SH rate {result.sh_rate:g})"))
     facts.append(("method", result.method + (f", score {result.score}" if result.score else "")))
@@ -155,8 +171,24 @@ def _compress_facts(result: CompressResult) -> list[tuple[str, object]]:
     return facts
 
 
+def _size_words(result: CompressResult) -> str:
+    scene, size = result.scene, result.size
+    parts = [] if scene.plain or scene.bytes is None else [f"{times_words(scene.bytes / size)} than the input"]
+    plain = times_words(scene.ply_bytes / size)
+    parts.append(f"{plain} than a PLY" if parts else plain)
+    return f", {', '.join(parts)} ({result.ratio_without_normals:.2f} times less than a PLY without normals)"
+
+
+def _times_tile(ratio: float) -> tuple[str, str]:
+    """Return the tile that says how many times smaller or larger a file is."""
+    times, _, word = times_words(ratio).split(" ")
+    return f"{times}\u00d7", word
+
+
 def _scene_facts(label: str, scene: SceneInfo) -> list[tuple[str, object]]:
     words = f"{scene.path}: {count(scene.count)} Gaussians, SH degree {scene.sh_degree}, {format_size(scene.ply_bytes)} as PLY"
+    if scene.bytes is not None and not scene.plain:
+        words += f", {count(scene.bytes)} bytes as it lies there"
     return [(label, words), *(("note", note) for note in scene.notes)]
 
 

@@ -17,7 +17,17 @@ from flexgs_edge.packed.sensitivity import Sensitivity
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.as_json import quality_json, rounded, step_json
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
-from flexgs_edge.report.summary import decibel, line, quality_lines, run_lines, scene_lines, similar, text, view_lines
+from flexgs_edge.report.summary import (
+    decibel,
+    line,
+    quality_lines,
+    ratio_lines,
+    run_lines,
+    scene_lines,
+    similar,
+    text,
+    view_lines,
+)
 from flexgs_edge.units import format_size
 
 
@@ -119,6 +129,11 @@ class CompressResult:
         return self.scene.ply_bytes / self.size
 
     @property
+    def ratio_of_input(self) -> float | None:
+        """Bytes of the input file divided by those of the file; `None` for a scene from memory."""
+        return self.scene.ratio_of(self.size)
+
+    @property
     def ratio_without_normals(self) -> float:
         """Bytes of the scene as a PLY without normals, divided by those of the file."""
         return self.scene.ply_bytes_without_normals / self.size
@@ -136,6 +151,7 @@ class CompressResult:
             "size": self.size,
             "ratio": round(self.ratio, 4),
             "ratio_without_normals": round(self.ratio_without_normals, 4),
+            "ratio_of_input": rounded(self.ratio_of_input),
             "count": self.count,
             "sh_count": self.sh_count,
             "prune_rate": self.prune_rate,
@@ -171,12 +187,7 @@ class CompressResult:
             lines.append(line("would write", f"{size}; nothing was written (--dry-run)"))
         else:
             lines.append(line("wrote", f"{self.output}, {size}"))
-        lines.append(
-            line(
-                "ratio",
-                f"{self.ratio:.2f}x of the PLY's {format_size(self.scene.ply_bytes)} ({_saved(self):.1f} % smaller)",
-            )
-        )
+        lines += ratio_lines(self.scene, self.size)
         share = f"{self.count} of {self.scene.count} Gaussians, {self.sh_count} of them with SH"
         lines.append(line("kept", f"{share} (prune rate {self.prune_rate:g}, SH rate {self.sh_rate:g})"))
         if self.format != "fgs":
@@ -203,15 +214,11 @@ class CompressResult:
         return text([*lines, *run_lines(self.run)])
 
 
-def _saved(result: CompressResult) -> float:
-    return 100.0 * (1.0 - 1.0 / result.ratio)
-
-
 def _decision_lines(result: CompressResult) -> list[str]:
     if result.target is None:
         return [line("target", "none: fixed rates, no search")]
     steps = result.search.steps if result.search else ()
-    verdict = "reached" if result.reached else "NOT reached: this is the closest point (--best-effort)"
+    verdict = "reached" if result.reached else "NOT reached: this is the closest point"
     lines = [line("target", f"{result.target}: {verdict}, after {len(steps)} steps")]
     lines.append(line("decided by", decided_words(result)))
     return lines
@@ -225,6 +232,8 @@ def decided_words(result: CompressResult) -> str:
         "fidelity": "the fidelity (PSNR against the original's renders)",
         "size": "the size; among points that fit, quality",
     }[result.decided_by or "size"]
+    if result.quality is not None and result.quality.covered_decides:
+        by += " over what the original covers"
     where = {
         "held-out": "on the held-out views, which decide only where to stop",
         "training": "on the training poses",
@@ -271,7 +280,18 @@ class EvaluateResult:
 
 def _view_table(views: Sequence[ViewQuality]) -> list[str]:
     rows: list[tuple[str, ...]] = [
-        ("view", "fidelity", "SSIM to ref.", "drop", "PSNR", "of original", "SSIM", "of original")
+        (
+            "view",
+            "fidelity",
+            "covered",
+            "coverage",
+            "SSIM to ref.",
+            "drop",
+            "PSNR",
+            "of original",
+            "SSIM",
+            "of original",
+        )
     ]
     with_lpips = any(view.lpips_original is not None for view in views)
     if with_lpips:
@@ -282,6 +302,8 @@ def _view_table(views: Sequence[ViewQuality]) -> list[str]:
             (
                 view.name,
                 decibel(view.fidelity),
+                decibel(view.covered_fidelity) if view.coverage else "-",
+                f"{100 * view.coverage:.3g} %",
                 similar(view.ssim_original),
                 decibel(view.drop) if photo else "-",
                 decibel(view.psnr) if photo else "-",

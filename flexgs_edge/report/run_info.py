@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+PLY_HEADER_MOST = 4096
+"""Most bytes of the header of a PLY in INRIA's layout; most have 1.5 kB."""
+
 
 @dataclass(frozen=True)
 class RunInfo:
@@ -55,7 +58,21 @@ class RunInfo:
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """An input scene."""
+    """An input scene.
+
+    Parameters
+    ----------
+    path : str
+        As given.
+    count, sh_degree : int
+        Gaussians and SH degree.
+    ply_bytes, ply_bytes_without_normals : int
+        Bytes of the scene as a PLY in INRIA's layout, and without its normals.
+    notes : tuple of str
+        Values that the reader left out or changed.
+    bytes : int or None
+        Bytes of the input file, or of all files that were read; `None` for a scene from memory.
+    """
 
     path: str
     count: int
@@ -63,6 +80,16 @@ class SceneInfo:
     ply_bytes: int
     ply_bytes_without_normals: int
     notes: tuple[str, ...] = ()
+    bytes: int | None = None
+
+    @property
+    def plain(self) -> bool:
+        """Whether the input is a PLY in INRIA's layout, by its bytes: only the header makes a difference then."""
+        return self.bytes is None or 0 <= self.bytes - self.ply_bytes < PLY_HEADER_MOST
+
+    def ratio_of(self, size: int) -> float | None:
+        """Bytes of the input divided by `size`; `None` for a scene from memory."""
+        return None if self.bytes is None else self.bytes / size
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields as JSON values."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
-from flexgs_edge.units import format_mib
+from flexgs_edge.units import format_mib, format_size, smaller_words
 
 if TYPE_CHECKING:  # so that `trim` and `verify` start without kernels
     from flexgs_edge.quality.view_quality import Quality
@@ -15,6 +15,16 @@ def scene_lines(label: str, scene: SceneInfo) -> list[str]:
     """Describe an input scene and its notes."""
     lines = [line(label, f"{scene.path}: {scene.count} Gaussians, SH degree {scene.sh_degree}")]
     return lines + [line("note", note) for note in scene.notes]
+
+
+def ratio_lines(scene: SceneInfo, size: int) -> list[str]:
+    """Compare `size` bytes with the input, and with INRIA's PLY where that is another number."""
+    lines = []
+    if scene.bytes is not None and not scene.plain:
+        ratio = f"{scene.bytes / size:.2f}x of the input's {format_size(scene.bytes)}"
+        lines.append(line("ratio", f"{ratio} ({smaller_words(size, scene.bytes)})"))
+    ratio = f"{scene.ply_bytes / size:.2f}x of the PLY's {format_size(scene.ply_bytes)}"
+    return [*lines, line("of a PLY" if lines else "ratio", f"{ratio} ({smaller_words(size, scene.ply_bytes)})")]
 
 
 def view_lines(views: ViewsInfo | None) -> list[str]:
@@ -57,11 +67,22 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
             f"{quality.modelled_drop:.3f} dB from a base of {quality.base_psnr:g} dB (mean, {where})",
         )
     )
+    lines.append(line("covered", covered_words(quality)))
     worst = quality.worst
     if worst is not None:
         drop = "" if worst.drop is None else f"drop {decibel(worst.drop)} dB, "
-        lines.append(line("worst view", f"{worst.name}: {drop}fidelity {decibel(worst.fidelity)}{unit}"))
+        covered = f", {decibel(worst.covered_fidelity)}{unit} covered" if quality.covered_decides else ""
+        lines.append(line("worst view", f"{worst.name}: {drop}fidelity {decibel(worst.fidelity)}{unit}{covered}"))
     return lines
+
+
+def covered_words(quality: Quality) -> str:
+    """Describe the figures over the part of the pictures that the original covers."""
+    unit = "" if quality.covered_fidelity is None else " dB"
+    return (
+        f"fidelity {decibel(quality.covered_fidelity)}{unit}, modelled drop {quality.covered_modelled_drop:.3f} dB over the "
+        f"part of the pictures that the original covers ({100 * quality.coverage:.3g} %)"
+    )
 
 
 def run_lines(run: RunInfo) -> list[str]:

@@ -81,8 +81,8 @@ class WorthResult:
             lines.append("  ".join([row[0].ljust(widths[0]), *cells]))
         lines += [
             "one bit less: at twice the step. dropped: SH of this degree and higher gone; opacity, dc and scale at their mean,",
-            "rotations gone. saves: bytes of the whole file. fidelity: PSNR in dB against this file's own renders; drop: the",
-            f"modelled drop in dB that goes with it, from a base of {self.base_psnr:g} dB.",
+            "rotations gone. saves: bytes of the whole file. fidelity: PSNR in dB against this file's own renders, over the",
+            f"pixels that they cover; drop: the modelled drop in dB that goes with it, from a base of {self.base_psnr:g} dB.",
         ]
         return "\n".join(lines) + "\n"
 

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.goals.steps import Scored
+from flexgs_edge.io.frames import RDF
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
+from flexgs_edge.quality.psnr import mse
+from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.inputs import CheckedScene
+from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.views.references import References
@@ -26,6 +32,12 @@ UNSEEN_SHARE = 0.01
 """We warn when automatic views miss more than this share of the Gaussians."""
 
 
+BEHIND_SHARE = 0.5
+"""We warn when more than this share of the Gaussians lies behind all cameras."""
+_SAMPLE_ROWS = 2048
+_SAMPLE_VIEWS = 64
+
+
 class TrainingPoses:
     """Compares a finished file with the original on some training views.
 
@@ -39,17 +51,34 @@ class TrainingPoses:
         The loaded original; the constructor draws its references.
     cameras : sequence of Camera
         All training views; up to `FIT_VIEWS` of them are used.
+    covered_decides : bool
+        As for `Quality`: fidelity is over covered pixels.
     progress : Progress, optional
         Shows a bar while the references are drawn.
     """
 
     def __init__(
-        self, renderer: Renderer, original: DeviceScene, cameras: Sequence[Camera], progress: Progress = SILENT
+        self,
+        renderer: Renderer,
+        original: DeviceScene,
+        cameras: Sequence[Camera],
+        covered_decides: bool,
+        progress: Progress = SILENT,
     ) -> None:
         count = min(FIT_VIEWS, len(cameras))
         self._renderer = renderer
         self._cameras = [cameras[i * len(cameras) // count].every(FIT_STEP) for i in range(count)]
-        self._references = References.of(renderer, original, self._cameras, progress=progress)
+        self._covered_decides = covered_decides
+        self._coverage: list[float] = []
+        self._references = References()
+        in_turn = renderer.in_turn(original, self._cameras)
+        try:
+            for view, camera in enumerate(progress.track(in_turn, "rendering the original", count)):
+                self._references.add(view, renderer.render_planes(original, camera))
+                self._coverage.append(renderer.drawn_coverage())
+        except BaseException:
+            self.close()
+            raise
 
     def fidelity(self, scene: DeviceScene) -> float | None:
         """Mean fidelity of `scene` over these views, dB; `None` if all renders are identical."""
@@ -57,12 +86,37 @@ class TrainingPoses:
         for view, camera in enumerate(self._renderer.in_turn(scene, self._cameras)):
             inside = (slice(None), slice(camera.height), slice(camera.width))
             planes = self._renderer.render_planes(scene, camera)
-            found.append(psnr(mse(planes[inside], self._references[view][inside])))
-        return mean_psnr(found)
+            error = mse(planes[inside], self._references[view][inside])
+            found.append(ViewQuality(camera.name, error, coverage=self._coverage[view]))
+        return measurement_of(Quality(tuple(found), covered_decides=self._covered_decides)).figure("fidelity")
 
     def close(self) -> None:
         """Free the renders of the original."""
         self._references.close()
+
+
+def frame_doubts(views: ViewSet, scene: CheckedScene) -> tuple[str, ...]:
+    """Warn if a scene that was turned from another frame lies behind the cameras that belong to it.
+
+    Files of phones often break the rule of their format. A sample of positions and cameras tells. Cameras around a scene tell
+    nothing, as it lies before some of them either way.
+    """
+    if scene.frame == RDF or views.cameras_from == AUTO_CAMERAS:
+        return ()
+    source = scene.source
+    rows = np.arange(0, source.count, -(-source.count // _SAMPLE_ROWS))
+    means = source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
+    behind = np.ones(rows.size, bool)
+    for camera in views.cameras[:: -(-len(views.cameras) // _SAMPLE_VIEWS)]:
+        behind &= camera.rotation[2] @ means + camera.translation[2] <= 0
+    share = float(behind.mean())
+    if share <= BEHIND_SHARE:
+        return ()
+    return (
+        f"{100 * share:.0f} % of the Gaussians lie behind all {len(views.cameras)} cameras of {views.cameras_from}. The file's "
+        f"axes were read as {scene.frame.name} (x, y, z) and turned into RDF. Give the right ones with --frame, such as "
+        "--frame RDF for a file in the cameras' own frame.",
+    )
 
 
 def doubts(

@@ -9,12 +9,16 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from flexgs_edge.constants import DEFAULT_NEAR
+from flexgs_edge.errors import InputError
+from flexgs_edge.io.frames import RDF, Frame
 from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.io.ply import inria_dtype
+from flexgs_edge.io.reading import AS_WRITTEN, Reading
 from flexgs_edge.report.run_info import SceneInfo
-from flexgs_edge.run.open_scene import open_scene
+from flexgs_edge.run.open_scene import open_file
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.scene.check import check_scene
+from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.source import SceneSource
 
 Options = TypeVar("Options", bound=ViewOptions)
@@ -32,21 +36,31 @@ class CheckedScene:
         As given; `None` for a scene from memory, which has no cameras or photos beside it.
     source : SceneSource
         Every value is finite; there is at least one Gaussian.
-    input_count : int
-        Gaussians in the file, before invalid ones were left out.
+    input_count, input_sh_degree : int
+        Gaussians and SH degree of the file, before anything was left out.
     settings : dict
         How a `.fgs` was made. Other files only state drawing settings, if any (`antialiased` in a `.spz`).
+    held_bytes : int
+        Bytes of the file's packed values in memory.
+    file_bytes : int or None
+        Bytes of the input file, or of all files that were read; `None` for a scene from memory.
+    frame : Frame
+        Directions of the axes in the file.
     """
 
     path: Path | None
     source: SceneSource
     input_count: int
+    input_sh_degree: int
     settings: dict[str, Any]
+    held_bytes: int = 0
+    file_bytes: int | None = None
+    frame: Frame = RDF
 
     @property
     def ply_bytes(self) -> int:
         """Bytes of the scene as a PLY in INRIA's layout, with normals: 248 per Gaussian at SH degree 3."""
-        return self.input_count * inria_dtype(self.source.sh_degree).itemsize
+        return self.input_count * inria_dtype(self.input_sh_degree).itemsize
 
     @property
     def ply_bytes_without_normals(self) -> int:
@@ -63,18 +77,31 @@ def read_scene(path: str | os.PathLike[str], drop_invalid: bool = False) -> Scen
     return load_scene(path, drop_invalid).source
 
 
-def load_scene(path: ScenePlace, drop_invalid: bool = False) -> CheckedScene:
+def load_scene(path: ScenePlace, drop_invalid: bool = False, reading: Reading = AS_WRITTEN) -> CheckedScene:
     """Open a scene and check every value once. Raises `InputError` for invalid values, unless `drop_invalid` leaves them out.
 
-    Returns a scene that is already open unchanged.
+    A scene that is already open only loses SH above the degree that `reading` names.
     """
-    return path if isinstance(path, CheckedScene) else checked_scene(open_scene(path), Path(path), drop_invalid)
+    if isinstance(path, CheckedScene):
+        if reading.frame is not None or reading.lod is not None:
+            raise InputError("frame and lod say how a file is read, and this scene is open: give them to Scene.open")
+        return replace(path, source=without_degrees(path.source, reading.sh_degree))
+    opened = open_file(path, reading)
+    checked = checked_scene(opened.source, Path(path), drop_invalid)
+    source = without_degrees(checked.source, reading.sh_degree)
+    return replace(checked, source=source, file_bytes=opened.bytes, frame=opened.frame)
 
 
 def checked_scene(opened: SceneSource, path: Path | None = None, drop_invalid: bool = False) -> CheckedScene:
     """Check every value of an open scene once."""
-    settings = dict(getattr(opened, "settings", {}))
-    return CheckedScene(path, check_scene(opened, drop_invalid), opened.count, settings)
+    return CheckedScene(
+        path,
+        check_scene(opened, drop_invalid),
+        opened.count,
+        opened.sh_degree,
+        dict(opened.settings),
+        opened.held_bytes,
+    )
 
 
 def resolve_drawing(options: Options, scene: CheckedScene, companions: Companions) -> Options:
@@ -113,4 +140,5 @@ def scene_info(scene: CheckedScene) -> SceneInfo:
         ply_bytes=scene.ply_bytes,
         ply_bytes_without_normals=scene.ply_bytes_without_normals,
         notes=tuple(scene.source.notes),
+        bytes=scene.file_bytes,
     )

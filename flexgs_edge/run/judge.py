@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
-from flexgs_edge.goals.target import Measurement
+from flexgs_edge.errors import InputError
+from flexgs_edge.goals.target import Covered, Measurement
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.psnr import mse
 from flexgs_edge.quality.ssim import ssim_bytes, ssims
 from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view
 from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.view_set import ViewSet
+from flexgs_edge.scene.check import alive, invisible
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.bench import Bench
 
@@ -24,12 +28,17 @@ LIBRARY_BYTES = 12 * 2**20
 """Bound on the bytes that loading Pillow and decoding with it take: docs/results/tuning.md#memory"""
 WORK_BYTES = 100
 """Bound on the bytes per pixel while a photo is decoded or SSIM is computed. SSIM's share includes the backend's buffers."""
+CHECK_ROWS = 1 << 18
+"""Rows whose opacity is read at a time, where no view sees any Gaussian."""
 ESTIMATE_STEP = 2
 """An estimate reads every second pixel in both directions."""
 
 
 class Judge:
     """Compares a scene with the original, and with photos, over some views.
+
+    Without photos, the figures over covered pixels decide: background that the original leaves empty must not dilute an
+    error. With photos, the plain figures decide, as everywhere else.
 
     Parameters
     ----------
@@ -65,6 +74,8 @@ class Judge:
         self.source = source
         self.cameras = views.of(indices)
         self.photos = views.photos if with_photos else None
+        self.covered_decides = views.photos is None
+        self._automatic = views.cameras_from == AUTO_CAMERAS
         self.base_psnr = base_psnr
         self.reports = reports
         self.indices = list(indices)
@@ -72,6 +83,7 @@ class Judge:
         self._kept: dict[tuple[str, int], np.ndarray] = {}
         self._away: dict[tuple[str, int], np.ndarray] = {}
         self._original_error: list[float] = []
+        self._coverage: list[float] = []
         self._coarse_error: dict[int, float] = {}
         self._known: dict[bytes, Quality] = {}
         # Reserve the memory now: scenes that are loaded later must not count on it.
@@ -86,17 +98,43 @@ class Judge:
         budget.reclaimers.append(self._give_back)
 
     def prepare(self, scene: DeviceScene, progress: Progress = SILENT) -> None:
-        """Draw the references from `scene`, the loaded original, and measure them against the photos."""
-        self._original_error, self._coarse_error, self._known = [], {}, {}
-        images = self.bench.images(scene, self.cameras)
-        for i, drawn in enumerate(progress.track(images, "drawing the original", len(self.cameras))):
+        """Draw the references from `scene`, the loaded original, and measure them against the photos.
+
+        A cluster does not draw them: its images do not tell what the original covers.
+
+        Raises
+        ------
+        InputError
+            When no view sees any Gaussian.
+        """
+        self._original_error, self._coverage, self._coarse_error, self._known = [], [], {}, {}
+        cameras = progress.track(self.renderer.in_turn(scene, self.cameras), "drawing the original", len(self.cameras))
+        for i, camera in enumerate(cameras):
             # Clamp once, and store channel by channel as renders do: comparisons are then much faster.
-            image = _planes(drawn)
+            image = _planes(self.renderer.render(scene, camera))
+            self._coverage.append(self.renderer.drawn_coverage())
             self._keep(("original", i), image)
             if self.photos is not None:
                 photo = _planes(self.photos.load(self.indices[i]))
                 self._original_error.append(mse(image, photo))
                 self._keep(("photo", i), photo)
+        if not any(self._coverage):
+            raise self._nothing_seen()
+
+    def _nothing_seen(self) -> InputError:
+        source = self.source
+        logits = (
+            source.read(slice(start, min(start + CHECK_ROWS, source.count)), ["opacity_logits"])["opacity_logits"]
+            for start in range(0, source.count, CHECK_ROWS)
+        )
+        if not any(alive(part[0]).any() for part in logits):
+            return invisible(source)
+        placed = "" if self._automatic else f", let them be placed (--cameras {AUTO_CAMERAS})"
+        return InputError(
+            f"{source.name}: none of {len(self.cameras)} {'automatic ' if self._automatic else ''}views sees any Gaussian, so "
+            f"nothing can be compared. Give cameras that look at the scene (--cameras PATH){placed}, or move the near plane "
+            f"(--near, now {self.renderer.near:g})"
+        )
 
     def close(self) -> None:
         """Free the kept images and the reserved memory."""
@@ -157,8 +195,9 @@ class Judge:
             error = self._original_error[i] if self.photos is not None else None
             references = self.original(i), self._photo(i)
             ssims = self._ssims if with_ssim else None
-            found.append(compare_view(self.cameras[i].name, image, *references, error, ssims, lpips))
-        quality = Quality(tuple(found), self.base_psnr)
+            coverage = self._coverage[i]
+            found.append(compare_view(self.cameras[i].name, image, *references, error, ssims, lpips, coverage))
+        quality = Quality(tuple(found), self.base_psnr, self.covered_decides)
         if whole and drawn is None:
             drawn = scene.fingerprint(elsewhere)
         if drawn is not None:
@@ -171,8 +210,8 @@ class Judge:
         few = [camera.every(ESTIMATE_STEP) for camera in self.cameras]
         for i, camera in enumerate(self.renderer.in_turn(scene, few)):
             image = self.renderer.render(scene, camera)
-            found.append(compare_view(self.cameras[i].name, image, *self._coarse(i)))
-        return Quality(tuple(found), self.base_psnr)
+            found.append(compare_view(self.cameras[i].name, image, *self._coarse(i), coverage=self._coverage[i]))
+        return Quality(tuple(found), self.base_psnr, self.covered_decides)
 
     def _coarse(self, i: int) -> tuple[np.ndarray, np.ndarray | None, float | None]:
         """References of an estimate: original and photo at its pixels, and the mean squared error between them."""
@@ -249,13 +288,13 @@ def _coarse_pixels(camera: Camera) -> int:
 def measurement_of(quality: Quality) -> Measurement:
     """The figures that a search decides on: the means, and those of the worst view."""
     worst = quality.worst
-    alone = None if worst is None else Quality((worst,), quality.base_psnr)
-    return Measurement(
-        quality.drop,
-        quality.fidelity,
-        quality.modelled_drop,
-        None if alone is None else Measurement(alone.drop, alone.fidelity, alone.modelled_drop),
-    )
+    alone = None if worst is None else replace(quality, views=(worst,))
+    return replace(_means(quality), worst=None if alone is None else _means(alone))
+
+
+def _means(quality: Quality) -> Measurement:
+    covered = Covered(quality.covered_fidelity, quality.covered_modelled_drop) if quality.covered_decides else None
+    return Measurement(quality.drop, quality.fidelity, quality.modelled_drop, covered=covered)
 
 
 def _planes(image: np.ndarray) -> np.ndarray:

@@ -62,7 +62,8 @@ class Judges:
                 if self.decide is not self.report:
                     self.decide.prepare(device_scene, run.progress)
                 if views.train and self._plan.report == views.held_out:
-                    self.training = TrainingPoses(renderer, device_scene, views.of(views.train), run.progress)
+                    cameras, covered_decides = views.of(views.train), self.report.covered_decides
+                    self.training = TrainingPoses(renderer, device_scene, cameras, covered_decides, run.progress)
             yield device_scene
         renderer.release()
 

@@ -1,35 +1,68 @@
-"""Open a scene file with the reader of its suffix."""
+"""Open a scene file with the reader of its format: that of its suffix, or of its first bytes for every kind of PLY."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from importlib import import_module
+from dataclasses import dataclass
 from pathlib import Path
 
-from flexgs_edge.errors import InputError
-from flexgs_edge.io.formats import FORMATS
+from flexgs_edge.errors import FormatError, InputError
+from flexgs_edge.files import check_readable
+from flexgs_edge.io.formats import FORMATS, format_of
+from flexgs_edge.io.frames import RDF, Frame, FrameSource, in_frame
+from flexgs_edge.io.gzipped import GZ, unpacked
+from flexgs_edge.io.kinds import GZIP_MAGIC, Kind, kind_of
 from flexgs_edge.io.model_folder import latest_iteration
 from flexgs_edge.io.ply import PlySource
+from flexgs_edge.io.reading import AS_WRITTEN, Reading
 from flexgs_edge.scene.source import SceneSource
 
-READERS: dict[str, str] = {
-    ".ply": "flexgs_edge.io.ply:PlySource",
-    ".fgs": "flexgs_edge.codec.open_fgs:open_fgs",
-    **dict.fromkeys(FORMATS, "flexgs_edge.io.exchange:read_foreign"),
-}
-"""Readers by suffix, as `module:function`. A reader is imported only when a file needs it, so start-up stays fast."""
+FOLDERS = ("lod-meta.json", "meta.json")
+"""Files that make a folder a scene, the first that is there."""
+SUFFIXES = (".fgs", ".ply", *FORMATS)
+_PLY = (".ply", ".compressed.ply")
+"""Formats that a file has if its first bytes say so, whatever its suffix: both are called .ply in the wild."""
 
 
-def open_scene(path: str | os.PathLike[str], readers: Mapping[str, str] = READERS) -> SceneSource:
-    """Open a scene file by its suffix, or the latest iteration of INRIA's model folder.
+@dataclass(frozen=True)
+class Opened:
+    """An open scene, and what is known of its file.
+
+    Parameters
+    ----------
+    source : SceneSource
+        With its axes in RDF.
+    suffix : str
+        Suffix of the file's format, which its name may lack.
+    bytes : int
+        Bytes of the file as it lies there, packed or not; of all files that are read, where there are several.
+    frame : Frame
+        Directions of the axes in the file.
+    version : int or None
+        Version of the format, if the file states one.
+    """
+
+    source: SceneSource
+    suffix: str
+    bytes: int
+    frame: Frame
+    version: int | None
+
+
+def open_scene(path: str | os.PathLike[str], reading: Reading = AS_WRITTEN) -> SceneSource:
+    """Open a scene file by its suffix, the latest iteration of INRIA's model folder, or a folder of SOG pictures.
 
     Parameters
     ----------
     path : path
-        A file, or the folder that INRIA's training program writes.
-    readers : mapping, optional
-        `module:function` for each suffix, with its dot.
+        A file, packed with gzip or not, or a folder.
+    reading : Reading, optional
+        Frame and level of detail.
+
+    Returns
+    -------
+    SceneSource
+        With its axes in RDF.
 
     Raises
     ------
@@ -38,16 +71,108 @@ def open_scene(path: str | os.PathLike[str], readers: Mapping[str, str] = READER
     FormatError
         If the file does not follow its format.
     """
+    return open_file(path, reading).source
+
+
+def open_file(path: str | os.PathLike[str], reading: Reading = AS_WRITTEN) -> Opened:
+    """Open a scene as `open_scene` does, and say what its file is."""
+    place = scene_file(path)
+    if reading.lod is not None and not place.name.lower().endswith("lod-meta.json"):
+        raise InputError(
+            f"{path}: --lod is for streamed scenes (lod-meta.json), and this file has one level: leave it out"
+        )
+    suffix, source = _open(place, place.name, os.fspath(place), reading)
+    inner = source.parent if isinstance(source, FrameSource) else source
+    size = inner.file_bytes or os.stat(place).st_size
+    frame = source.frame if isinstance(source, FrameSource) else RDF
+    return Opened(source, suffix, size, frame, inner.version)
+
+
+def scene_file(path: str | os.PathLike[str]) -> Path:
+    """The scene file that a path stands for: the file itself, or the one in the folder."""
     place = Path(path)
-    supported = f"supported: files ending in {', '.join(readers)}, or a model folder with point_cloud/iteration_*"
-    if place.is_dir():
-        return PlySource(latest_iteration(place))
-    if not place.exists():
-        raise InputError(f"{path}: no such file or folder; {supported}")
-    # Use the longest suffix: .compressed.ply is another format than .ply.
-    suffixes = [suffix for suffix in readers if place.name.lower().endswith(suffix) and place.suffix]
-    if not suffixes:
-        raise InputError(f"{path}: unknown kind of scene {place.suffix!r}; {supported}")
-    module, _, name = readers[max(suffixes, key=len)].partition(":")
-    source: SceneSource = getattr(import_module(module), name)(place)
-    return source
+    if os.path.isdir(place):
+        found = next((place / name for name in FOLDERS if os.path.isfile(place / name)), None)
+        return found or latest_iteration(place)
+    if not os.path.lexists(place):
+        raise InputError(f"{path}: no such file or folder; {_supported()}")
+    check_readable(place)
+    return place
+
+
+def is_fgs(path: Path) -> bool:
+    """Whether a path is read as a `.fgs`: by its suffix, unless its first bytes are those of a PLY."""
+    if path.suffix.lower() != ".fgs":
+        return False
+    check_readable(path)
+    found = kind_of(path, os.fspath(path))
+    return found is None or found.suffix not in _PLY
+
+
+def check_fgs(path: Path) -> None:
+    """Raise `InputError` for a path that is no file, or for a file whose first bytes are those of something else."""
+    check_readable(path)
+    found = kind_of(path, os.fspath(path))
+    if found is not None and found.suffix != ".fgs":
+        raise _refused(found, os.fspath(path))
+
+
+def _open(place: Path, file_name: str, name: str, reading: Reading) -> tuple[str, SceneSource]:
+    """Open `place`, whose format `file_name` tells; messages call it `name`. Also returns the suffix of its format."""
+    lower = file_name.lower()
+    found = kind_of(place, name)
+    if lower.endswith(GZ):
+        if _starts_with_gzip(place):
+            suffixes = []
+
+            def open_inner(inner: Path) -> SceneSource:
+                suffix, source = _open(inner, file_name[: -len(GZ)], name, reading)
+                suffixes.append(suffix)
+                return source
+
+            source = unpacked(place, name, open_inner)
+            return suffixes[0], source
+        if found is None:
+            raise FormatError(f"{name}: not a gzip file; is it complete?")
+        lower = file_name[: -len(GZ)].lower()  # browsers unpack files without a word, and keep their names
+    format = format_of(lower)
+    suffix = format.suffix if format else Path(lower).suffix
+    note: tuple[str, ...] = ()
+    if found is not None and suffix != found.suffix and suffix not in found.hosts:
+        if found.suffix not in _PLY:
+            raise _refused(found, name)
+        suffix, note = str(found.suffix), (f"read as {found.words}, as its first bytes say",)
+    if suffix in FORMATS:
+        # Imported only for these files, so that `info` of the others starts soon.
+        from flexgs_edge.io.exchange import read_foreign
+
+        source = read_foreign(place, reading, name, FORMATS[suffix])
+        source.notes += note
+        return suffix, source
+    if suffix == ".ply":
+        source = in_frame(PlySource(place, name=name), reading.frame or RDF)
+        source.notes += note
+        return suffix, source
+    if suffix != ".fgs":
+        what = f"unknown kind of scene {suffix!r}" if suffix else "its name has no suffix that tells what it is"
+        raise InputError(f"{name}: {what}; {_supported()}")
+    if os.fspath(place) != name:
+        raise InputError(f"{name}: a .fgs does not get smaller by gzip; unpack it first: gunzip {name}")
+    # Imported only for these files, so that the others start without the coder.
+    from flexgs_edge.codec.open_fgs import open_fgs
+
+    return suffix, in_frame(open_fgs(place), reading.frame or RDF)
+
+
+def _refused(kind: Kind, name: str) -> FormatError:
+    return kind.refused(name) if kind.suffix is None else kind.renamed(name, SUFFIXES)
+
+
+def _starts_with_gzip(place: Path) -> bool:
+    with open(place, "rb") as file:
+        return file.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+
+
+def _supported() -> str:
+    suffixes = ", ".join(SUFFIXES)
+    return f"supported: files ending in {suffixes}, each also with {GZ}, or a model folder with point_cloud/iteration_*"

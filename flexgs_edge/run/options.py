@@ -12,6 +12,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.steps import REFINE_STEPS
 from flexgs_edge.goals.target import Figure, MaxDrop, MaxSize, MinFidelity, Target, WorstToo, min_ratio
+from flexgs_edge.io.reading import Reading, Writing
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 
 NO_PHOTOS = "none"
@@ -77,15 +78,24 @@ class ViewOptions:
     resolution : int
         Scale wider views down to this many pixels. Fewer pixels are faster.
     near : float, optional
-        Near plane, scene units. Default: as a `.fgs` states, else 0.2.
+        Near plane, scene units. Default: as a `.fgs` states, else 0.2. Automatic views of small scenes need less, and get it.
     background : tuple of float, optional
         Red, green, blue in [0, 1]. Default: as a `.fgs` or `cfg_args` states, else black.
     extent : str, optional
         How far a Gaussian reaches on the screen: `exact` or `inria`. Default: as a `.fgs` states, else `exact`.
     antialiased : bool, optional
         Reduce opacities to make up for the screen-space dilation. Default: as a `.fgs` or `cfg_args` states, else no.
+    up : tuple of float, optional
+        Direction of up for automatic views, in the program's frame (that of a decompressed .ply). Default: what the scene
+        shows, else -y.
     drop_invalid : bool
         Leave out Gaussians with NaN, infinity or zero quaternions. Default: raise `InputError` for them.
+    frame : str, optional
+        Directions of the axes of the scene's file, such as `RUB`. Default: as the file says, else as its format has it.
+    lod : int, optional
+        Level of detail of a streamed scene, 0 is the finest. Default: the finest that is there.
+    sh_degree : int, optional
+        Leave out SH above this degree. Default: keep all.
     memory_limit : int, optional
         Bytes for the whole process. Default: three quarters of the free memory.
     device : str, optional
@@ -101,7 +111,11 @@ class ViewOptions:
     background: tuple[float, float, float] | None = None
     extent: str | None = None
     antialiased: bool | None = None
+    up: tuple[float, float, float] | None = None
     drop_invalid: bool = False
+    frame: str | None = None
+    lod: int | None = None
+    sh_degree: int | None = None
     memory_limit: int | None = None
     device: str | None = None
 
@@ -113,6 +127,16 @@ class ViewOptions:
             raise InputError(f"--near {self.near:g}: expected a distance above 0 in scene units")
         if self.background is not None and not all(0.0 <= c <= 1.0 for c in self.background):
             raise InputError(f"--background {self.background}: expected red, green and blue from 0 to 1")
+        if self.up is not None and not (
+            len(self.up) == 3 and all(math.isfinite(value) for value in self.up) and any(self.up)
+        ):
+            raise InputError(f"--up {self.up}: expected three finite numbers, not all zero, such as (0, -1, 0)")
+        _ = self.reading
+
+    @property
+    def reading(self) -> Reading:
+        """How the scene's file is read."""
+        return Reading.of(self.frame, self.lod, self.sh_degree)
 
 
 @dataclass(frozen=True)
@@ -139,7 +163,7 @@ class CompressOptions(ViewOptions):
     max_size : int, optional
         Size target: most bytes of the file.
     min_ratio : float, optional
-        Size target: PLY bytes divided by file bytes.
+        Size target: bytes of the scene as a PLY divided by file bytes, whatever format the scene was read from.
     prune_rate, sh_rate : float, optional
         Fixed rates from 0 to 1, instead of a search (`paper`). Give both or none.
     bits : str
@@ -162,6 +186,8 @@ class CompressOptions(ViewOptions):
     distil : int, optional
         Iterations that fine-tune the file against renders of the original, 0 for none (`best`, `.fgs`). Default: as the
         effort says.
+    spz_version : {3, 4}
+        Version of a `.spz` that is written. Older programs read only 3. Default: 3.
     layers : int
         Write the file in 1 to 4 layers, between which `trim` can cut it (`best`). Default: 1.
     scratch : str, optional
@@ -200,6 +226,7 @@ class CompressOptions(ViewOptions):
     views_margin: bool = False
     refit: bool = True
     distil: int | None = None
+    spz_version: int = 3
     layers: int = 1
     scratch: str | None = None
     resume: bool = False
@@ -235,13 +262,13 @@ class CompressOptions(ViewOptions):
             raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
         if self.score_cache is not None and self.score not in ("gs", "meson"):
             raise InputError(f"--score-cache keeps scores that are computed: leave it out with --score {self.score}")
+        _ = self.writing
         self._check_targets()
         self.bit_spec()
         _ = self.unseen_share
 
     def _check_targets(self) -> None:
-        words = ("max_drop", "min_fidelity", "max_size", "min_ratio")
-        given = ["--" + word.replace("_", "-") for word in words if getattr(self, word) is not None]
+        given = self.targets
         if len(given) > 1:
             raise InputError(f"{' and '.join(given)}: give one target")
         if (self.prune_rate is None) != (self.sh_rate is None):
@@ -257,6 +284,17 @@ class CompressOptions(ViewOptions):
                 f"--max-worst-drop with {other}: it goes with --max-drop or --min-fidelity; leave one of them out"
             )
         self.target("drop", 1)
+
+    @property
+    def targets(self) -> list[str]:
+        """The targets that the user named, as words of the command line; empty: the default decides."""
+        words = ("max_drop", "min_fidelity", "max_size", "min_ratio")
+        return ["--" + word.replace("_", "-") for word in words if getattr(self, word) is not None]
+
+    @property
+    def writing(self) -> Writing:
+        """How a file of another program's format is written."""
+        return Writing(self.spz_version, bool(self.antialiased))
 
     @property
     def unseen_share(self) -> float:

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_writable
-from flexgs_edge.io.converter import check_converter
-from flexgs_edge.io.formats import FORMATS, Format, format_of
+from flexgs_edge.io.formats import WRITTEN, Format, written_format
 from flexgs_edge.run.options import CompressOptions
 
 
@@ -45,7 +44,7 @@ def check_output(output: str | os.PathLike[str] | None, options: CompressOptions
     if output is None:
         raise InputError("-o OUT.fgs is missing: give the file to write, or --dry-run")
     if Path(output).suffix.lower() != ".fgs" and format is None:
-        raise InputError(f"-o {output}: expected a name that ends in .fgs, {', '.join(FORMATS)}")
+        raise InputError(f"-o {output}: expected a name that ends in .fgs, {', '.join(WRITTEN)}")
     check_writable(output, options.force)
     return Output(Path(output), format)
 
@@ -56,7 +55,7 @@ FORMAT_BITS = ("bits", "groups")
 
 def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOptions) -> Format | None:
     """The format that `-o` asks for, if the options fit it; `None` for `.fgs`."""
-    format = None if output is None else format_of(output)
+    format = None if output is None else written_format(output)
     if format is None:
         return None
     for name in FORMAT_BITS:
@@ -74,6 +73,4 @@ def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOpti
             f"--{'resume' if options.resume else 'scratch'} works on .fgs files alone: the search for a "
             f"{format.suffix} is in memory and in one go; leave it out"
         )
-    assert output is not None
-    check_converter(output)
     return format

@@ -25,6 +25,7 @@ from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.contents import contents
 from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.judge import Judge
+from flexgs_edge.run.open_scene import is_fgs
 from flexgs_edge.run.pictures import draw_shots, rig_of, shots_bytes
 from flexgs_edge.run.view_set import ViewSet
 
@@ -92,7 +93,7 @@ class Reporter:
 
     def read_contents(self, path: str | Path) -> None:
         """Read the bytes per channel of a finished `.fgs`. Other formats are skipped: `info` knows no channels of theirs."""
-        if Path(path).suffix.lower() == ".fgs":
+        if is_fgs(Path(path)):
             self._contents = contents(Path(path)).to_json()
 
     def read_contents_of(self, write: Callable[[Path], object]) -> None:

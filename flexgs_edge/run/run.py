@@ -13,12 +13,13 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.companions import companions_of, merge_companions
-from flexgs_edge.run.inputs import CheckedScene, Options, ScenePlace, load_scene, resolve_drawing
+from flexgs_edge.run.doubts import frame_doubts
+from flexgs_edge.run.inputs import LOG, CheckedScene, Options, ScenePlace, load_scene, resolve_drawing
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.outputs import NO_OUTPUT, Output, check_output
 from flexgs_edge.run.plan import Plan
 from flexgs_edge.run.reporter import Reporter
-from flexgs_edge.run.view_set import WITHOUT_VIEWS, GivenViews, ViewSet, find_views
+from flexgs_edge.run.view_set import WITHOUT_VIEWS, GivenViews, ViewSet, find_views, near_enough
 from flexgs_edge.scene.source import SceneSource
 
 
@@ -48,6 +49,8 @@ class Run(Generic[Options]):
         The file that `compress` writes.
     judged : CheckedScene or None
         The scene that is compared with this one (`evaluate`).
+    doubts : tuple of str
+        Warnings about how scene and cameras fit together; they are logged already.
     """
 
     options: Options
@@ -60,6 +63,7 @@ class Run(Generic[Options]):
     reporter: Reporter | None = None
     output: Output = NO_OUTPUT
     judged: CheckedScene | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def source(self) -> SceneSource:
@@ -123,13 +127,22 @@ def open_run(
         companions = _beside(path)
         if judged_path is not None:
             companions = merge_companions(companions, _beside(judged_path))
-        scene = load_scene(path, options.drop_invalid)
+        scene = load_scene(path, options.drop_invalid, options.reading)
         judged = None if judged_path is None else load_scene(judged_path, options.drop_invalid)
+        for each in (scene, judged):
+            if each is not None:
+                budget.take("the file's values", each.held_bytes)
+        asked = options.near
         options = resolve_drawing(options, judged if judged is not None and judged.settings else scene, companions)
         views = find_views(options, companions, scene.source, photos, given)
+        if asked is None and views is not None:
+            options, views = near_enough(options, views)
         if reporter is not None and views is not None:
             reporter.see_cameras(views, scene)
-    return Run(options, scene, views, None, budget, clock, progress, reporter, judged=judged)
+        found = () if views is None else frame_doubts(views, scene)
+        for warning in found:
+            LOG.warning("warning: %s", warning)
+    return Run(options, scene, views, None, budget, clock, progress, reporter, judged=judged, doubts=found)
 
 
 def planned(run: Run[CompressOptions]) -> Run[CompressOptions]:

@@ -61,4 +61,7 @@ def make_settings(
 
 
 def _means(found: Measurement) -> dict[str, float | None]:
-    return {"drop": found.drop, "fidelity": found.fidelity, "modelled_drop": found.modelled_drop}
+    means = {"drop": found.drop, "fidelity": found.fidelity, "modelled_drop": found.modelled_drop}
+    if found.covered is None:
+        return means
+    return {**means, "covered_fidelity": found.covered.fidelity, "covered_modelled_drop": found.covered.modelled_drop}

@@ -16,7 +16,7 @@ from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.report.run_info import ViewsInfo
-from flexgs_edge.run.inputs import LOG
+from flexgs_edge.run.inputs import LOG, Options
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOptions
 from flexgs_edge.scene.source import SceneSource
 
@@ -43,6 +43,8 @@ class ViewSet:
         Folder of the photos.
     notes : tuple of str
         How automatic cameras were placed, and which views were scaled or lost their distortion.
+    near : float or None
+        Largest near plane that does not cut off what automatic views show, scene units.
     """
 
     cameras: list[Camera]
@@ -52,6 +54,7 @@ class ViewSet:
     cameras_from: str
     images_path: Path | None
     notes: tuple[str, ...] = ()
+    near: float | None = None
 
     def of(self, indices: Sequence[int]) -> list[Camera]:
         """The cameras at `indices`."""
@@ -124,6 +127,11 @@ def find_views(
     """
     given = given or GivenViews()
     place = options.cameras or companions.cameras or AUTO_CAMERAS
+    if options.up is not None and (given.cameras is not None or place != AUTO_CAMERAS):
+        found = given.cameras_from if given.cameras is not None else place
+        raise InputError(
+            f"--up turns automatic views, but cameras come from {found}: leave --up out, or give --cameras {AUTO_CAMERAS}"
+        )
     cameras: Sequence[Camera]
     if given.cameras is not None:
         given = given.in_order_of_name()
@@ -164,10 +172,11 @@ def find_views(
 
 def _automatic_views(options: ViewOptions, source: SceneSource) -> ViewSet:
     LOG.info("generating camera views from the scene itself")
-    cameras, how = automatic_rig(source)
-    cameras, note = limit_width(cameras, options.resolution)
+    rig = automatic_rig(source, up=None if options.up is None else np.array(options.up))
+    cameras, note = limit_width(rig.cameras, options.resolution)
+    notes = (rig.note,) if note is None else (rig.note, note)
     train, held_out = split_views(len(cameras), options.holdout)
-    return ViewSet(cameras, None, train, held_out, AUTO_CAMERAS, None, (how,) if note is None else (how, note))
+    return ViewSet(cameras, None, train, held_out, AUTO_CAMERAS, None, notes, rig.near)
 
 
 def _images(options: ViewOptions, companions: Companions, place: str | Path) -> Path | None:
@@ -182,6 +191,15 @@ def _images(options: ViewOptions, companions: Companions, place: str | Path) -> 
     if beside is not None and Path(place).resolve() != beside.resolve():
         return None
     return companions.images
+
+
+def near_enough(options: Options, views: ViewSet) -> tuple[Options, ViewSet]:
+    """Bring the near plane of `options` so near that it does not cut off what automatic views show."""
+    assert options.near is not None
+    if views.near is None or options.near <= views.near:
+        return options, views
+    note = f"near plane {views.near:g} instead of {options.near:g}: the views stand that near to what they show"
+    return replace(options, near=views.near), replace(views, notes=(*views.notes, note))
 
 
 def views_info(views: ViewSet) -> ViewsInfo:

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.errors import InputError
-from flexgs_edge.scene.fields import FIELDS
+from flexgs_edge.scene.fields import FIELDS, OPACITY_LIMIT
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
 
 _TINY = np.finfo(np.float32).tiny
@@ -38,7 +39,8 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
 
     A row is invalid if a field has NaN or infinity, or an SH coefficient is beyond `SH_LARGEST`. It is also invalid if
     the norm of its quaternion is zero, or outside the range that float32 can normalise. Log-scales of -inf (flat
-    splats) are valid: they are read as the smallest finite log-scale of the scene.
+    splats) are valid: they are read as the smallest finite log-scale of the scene. Logits of +-inf (opacities 1 and 0)
+    are valid too: they are read as +-`OPACITY_LIMIT`.
 
     Parameters
     ----------
@@ -65,14 +67,15 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
         return source
     faults = _Faults()
     keep = np.ones(source.count if drop_invalid else 0, bool)
-    flat, smallest = 0, np.float32(np.inf)
+    flat, extreme, smallest = 0, 0, np.float32(np.inf)
     for rows in source.chunks(chunk_rows):
-        bad, scales = _check_chunk(source, rows, faults)
+        bad, infinite = _check_chunk(source, rows, faults)
         if drop_invalid:
             keep[rows] = ~bad
-        scales = scales[:, ~bad]
+        scales, logits = infinite["log_scales"][:, ~bad], infinite["opacity_logits"][:, ~bad]
         without = np.isneginf(scales)
         flat += int(without.any(axis=0).sum())
+        extreme += int(np.isinf(logits).sum())
         smallest = min(smallest, scales.min(initial=np.float32(np.inf), where=~without))
     if faults.count and not drop_invalid:
         raise InputError(
@@ -84,23 +87,31 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
     if faults.count:
         note = f"{faults.count} of {source.count} Gaussians left out as invalid: {faults}"
         source = SelectSource(source, np.flatnonzero(keep), (note,))
+    notes = []
     if flat:
         if not np.isfinite(smallest):
             raise InputError(f"{source.name}: log_scales: all are -inf; expected finite values")
-        source = _FlatSource(source, smallest, flat)
-    return source
+        notes.append(f"{flat} flat Gaussians: log-scales of -inf set to the smallest finite one, {float(smallest):.4g}")
+    if extreme:
+        notes.append(
+            f"{extreme} Gaussians of opacity 1 or 0: logits of +-inf set to +-{OPACITY_LIMIT:g} (0.999 or 0.001)"
+        )
+    return _FiniteSource(source, smallest, tuple(notes)) if notes else source
 
 
-def _check_chunk(source: SceneSource, rows: slice, faults: _Faults) -> tuple[np.ndarray, np.ndarray]:
-    """Find the invalid rows of a chunk; returns [n] bool, and the chunk's log-scales."""
+def _check_chunk(source: SceneSource, rows: slice, faults: _Faults) -> tuple[np.ndarray, Planes]:
+    """Find the invalid rows of a chunk; returns [n] bool, and the fields of the chunk that may be infinite."""
     bad = np.zeros(rows.stop - rows.start, bool)
-    scales = np.empty((0, 0), np.float32)
+    infinite: Planes = {}
     for field in FIELDS:
         values = source.read(rows, [field.name])[field.name]
         finite = np.isfinite(values)
         if field.name == "log_scales":
             finite |= np.isneginf(values)
-            scales = values
+        if field.name == "opacity_logits":
+            finite |= np.isinf(values)
+        if field.name in ("log_scales", "opacity_logits"):
+            infinite[field.name] = values
         broken = np.asarray(~finite.all(axis=0))
         faults.add(rows.start, broken, f"NaN or infinity in {field.name}")
         bad |= broken
@@ -115,22 +126,40 @@ def _check_chunk(source: SceneSource, rows: slice, faults: _Faults) -> tuple[np.
             faults.add(rows.start, useless, "quats of norm zero (or beyond float32)")
             bad |= useless
     faults.count += int(bad.sum())
-    return bad, scales
+    return bad, infinite
 
 
-class _FlatSource(SceneSource):
-    """A source whose log-scales are raised to at least `floor`."""
+class _FiniteSource(SceneSource):
+    """A checked source whose infinite values are read as finite ones: log-scales of at least `floor`, and bounded logits."""
 
-    def __init__(self, parent: SceneSource, floor: np.float32, count: int) -> None:
+    valid = True
+
+    def __init__(self, parent: SceneSource, floor: np.float32, notes: tuple[str, ...]) -> None:
         self.parent, self.floor = parent, np.float32(floor)
         self.name, self.count, self.sh_degree = parent.name, parent.count, parent.sh_degree
-        self.sh_count, self.origin = parent.sh_count, parent.origin
-        note = f"{count} flat Gaussians: log-scales of -inf set to the smallest finite one, {float(floor):.4g}"
-        self.notes = (*parent.notes, note)
+        self.sh_count, self.origin, self.notes = parent.sh_count, parent.origin, (*parent.notes, *notes)
+        # Without the parent's comments: these values do not lie on the grid that they may name.
+        self.settings, self.held_bytes = parent.settings, parent.held_bytes
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`."""
         planes = self.parent.read(rows, fields, out)
         if "log_scales" in planes:
             np.maximum(planes["log_scales"], self.floor, out=planes["log_scales"])
+        if "opacity_logits" in planes:
+            logits = planes["opacity_logits"]
+            np.copyto(logits, np.copysign(np.float32(OPACITY_LIMIT), logits), where=np.isinf(logits))
         return planes
+
+
+def alive(logits: np.ndarray) -> np.ndarray:
+    """[n] bool: opacity reaches 1/255. The renderer never draws the other rows, so removing them costs no quality."""
+    return logits >= np.float32(-np.log(1 / ALPHA_MIN - 1) - 1e-3)
+
+
+def invisible(source: SceneSource) -> InputError:
+    """The error for a scene of which no row is `alive`."""
+    return InputError(
+        f"{source.name}: no Gaussian is opaque enough to be drawn: all {source.count} have an opacity below 1/255, and nothing "
+        "would be left. Check that the file is a trained scene, with opacities before the sigmoid (logits)"
+    )

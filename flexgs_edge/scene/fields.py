@@ -37,6 +37,11 @@ class Field:
         return self.ply
 
 
+OPACITY_LIMIT = 7.0
+"""Logits of opacities 0 and 1 are -7 and 7. Files hold these opacities, and no finite logit reaches them. Half a step of 8
+bits from the end is 6.2."""
+
+
 def sh_rest_count(sh_degree: int) -> int:
     """Number of SH coefficients above degree 0, for one colour channel.
 

@@ -92,7 +92,7 @@ class PartsSource(SceneSource):
         self.phase = int(np.random.default_rng(seed).integers(self.virtual))
         self.name, self.sh_degree, self.origin = parent.name, parent.sh_degree, parent.origin
         self.sh_count = count if parent.sh_count else 0
-        self.notes = parent.notes
+        self.notes, self.settings, self.held_bytes = parent.notes, parent.settings, parent.held_bytes
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`; needs about 800 bytes a row, beside the arrays and the rows of the parent."""

@@ -49,6 +49,51 @@ def turned(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return result
 
 
+def matrices(quats: np.ndarray) -> np.ndarray:
+    """[n, 3, 3] f64, rotation matrices of quaternions ([4, n], any norm but zero)."""
+    columns = [turned(quats, np.broadcast_to(axis[:, None], (3, quats.shape[1]))) for axis in np.eye(3)]
+    found: np.ndarray = np.stack(columns, axis=-1).transpose(1, 0, 2)
+    return found
+
+
+def quats_of(rotations: np.ndarray) -> np.ndarray:
+    """[4, n] f64, unit quaternions of rotation matrices ([n, 3, 3] f64).
+
+    Each is taken from the column of q q^T that belongs to its largest component, so that no digits are lost.
+    """
+    m = np.moveaxis(np.asarray(rotations, np.float64), 0, -1)
+    outer = np.stack(
+        [
+            np.stack([1 + m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]),
+            np.stack([m[2, 1] - m[1, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]]),
+            np.stack([m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[2, 1] + m[1, 2]]),
+            np.stack([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], 1 - m[0, 0] - m[1, 1] + m[2, 2]]),
+        ]
+    )
+    largest = np.argmax(np.einsum("iin->in", outer), axis=0)
+    quats = np.take_along_axis(outer, largest[None, None], axis=0)[0]
+    found: np.ndarray = quats / np.sqrt((quats * quats).sum(axis=0))
+    return found
+
+
+def times(first: np.ndarray, quats: np.ndarray) -> np.ndarray:
+    """[4, n] f64, quaternions ([4, n]) turned by one more rotation, the unit quaternion `first` ([4])."""
+    w, x, y, z = np.asarray(first, np.float64)
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return combined(left, np.asarray(quats, np.float64))
+
+
+def combined(matrix: np.ndarray, planes: np.ndarray) -> np.ndarray:
+    """[m, ...], sums of planes ([k, ...]) with the weights of `matrix` [m, k].
+
+    A product of matrices would round in an order that depends on the number of columns.
+    """
+    found: np.ndarray = sum(
+        matrix[:, k].reshape(-1, *[1] * (planes.ndim - 1)) * planes[k][None] for k in range(len(planes))
+    )
+    return found
+
+
 def tilted(quats: np.ndarray, errors: np.ndarray) -> np.ndarray:
     """[4, n] f64, unit quaternions ([4, n]) after small turns about their own axes.
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +50,14 @@ class SceneSource(ABC):
         All rows are known to pass `check_scene`, which then need not read them.
     comments : tuple of str
         Comments of this program in the header of a PLY, such as the step sizes of the values' grid.
+    settings : mapping
+        What the file states: how a `.fgs` was made, and how a scene is drawn (`antialiased`).
+    held_bytes : int
+        Bytes of the file's packed values in memory, as long as the source lives.
+    file_bytes : int or None
+        Bytes of all files that the scene was read from, if there are several. `None`: the size of its only file.
+    version : int or None
+        Version of the format that the file states.
     """
 
     name: str
@@ -58,6 +68,10 @@ class SceneSource(ABC):
     notes: tuple[str, ...] = ()
     valid: bool = False
     comments: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = MappingProxyType({})
+    held_bytes: int = 0
+    file_bytes: int | None = None
+    version: int | None = None
 
     @abstractmethod
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
@@ -306,7 +320,8 @@ class SelectSource(SceneSource):
         self.rows: np.ndarray = plain.astype(np.int32 if parent.count < 2**31 else np.int64)
         self.name, self.count, self.sh_degree = parent.name, plain.size, parent.sh_degree
         self.sh_count = int(sh_rows[-1]) + 1 if sh_rows.size else 0
-        self.origin, self.notes = parent.origin, notes
+        self.origin, self.notes, self.valid = parent.origin, notes, parent.valid
+        self.settings, self.held_bytes = parent.settings, parent.held_bytes
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`; if the rows are out of order, the values read are copied once more."""

@@ -163,13 +163,13 @@ class StudyScene:
         return self._search
 
     def figures(self, size: int, found: Measurement) -> dict[str, Cell]:
-        """Cells of the columns `FIGURES`: bytes and quality."""
+        """Cells of the columns `FIGURES`: bytes, and quality in the figures that decide."""
         return {
             "size": size,
             "ratio": round(self.run.scene.ply_bytes / size, 3),
             "drop": _decibel(found.drop),
-            "fidelity": _decibel(found.fidelity),
-            "modelled_drop": _decibel(found.modelled_drop),
+            "fidelity": _decibel(found.figure("fidelity")),
+            "modelled_drop": _decibel(found.figure("modelled drop")),
         }
 
     def cells(self, point: Point) -> dict[str, Cell]:

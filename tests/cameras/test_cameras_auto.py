@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from flexgs_edge.cameras.auto import automatic_rig, fibonacci, look, up_axis
+from flexgs_edge.cameras.auto import automatic_rig, look
 from flexgs_edge.cameras.camera import Camera, split_views
+from flexgs_edge.cameras.directions import fibonacci
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.cameras.witnesses import gather_witnesses, sh_basis, weighted_quantiles
+from flexgs_edge.cameras.witnesses import sh_basis, weighted_quantiles
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.io.ply import PlySource
@@ -59,6 +64,12 @@ def with_sh(source: MemorySource, eye: np.ndarray, degree: int = 3, seed: int = 
     return MemorySource(planes, degree)
 
 
+def placed(source: SceneSource, views: int = 48, width: int = 640, height: int = 480) -> tuple[list[Camera], str]:
+    """Cameras of the automatic rig, and its note."""
+    rig = automatic_rig(source, views, width, height)
+    return rig.cameras, rig.note
+
+
 def centres(cameras: list[Camera]) -> np.ndarray:
     return np.array([camera.center for camera in cameras])
 
@@ -80,7 +91,7 @@ def blocked(source: SceneSource, camera: Camera, near: float) -> float:
 
 def test_an_object_is_seen_from_outside() -> None:
     source = ball(1.0, centre=(10.0, -3.0, 2.0))
-    cameras, note = automatic_rig(source, views=16, width=64, height=48)
+    cameras, note = placed(source, views=16, width=64, height=48)
     offsets = centres(cameras) - [10.0, -3.0, 2.0]
     distance = np.linalg.norm(offsets, axis=1)
     assert distance.min() > 1.2 and distance.max() < 8
@@ -94,7 +105,7 @@ def test_an_object_is_seen_from_outside() -> None:
 
 def test_a_room_is_seen_inside_out() -> None:
     source = room()
-    cameras, note = automatic_rig(source, views=16, width=64, height=48)
+    cameras, note = placed(source, views=16, width=64, height=48)
     assert (np.abs(centres(cameras)) < 3.9).all()
     # All six walls are looked at.
     assert (forwards(cameras) @ np.concatenate([np.eye(3), -np.eye(3)]).T).max(axis=0).min() > 0.6
@@ -103,14 +114,14 @@ def test_a_room_is_seen_inside_out() -> None:
 
 def test_an_object_in_a_room_is_seen_between_the_two() -> None:
     source = joined(ball(0.8, 2500), room(5.0))
-    cameras, _ = automatic_rig(source, views=16, width=64, height=48)
+    cameras, _ = placed(source, views=16, width=64, height=48)
     assert (np.linalg.norm(centres(cameras), axis=1) > 0.9).all() and (np.abs(centres(cameras)) < 4.9).all()
 
 
 @pytest.mark.parametrize("kind", ["object", "room", "both"])
 def test_no_view_starts_inside_matter(kind: str) -> None:
     source = {"object": ball(), "room": room(), "both": joined(ball(0.8, 2500), room(5.0))}[kind]
-    cameras, _ = automatic_rig(source, views=12, width=64, height=48)
+    cameras, _ = placed(source, views=12, width=64, height=48)
     assert max(blocked(source, camera, 0.15) for camera in cameras) < 0.3
 
 
@@ -118,85 +129,70 @@ def test_no_view_starts_inside_matter(kind: str) -> None:
 @pytest.mark.parametrize(("eye", "degree"), [((6.0, 0.0, 1.0), 2), ((0.0, -5.0, 0.5), 3)])
 def test_sh_tell_where_cameras_stood(eye: tuple[float, float, float], degree: int) -> None:
     source = with_sh(ball(1.5, 4000), np.array(eye), degree)
-    cameras, note = automatic_rig(source, views=16, width=64, height=48)
+    cameras, note = placed(source, views=16, width=64, height=48)
     side = np.array(eye) / np.linalg.norm(eye)
     standing = centres(cameras) @ side / np.linalg.norm(centres(cameras), axis=1)
     assert np.mean(standing) > 0.5 and "where SH are strongest" in note
-    blind, _ = automatic_rig(ball(1.5, 4000), views=16, width=64, height=48)
+    blind, _ = placed(ball(1.5, 4000), views=16, width=64, height=48)
     assert np.mean(centres(blind) @ side / np.linalg.norm(centres(blind), axis=1)) < 0.3
 
 
 def test_the_same_scene_gets_the_same_rig() -> None:
-    first, second = (automatic_rig(room(), views=9)[0] for _ in range(2))
+    first, second = (placed(room(), views=9)[0] for _ in range(2))
     assert [camera.name for camera in first] == [f"auto_{i:03d}" for i in range(9)] == sorted(c.name for c in first)
     for a, b in zip(first, second):
         np.testing.assert_array_equal(a.rotation, b.rotation)
         np.testing.assert_array_equal(a.translation, b.translation)
     assert {(c.width, c.height) for c in first} == {(640, 480)}
-    assert 2 * math.degrees(math.atan(320 / first[0].fx)) == pytest.approx(50)
+    assert 2 * math.degrees(math.atan(320 / first[0].fx)) == pytest.approx(65)
     for camera in first:
         np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(camera.rotation) == pytest.approx(1)
     # A smaller rig is the start of a larger one.
-    few, _ = automatic_rig(room(), views=4)
+    few, _ = placed(room(), views=4)
     np.testing.assert_allclose(centres(few), centres(first[:4]), atol=1e-12)
     np.testing.assert_allclose(forwards(few), forwards(first[:4]), atol=1e-12)
 
 
+def test_threads_change_nothing(sample_dir: Path) -> None:
+    code = (
+        "import sys, hashlib; from flexgs_edge.cameras.auto import automatic_rig; from flexgs_edge.io.ply import PlySource;"
+        "poses = [(c.rotation.tobytes(), c.translation.tobytes()) for c in automatic_rig(PlySource(sys.argv[1])).cameras];"
+        "print(hashlib.sha256(repr(poses).encode()).hexdigest())"
+    )
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", code, str(sample_dir / "point_cloud.ply")],
+            env={**os.environ, "OPENBLAS_NUM_THREADS": threads},
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+        for threads in ("1", "2", "7")
+    ]
+    assert len(found[0]) > 60 and found[0] == found[1] == found[2]
+
+
+def test_placing_views_is_quick() -> None:
+    """Scenes without SH once took ten seconds; today it is half a second, and machines differ."""
+    source = ball(1.0, 1500)
+    start = time.process_time()
+    automatic_rig(source)
+    assert time.process_time() - start < 3
+
+
 def test_scale_and_place_do_not_matter() -> None:
-    small, _ = automatic_rig(ball(), views=6)
+    small, _ = placed(ball(), views=6)
     planes = ball().read(slice(0, 3000), list(FIELD))
     planes["means"] *= 1024
     planes["log_scales"] += np.float32(math.log(1024))
-    large, _ = automatic_rig(MemorySource(planes, origin=np.array([5e6, -2e6, 0.0])), views=6)
+    large, _ = placed(MemorySource(planes, origin=np.array([5e6, -2e6, 0.0])), views=6)
     np.testing.assert_allclose(centres(large) - [5e6, -2e6, 0.0], centres(small) * 1024, rtol=1e-3, atol=1)
-
-
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_tiny_scenes(count: int) -> None:
-    points = np.random.default_rng(count).normal(size=(count, 3))
-    source = make_splats(points, np.full((count, 3), 0.1))
-    cameras, _ = automatic_rig(source, views=3, width=32, height=24)
-    for camera in cameras:
-        assert np.isfinite(camera.translation).all() and np.isfinite(camera.rotation).all()
-    images = [draw(open_form("numpy"), source, camera, near=1e-3) for camera in cameras]
-    assert max(float(image.max()) for image in images) > 0.1
-
-
-def test_scenes_with_far_outliers_and_extreme_scales() -> None:
-    source = joined(ball(), make_splats(np.array([[1e5, 0, 0], [0, -3e4, 0]]), np.array([[50.0] * 3, [1e-12] * 3])))
-    cameras, _ = automatic_rig(source, views=6)
-    assert np.linalg.norm(centres(cameras), axis=1).max() < 8
 
 
 def test_what_cannot_be_looked_at() -> None:
     with pytest.raises(InputError, match="0 automatic views: expected at least 1"):
         automatic_rig(ball(), views=0)
-
-
-@pytest.mark.parametrize(
-    ("places", "directions", "name"),
-    [
-        (
-            [[3, 0, 1], [-3, 0, 1], [0, 3, 1], [0, -3, 1]],
-            [[-1, 0, -0.4], [1, 0, -0.4], [0, -1, -0.4], [0, 1, -0.4]],
-            "+z",
-        ),
-        (
-            [[3, 1, 0], [-3, 1, 0], [0, 1, 3], [0, 1, -3]],
-            [[-1, -0.4, 0], [1, -0.4, 0], [0, -0.4, -1], [0, -0.4, 1]],
-            "+y",
-        ),
-        ([[3, 0, 0], [-3, 0, 0], [0, 0, 3], [0, 0, -3]], [[-1, 0, 0], [1, 0, 0], [0, 0, -1], [0, 0, 1]], "-y"),
-        ([[3, 0, 0], [-3, 0, 0], [0, 3, 0], [0, -3, 0]], [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]], "+z"),
-        ([[1, 1, 1]], [[0, 1, 0]], "+z"),
-        ([[1, 1, 1]], [[0, 0, 1]], "-y"),
-    ],
-)
-def test_up(places: list[list[float]], directions: list[list[float]], name: str) -> None:
-    lines = np.array(directions, float)
-    up, found = up_axis(np.array(places, float), lines / np.linalg.norm(lines, axis=1, keepdims=True))
-    assert found == name and np.abs(up).sum() == 1
 
 
 def test_a_camera_looks_where_it_is_told() -> None:
@@ -212,14 +208,6 @@ def test_weighted_quantiles() -> None:
     values = np.array([[3.0, 1.0, 2.0], [0.0, 0.0, 5.0]])
     np.testing.assert_array_equal(weighted_quantiles(values, np.array([1.0, 1.0, 1.0]), [0.5]), [[2.0, 0.0]])
     np.testing.assert_array_equal(weighted_quantiles(values, np.array([0.0, 0.0, 1.0]), [0.1, 0.9]), [[2.0, 5.0]] * 2)
-
-
-def test_the_grid_sees_matter() -> None:
-    scene = gather_witnesses(ball())
-    np.testing.assert_allclose(scene.middle, 0, atol=0.1)
-    through = scene.transmittance(np.array([3.0, 0, 0]), np.array([[-3.0, 3.0], [0.0, 3.0], [0.0, 0.0]]))
-    assert through[0] < 0.2 and through[1] == 1.0
-    np.testing.assert_array_equal(scene.optical_depth(np.array([[9.0, -9.0], [0.0, 0.0], [0.0, 0.0]])), 0)
 
 
 def test_sh_basis_is_orthonormal() -> None:
@@ -254,7 +242,7 @@ def test_real_scenes_are_ranked_nearly_as_by_their_own_poses(request: pytest.Fix
     source = PlySource(folder / "point_cloud.ply")
     photos = Photos.open(folder / "images", read_cameras(folder))
     train, held = split_views(len(photos.cameras))
-    rig, _ = automatic_rig(source)
+    rig, _ = placed(source)
     scores = []
     for cameras in ([rig[i] for i in split_views(len(rig))[0]], [photos.cameras[i] for i in train]):
         renderer = Renderer(open_form("w16"), large_budget())

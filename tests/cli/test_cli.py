@@ -212,6 +212,7 @@ def test_nothing_is_overwritten_without_force(
         (["compress", "none.ply", "-o", "a.fgs", "--max-drop", "1", "--min-ratio", "3"], "give one target"),
         (["compress", "none.ply", "-o", "a.fgs", "--max-size", "3QB"], "3QB"),
         (["compress", "none.ply", "-o", "a.fgs", "--background", "#12"], "#rrggbb"),
+        (["compress", "none.ply", "-o", "a.fgs", "--up", "north"], "expected x, -x, y, -y, z, -z, or three numbers"),
         (["compress", "none.ply", "-o", "a.fgs", "--effort", "lots"], "lots"),
         (["compress", "none.ply"], "-o OUT.fgs is missing"),
         (["compress", "none.ply", "-o", "a.fgs", "--score-cache", "s.npz"], "add --method paper"),
@@ -393,6 +394,20 @@ def test_colours(text: str, colour: tuple[float, float, float]) -> None:
 def test_colours_that_are_none(text: str) -> None:
     with pytest.raises(click.BadParameter, match="black, white"):
         value_types.COLOUR.convert(text, None, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "direction"),
+    [("x", (1, 0, 0)), ("-Y", (0, -1, 0)), ("+z", (0, 0, 1)), ("0,-1, 0.2", (0, -1, 0.2))],
+)
+def test_directions(text: str, direction: tuple[float, float, float]) -> None:
+    assert value_types.AXIS.convert(text, None, None) == direction
+
+
+@pytest.mark.parametrize("text", ["", "w", "--y", "0,0,0", "1,2", "nan,0,1", "inf,0,0", "a,b,c"])
+def test_directions_that_are_none(text: str) -> None:
+    with pytest.raises(click.BadParameter, match="not all zero"):
+        value_types.AXIS.convert(text, None, None)
 
 
 def test_sizes_with_units(capsys: pytest.CaptureFixture[str]) -> None:

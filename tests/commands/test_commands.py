@@ -97,7 +97,7 @@ def test_json_has_every_documented_key_and_no_infinity(done: tuple[Path, Compres
     assert set(record["quality"]) == {
         "drop", "fidelity", "modelled_drop", "base_psnr", "psnr", "original_psnr", "ssim", "original_ssim", "ssim_fidelity",
         "lpips", "original_lpips", "lpips_fidelity",
-        "identical_views", "worst", "views",
+        "coverage", "covered_fidelity", "covered_modelled_drop", "covered_decides", "identical_views", "worst", "views",
     }  # fmt: skip
     assert set(record["run"]) == {
         "seconds", "stages", "startup_ms", "compile_ms", "memory_limit", "peak_memory", "peak_anonymous", "scratch", "device",
@@ -309,6 +309,9 @@ def test_a_score_file_of_another_scene(project: Path, tmp_path: Path) -> None:
         ({"base_psnr": -3.0}, "--base-psnr -3"),
         ({"near": -1.0}, "--near -1"),
         ({"background": (0.0, 2.0, 0.0)}, "--background"),
+        ({"up": (0.0, 0.0, 0.0)}, "--up .*: expected three finite numbers, not all zero"),
+        ({"up": (0.0, float("nan"), 1.0)}, "--up"),
+        ({"up": (0.0, 1.0)}, "--up"),
         ({"holdout": 1}, "--holdout 1"),
         ({"resolution": 0}, "--resolution 0"),
     ],

@@ -7,6 +7,7 @@ A file that was found by fuzzing goes into `corpus` as it was found; this script
 
 from __future__ import annotations
 
+import gzip
 import json
 import struct
 import sys
@@ -14,16 +15,25 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 
+
 from camera_files import colmap_records, write_colmap, write_inria, write_transforms
+from exchanged import planes_of, scene
 from fgs_damage import edit_header, flip, overwrite, put, reseal_section, write_header
 from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v2.container import write_grid
+from flexgs_edge.io.exchange import write_foreign
+from flexgs_edge.io.reading import Writing
 from flexgs_edge.packed.bitspec import BitSpec
+from gltf_files import GltfBuilder, splat_arrays
 from grid_scenes import make_grid
+from ksplat_files import Part, ksplat
 from quantized_scenes import make_scene, quantize_all
 from scene_files import edit, header, random_rows, write_rows
+from sog_files import sog_bytes, write_streamed
 from synthetic import look_from, make_camera
 
 FOLDER = Path(__file__).parent
@@ -51,6 +61,58 @@ def write_seeds() -> None:
     write_transforms(SEEDS / "transforms.json", cameras)
     for text_form in (True, False):
         write_colmap(SEEDS / ("text" if text_form else "binary"), *colmap_records(cameras), text=text_form)
+    write_gltf_seeds()
+    (SEEDS / "version1.sog").write_bytes(sog_bytes(1, kind="png"))
+    (SEEDS / "version2.sog").write_bytes(sog_bytes(2))
+    write_streamed(SEEDS / "streamed")
+
+
+def write_gltf_seeds() -> None:
+    """Splats under two nodes, one of which shears, with narrow, interleaved and sparse accessors."""
+    builder = GltfBuilder()
+    arrays = splat_arrays(3, 1)
+    opacities = (arrays["OPACITY"] * 255).astype(np.uint8)
+    quats = (arrays["ROTATION"] * 32767).astype(np.int16)
+    accessors = {
+        name: builder.accessor(values) for name, values in arrays.items() if name not in ("OPACITY", "ROTATION")
+    }
+    accessors["OPACITY"] = builder.accessor(opacities, stride=4, normalized=True)
+    accessors["ROTATION"] = builder.accessor(quats, normalized=True)
+    indices, values = builder.view(b"\1\0"), builder.view(np.ones(3, np.float32).tobytes())
+    builder.record["accessors"][0]["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": indices, "componentType": 5121},
+        "values": {"bufferView": values},
+    }
+    builder.node(mesh=builder.mesh(builder.primitive(accessors)), rotation=[0, 0.6, 0, 0.8], scale=[1, 2, 3])
+    child = builder.node(False, mesh=0, matrix=[0, 2, 0, 0, -2, 0, 0, 0, 0, 0, 2, 0, 1e4, 0, 0, 1])
+    builder.node(children=[child], translation=[1, 2, 3])
+    builder.glb(SEEDS / "splats.glb")
+    builder.gltf(SEEDS / "splats.gltf")
+
+
+def write_other_seeds() -> None:
+    """Small files of other programs' formats."""
+    for version, name in ((3, "third.spz"), (4, "fourth.spz")):
+        write_foreign(SEEDS / name, scene(3, 1), force=True, writing=Writing(version, antialiased=True))
+    unpacked = gzip.decompress((SEEDS / "third.spz").read_bytes())
+    # Version 2 has rotations of 3 bytes, and version 1 also positions of 6.
+    arrays, place = [], 16
+    for width in (9, 1, 3, 3, 4, 9):
+        arrays.append(np.frombuffer(unpacked, "u1", 3 * width, place).reshape(3, width))
+        place += 3 * width
+    halves = np.array([[1, -2, 0.5], [0, 3, 1], [-1, 1, 2]], "<f2").view("u1")
+    for version, name, first in ((1, "first.spz", halves), (2, "second.spz", arrays[0])):
+        parts = [first, *arrays[1:4], arrays[4][:, :3], arrays[5]]
+        body = unpacked[:4] + struct.pack("<I", version) + unpacked[8:16] + b"".join(part.tobytes() for part in parts)
+        (SEEDS / name).write_bytes(gzip.compress(body, mtime=0))
+    write_foreign(SEEDS / "tiny.splat", scene(3, 0), force=True)
+    write_foreign(SEEDS / "tiny.compressed.ply", scene(3, 1), force=True)
+    for level, name in ((0, "plain.ksplat"), (2, "packed.ksplat")):
+        parts = [
+            Part(planes_of(scene(count, 1, spread=0.9)), 1, sizes, 2) for count, sizes in ((4, (2, 1, 1)), (1, (1,)))
+        ]
+        (SEEDS / name).write_bytes(ksplat(level, parts, spare_sections=1))
 
 
 def nested(depth: int) -> list[Any]:
@@ -171,4 +233,5 @@ def write_corpus() -> None:
 
 if __name__ == "__main__":
     write_seeds()
+    write_other_seeds()
     write_corpus()

@@ -1,16 +1,14 @@
-"""Opening scenes by path, and finding what lies beside them."""
+"""Opening model folders, and finding what lies beside scenes."""
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from flexgs_edge.errors import FormatError, InputError
+from flexgs_edge.errors import FormatError
 from flexgs_edge.io.model_folder import find_companions
-from flexgs_edge.io.ply import PlySource
-from flexgs_edge.run.open_scene import READERS, open_scene
+from flexgs_edge.run.open_scene import open_scene
 from scene_files import random_rows, write_rows
 
 
@@ -28,44 +26,6 @@ def model(tmp_path: Path) -> Path:
 def test_a_model_folder_gives_its_latest_iteration_by_number(model: Path) -> None:
     source = open_scene(model)
     assert source.count == 3 and "iteration_30000" in source.name
-
-
-def test_a_ply_by_any_case_of_its_suffix(tmp_path: Path) -> None:
-    source = open_scene(str(write_rows(tmp_path / "A.PLY", random_rows(2))))
-    assert isinstance(source, PlySource) and source.count == 2
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("none.ply", "no such file or folder; supported: .*ply"),
-        ("a.splat", "unknown kind of scene '.splat'; supported"),
-    ],
-)
-def test_paths_that_are_no_scene(tmp_path: Path, name: str, words: str) -> None:
-    (tmp_path / "a.splat").touch()
-    with pytest.raises(InputError, match=words):
-        open_scene(tmp_path / name)
-
-
-def test_a_folder_that_is_no_model(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no point_cloud/iteration"):
-        open_scene(tmp_path)
-
-
-def test_readers_are_looked_up_by_suffix(tmp_path: Path) -> None:
-    readers = {**READERS, ".xyz": "pathlib:Path"}
-    (tmp_path / "a.XYZ").touch()
-    assert open_scene(tmp_path / "a.XYZ", readers) == tmp_path / "a.XYZ"
-    (tmp_path / "b.none").touch()
-    with pytest.raises(InputError, match=r"\.ply.*\.xyz"):
-        open_scene(tmp_path / "b.none", readers)
-
-
-def test_every_reader_is_there() -> None:
-    for name in READERS.values():
-        module, _, reader = name.partition(":")
-        assert callable(getattr(import_module(module), reader))
 
 
 def test_companions_beside_a_ply(tmp_path: Path) -> None:

@@ -79,6 +79,33 @@ def test_header_comments_and_line_ends(tmp_path: Path, comment: str) -> None:
     assert_same(PlySource(tmp_path / "b.ply"), rows)
 
 
+@pytest.mark.parametrize(
+    ("comments", "antialiased"),
+    [
+        ("SplatRenderMode: mip", True),
+        ("SplatRenderMode: default", False),
+        ("splatrendermode: MIP", True),
+        ("antialiased 1", True),
+        ("antialiased 0", False),
+        ("antialiased 1\ncomment SplatRenderMode: default", False),  # the last one holds
+        ("SplatRenderMode: 2dgs", None),
+        ("not antialiased 1", None),
+        ("antialiased", None),
+        ("", None),
+    ],
+)
+def test_comments_that_say_how_the_model_was_trained(tmp_path: Path, comments: str, antialiased: bool | None) -> None:
+    source = PlySource(write_rows(tmp_path / "a.ply", random_rows(3), comment=comments))
+    assert source.settings == ({} if antialiased is None else {"antialiased": antialiased})
+
+
+def test_a_filter_counts_more_than_a_comment(tmp_path: Path) -> None:
+    rows = random_rows(3, names=[*property_names(0), "filter_3D"])
+    rows["filter_3D"] = 0.1
+    source = PlySource(write_rows(tmp_path / "a.ply", rows, comment="SplatRenderMode: default"))
+    assert source.settings == {"antialiased": True}
+
+
 def test_other_plain_elements_around_the_vertices(tmp_path: Path) -> None:
     rows = random_rows(4, 1)
     text = header(rows, extra="element after 2\nproperty uchar v")

@@ -43,13 +43,14 @@ def cameras() -> list[Camera]:
 def digest(
     backend: Backend, budget: MemoryBudget, source: SceneSource = SCENE, views: list[Camera] | None = None
 ) -> str:
-    """A hash over images and statistics of the views."""
+    """A hash over images, coverage and statistics of the views."""
     renderer = Renderer(backend, budget, background=(0.1, 0.2, 0.3))
     total = hashlib.sha256()
     statistics = Statistics.zeros(source.count)
     with renderer.load(source) as scene:
         for camera in views or cameras():
             total.update(renderer.render(scene, camera).tobytes())
+            total.update(np.float64(renderer.drawn_coverage()).tobytes())
             renderer.add_statistics(scene, camera, statistics)
     renderer.release()
     assert statistics.hits.sum() > ROWS
@@ -111,7 +112,7 @@ def test_order_of_views() -> None:
 
 
 def run_within(limit: int, numpy: bool, quantized: QuantizedScene | None = None) -> tuple[str, bool]:
-    """Images and statistics under a memory limit as a hash, and whether the scene stayed resident."""
+    """Images, coverage and statistics under a memory limit as a hash, and whether the scene stayed resident."""
     budget = MemoryBudget(limit)
     backend = TwinBackend(budget) if numpy else OpenCLBackend(default_device(), budget, width=8)
     renderer = Renderer(backend, budget)
@@ -119,6 +120,7 @@ def run_within(limit: int, numpy: bool, quantized: QuantizedScene | None = None)
     with renderer.load(SCENE) if quantized is None else renderer.load_quantized(quantized) as scene:
         for camera in cameras():
             total.update(renderer.render(scene, camera).tobytes())
+            total.update(np.float64(renderer.drawn_coverage()).tobytes())
             renderer.add_statistics(scene, camera, statistics)
         resident = scene.resident
     renderer.release()

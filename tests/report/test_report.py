@@ -227,6 +227,25 @@ def hand_made(name: str, **changes: Any) -> tuple[CompressResult, Material]:
     return replace(result, **changes), Material((shot,), rig, contents, MaxDrop(1.0))
 
 
+@pytest.mark.parametrize(
+    ("given", "title", "tile"),
+    [
+        (None, "24.8 times smaller", "2.48 kB of PLY became 100 B."),
+        (3000, "24.8 times smaller", "2.48 kB of PLY became 100 B."),
+        (250, "2.5 times smaller", "250 B became 100 B."),
+        (50, "2.0 times larger", "50 B became 100 B."),
+    ],
+)
+def test_the_page_compares_with_the_input_file(given: int | None, title: str, tile: str) -> None:
+    result, material = hand_made("a.sog")
+    page = Page(compress_page(replace(result, scene=replace(result.scene, bytes=given)), material))
+    assert title in page.text and tile in page.text
+    times, word = title.split(" times ")
+    assert f"{float(times):.2f}\u00d7 {word}" in " ".join(page.text.split())
+    assert "24.80 times smaller" in page.text  # than a PLY
+    assert ("than the input" in page.text) == (given in (250, 50))
+
+
 def test_no_name_gets_out_of_its_place() -> None:
     result, material = hand_made(EVIL)
     other = EvaluateResult(result.scene, result.scene, result.views, result.quality, "held-out", RUN)  # type: ignore[arg-type]

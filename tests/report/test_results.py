@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.as_json import quality_json
-from flexgs_edge.report.file_results import RenderResult
+from flexgs_edge.report.file_results import DecompressResult, RenderResult
 from flexgs_edge.report.results import EvaluateResult
-from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.run_info import PLY_HEADER_MOST, RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.summary import ratio_lines
 
 RUN = RunInfo(1.25, {"open": 0.25, "device": 0.5}, 0.5, 0.125, 2**30, 2**28, {"backend": "numpy", "numpy": "2"})
 SCENE = SceneInfo("a.ply", 10, 3, 2480, 2360, ("2 of 12 Gaussians left out as invalid",))
@@ -30,8 +32,8 @@ def test_evaluate_text_has_a_row_a_view_and_says_identical() -> None:
     quality = Quality((ViewQuality("a", 0.0, 1e-3, 1e-3), ViewQuality("b", 1e-4, 2e-3, 1e-3)))
     text = EvaluateResult(SCENE, SCENE, VIEWS, quality, "held-out", RUN).summary()
     rows = [line.split() for line in text.splitlines()]
-    assert ["a", "identical", "-", "0.000", "30.000", "30.000", "-", "-"] in rows
-    assert ["b", "40.000", "-", "3.010", "26.990", "30.000", "-", "-"] in rows
+    assert ["a", "identical", "identical", "100", "%", "-", "0.000", "30.000", "30.000", "-", "-"] in rows
+    assert ["b", "40.000", "40.000", "100", "%", "-", "3.010", "26.990", "30.000", "-", "-"] in rows
     for words in (
         "worst view:  b: drop 3.010 dB",
         "1 views identical",
@@ -56,3 +58,51 @@ def test_time_of_a_view_is_the_median_without_start_up(seconds: tuple[float, ...
     assert record["ms_per_view"] == pytest.approx(median)
     assert (record["startup_ms"], record["compile_ms"], record["warm_up_ms"]) == (500.0, 125.0, 9000.0)
     assert f"{median:.1f} ms a view" in result.summary() and "NumPy twins" in result.summary()
+
+
+@pytest.mark.parametrize(
+    ("given", "size", "lines"),
+    [
+        # From memory, and plain PLY files: one number.
+        (None, 248_000, ["ratio:       10.00x of the PLY's 2.48 MB (90.0 % smaller)"]),
+        (2_480_000 + 1500, 248_000, ["ratio:       10.00x of the PLY's 2.48 MB (90.0 % smaller)"]),
+        (2_480_000 + PLY_HEADER_MOST - 1, 248_000, ["ratio:       10.00x of the PLY's 2.48 MB (90.0 % smaller)"]),
+        # A PLY without normals, and files of other formats.
+        (
+            2_360_000,
+            248_000,
+            [
+                "ratio:       9.52x of the input's 2.36 MB (89.5 % smaller)",
+                "of a PLY:    10.00x of the PLY's 2.48 MB (90.0 % smaller)",
+            ],
+        ),
+        (
+            200_000,
+            284_600,
+            [
+                "ratio:       0.70x of the input's 200.00 kB (42.3 % larger)",
+                "of a PLY:    8.71x of the PLY's 2.48 MB (88.5 % smaller)",
+            ],
+        ),
+    ],
+)
+def test_sizes_are_compared_with_the_input_first(given: int | None, size: int, lines: list[str]) -> None:
+    scene = replace(SCENE, count=10_000, ply_bytes=2_480_000, bytes=given)
+    assert ratio_lines(scene, size) == lines
+    assert scene.to_json()["bytes"] == given
+    assert scene.ratio_of(size) == (None if given is None else given / size)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (500, "4.96 times larger than the input's 500 B"),
+        (4960, "2.00 times smaller"),
+        (2480, "as large as the input's 2.48 kB"),
+        (None, None),
+    ],
+)
+def test_a_decoded_file_is_compared_with_the_input(given: int | None, words: str | None) -> None:
+    result = DecompressResult(replace(SCENE, bytes=given), "a.ply", 2480, RUN)
+    assert ("size:" in result.summary()) == (words is not None) and (words or "") in result.summary()
+    assert result.to_json()["ratio_of_input"] == (None if given is None else round(given / 2480, 4))

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from flexgs_edge.errors import InputError
+from flexgs_edge.io.ply import PlySource
 from flexgs_edge.scene.check import check_scene
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import MemorySource
 
 ALL = [field.name for field in FIELDS]
+
+
+VALID = (("log_scales", -np.inf), ("opacity_logits", np.inf), ("opacity_logits", -np.inf))
+"""Flat splats, and opacities 1 and 0."""
 
 
 def arrays(count: int = 11, degree: int = 1) -> dict[str, np.ndarray]:
@@ -31,8 +38,7 @@ def test_an_empty_scene_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    # Log-scales of -inf are flat splats: valid.
-    [(f, v) for f in ALL for v in (np.nan, np.inf, -np.inf) if (f, v) != ("log_scales", -np.inf)],
+    [(f, v) for f in ALL for v in (np.nan, np.inf, -np.inf) if (f, v) not in VALID],
 )
 @pytest.mark.parametrize("chunk_rows", [3, 64])
 def test_a_bad_value_is_named_and_can_be_dropped(field: str, value: float, chunk_rows: int) -> None:
@@ -127,6 +133,44 @@ def test_only_flat_scales() -> None:
     data["log_scales"][:] = -np.inf
     with pytest.raises(InputError, match="log_scales: all are -inf"):
         check_scene(MemorySource(data))
+
+
+@pytest.mark.parametrize("chunk_rows", [2, 64])
+def test_opacities_of_1_and_0_are_clamped_to_finite_logits(chunk_rows: int) -> None:
+    data = arrays()
+    data["opacity_logits"][0, :4] = (np.inf, -np.inf, 12.0, -9.0)
+    source = check_scene(MemorySource(data), chunk_rows=chunk_rows)
+    assert source.notes == ("2 Gaussians of opacity 1 or 0: logits of +-inf set to +-7 (0.999 or 0.001)",)
+    read = source.read(slice(0, 11), ALL)
+    np.testing.assert_array_equal(read["opacity_logits"][0, :4], (7.0, -7.0, 12.0, -9.0))
+    for name in set(ALL) - {"opacity_logits"}:
+        np.testing.assert_array_equal(read[name], data[name])
+    assert data["opacity_logits"][0, 0] == np.inf, "the input was changed"
+    assert source.valid and check_scene(source) is source
+
+
+def test_flat_and_opaque_gaussians_of_a_marked_scene_with_invalid_rows() -> None:
+    data = arrays()
+    data["opacity_logits"][0, [3, 7]] = np.inf
+    data["log_scales"][1, 3] = -np.inf
+    data["means"][0, 7] = np.nan
+    marked = MemorySource(data)
+    marked.settings, marked.held_bytes, marked.comments = {"antialiased": True}, 99, ("flexgs-edge grid {}",)
+    source = check_scene(marked, drop_invalid=True)
+    assert [note.split(":")[0] for note in source.notes] == [
+        "1 of 11 Gaussians left out as invalid",
+        "1 flat Gaussians",
+        "1 Gaussians of opacity 1 or 0",
+    ]
+    assert source.settings == {"antialiased": True} and source.held_bytes == 99
+    assert source.comments == (), "clamped values do not lie on the file's grid"
+    for field in ("log_scales", "opacity_logits"):
+        assert np.isfinite(source.read(slice(0, 10), [field])[field]).all()
+
+
+def test_a_file_of_another_program_with_opacities_of_1(wild: Path) -> None:
+    source = check_scene(PlySource(wild / "wgpu-model.ply"))
+    assert source.count == 9 and source.notes[-1].startswith("9 Gaussians of opacity 1 or 0")
 
 
 def test_sh_count_survives_dropping() -> None:

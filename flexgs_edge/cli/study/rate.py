@@ -81,7 +81,6 @@ def command(
     \b
       - both methods of compress, at several ratios
       - the whole scene as .spz, .sog and .compressed.ply
-        (if installed: pip install 'flexgs-edge[formats]')
       - --method best without each of its parts: measured costs, measuring
         again, the refit, the SH degree of each Gaussian, the context coder
 

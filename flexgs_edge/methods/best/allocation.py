@@ -73,6 +73,27 @@ def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.n
     return keep, degrees
 
 
+def keep_one(keep: np.ndarray, costs: RemovalCosts) -> None:
+    """Keep the row whose removal costs most (of equal ones the first), if `keep` has none that a pose sees.
+
+    Parameters
+    ----------
+    keep : np.ndarray
+        [n] bool, from `choose` or `choose_one_degree`; changed in place.
+    costs : RemovalCosts
+        Squared errors.
+    """
+    dearest, most = 0, -1.0
+    for rows, (removal, weight2) in read_ahead(len(keep), costs.removal, costs.weight2):
+        here = np.where(weight2 > 0, removal, -1.0)
+        if (keep[rows] & (weight2 > 0)).any():
+            return
+        if here.max() > most:
+            dearest, most = rows.start + int(np.argmax(here)), float(here.max())
+    if most >= 0:
+        keep[dearest] = True
+
+
 def choose_one_degree(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
     """As `choose`, but with one SH degree for all rows, for formats in which zero SH take as many bytes as others."""
     top = len(costs.sh)

@@ -80,15 +80,23 @@ class Effort:
         return max(min(self.subsets, poses // LEAST_VIEWS), 1)
 
 
-def sampled_poses(cameras: Sequence[Camera], pixels: int) -> list[Camera]:
-    """The views at every pixel, or at every k-th one, with the largest k that leaves `pixels` in all.
+def sampling_step(cameras: Sequence[Camera], pixels: int, coverage: float = 1.0) -> int:
+    """The largest step k of at most `LARGEST_STEP` at which every k-th pixel leaves `pixels` in all.
+
+    With a `coverage` below 1 (share of the pixels that the scene covers), only so many of them count.
+    """
+    step = 1
+    while step < LARGEST_STEP and coverage * sum(_lattice(camera, step + 1) for camera in cameras) >= pixels:
+        step += 1
+    return step
+
+
+def sampled_poses(cameras: Sequence[Camera], step: int) -> list[Camera]:
+    """The views at every `step`-th pixel in both directions.
 
     The lattice is the same in every view, but begins at another pixel, by the order of the views' names. Names do not
     depend on the order of the poses, where a moved scene may break ties in another way.
     """
-    step = 1
-    while step < LARGEST_STEP and sum(_lattice(camera, step + 1) for camera in cameras) >= pixels:
-        step += 1
     places = np.argsort(np.argsort([camera.name for camera in cameras], kind="stable"), kind="stable")
     return [
         camera.every(step, *divmod(int(place) % step**2, step)) for place, camera in zip(places, cameras, strict=True)

@@ -217,7 +217,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         """Move all values towards the references, put them on the grid, and refit the constant colour."""
         first = self._descended(multiplier) is None
         count, rate = (self.steps, 1.0) if first else (math.ceil(FURTHER_STEPS * self.steps), FURTHER_RATE)
-        rate *= rate_from(self.measure(kept.planes, estimate=True).fidelity)
+        rate *= rate_from(self.measure(kept.planes, estimate=True).figure("fidelity"))
         moved = self._distil(kept, Schedule(count, rate), step_sizes)
         own = np.arange(len(kept.rows))
         self._descents.append((multiplier, Refitted.of(kept.rows, kept.degrees, own, moved, fields=tuple(moved))))

@@ -68,7 +68,7 @@ def assign_layers(
     planes, storage = values_of(grid, renderer.storage), renderer.storage
     for level in range(layers - 1, 0, -1):
         end = HALF * spent[left].sum()
-        while len(left) and spent[left].sum() > end:
+        while len(left) > 1 and spent[left].sum() > end:  # the first layer is never empty
             kept = take_rows(planes, left, storage)
             with renderer.load(MemorySource(kept, origin=grid.origin), sum_bytes(2)) as scene:
                 costs = measure_costs(bench, scene, cameras, sh_costs=False, progress=progress)
@@ -76,7 +76,7 @@ def assign_layers(
             order = np.argsort(worth, kind="stable")
             gone = np.cumsum(spent[left][order])
             goal = gone[-1] - max(end, ROUND * gone[-1])
-            cut = order[: int(np.searchsorted(gone, goal)) + 1]
+            cut = order[: min(int(np.searchsorted(gone, goal)) + 1, len(left) - 1)]
             layer[left[cut]] = level
             left = np.delete(left, cut)
     order = np.argsort(layer, kind="stable")

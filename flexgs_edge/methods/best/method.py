@@ -19,7 +19,6 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.cameras.generated import poses_between
 from flexgs_edge.codec.open_fgs import open_fgs
-from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.errors import TargetError
 from flexgs_edge.files import temporary_name
 from flexgs_edge.goals.choice import Choice
@@ -46,6 +45,7 @@ from flexgs_edge.run.made import Made
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings
+from flexgs_edge.scene.check import alive, invisible
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.source import MemorySource, read_all
 from flexgs_edge.units import format_size
@@ -78,7 +78,9 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
     """
     output = run.output.path
     with Judges(run, bench) as judges:
-        poses = scored_poses(run.seen.of(run.seen.train), run.options, bench.renderer, run.source)
+        poses = scored_poses(
+            run.seen.of(run.seen.train), run.options, bench.renderer, run.source, judges.decide.covered_decides
+        )
         folder = Path(run.options.scratch or (tempfile.gettempdir() if output is None else output.parent))
         storage = bench.renderer.storage = choose_storage(run, bench.renderer, poses.cameras, folder)
         judges.prepare()
@@ -232,6 +234,8 @@ def open_rounds(
         with References(storage.folder) as references:
             with run.clock.stage("search"):
                 rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
+                if not len(rows):
+                    raise invisible(source)
                 # Neighbours in space become neighbours in memory, so views are drawn faster.
                 rows = storage.take(rows, near_rows(storage.take(planes["means"], rows), storage))
                 between = poses_between(scored) if steps else ()
@@ -277,11 +281,6 @@ def search_rounds(
             found.chosen.left_out,
         )
     return found.product, _as_search(found, source.count)
-
-
-def alive(logits: np.ndarray) -> np.ndarray:
-    """[n] bool: opacity reaches 1/255. The renderer never draws the other rows, so removing them costs no quality."""
-    return logits >= np.float32(-np.log(1 / ALPHA_MIN - 1) - 1e-3)
 
 
 def as_step(step: Candidate, count: int) -> Step:

@@ -19,7 +19,7 @@ from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Measurement, Target
-from flexgs_edge.methods.best.allocation import BitModel, choose, drop_bands
+from flexgs_edge.methods.best.allocation import BitModel, choose, drop_bands, keep_one
 from flexgs_edge.methods.best.candidates import Candidate, Product, RateResult, next_multiplier
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.effort import Effort
@@ -141,9 +141,10 @@ class MultiplierSearch(ABC, Generic[Product]):
         assert best is not None
         chosen, product = best
         if not chosen.holds and not best_effort:
+            last = ", with one Gaussian left" if target.limit_bytes is not None and chosen.count == 1 else ""
             raise TargetError(
                 f"{target.describe()} is out of reach; the closest point has {target.report(chosen.size, chosen.measurement)}"
-                " (--best-effort writes it)"
+                f"{last} (--best-effort writes it)"
             )
         return RateResult(product, chosen, chosen.holds, tuple(steps))
 
@@ -178,6 +179,7 @@ class MultiplierSearch(ABC, Generic[Product]):
                 self.rounds.descend(self.effort.keep)
             snapshot = self.rounds.snapshots[index]
             keep, degrees = self.choose(snapshot.costs, multiplier)
+            keep_one(keep, snapshot.costs)
             if keep.mean() >= self.effort.keep or snapshot.count < 16:
                 break
         return index, keep, degrees

@@ -10,7 +10,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.order import covering_order
 from flexgs_edge.io.ply import inria_dtype
-from flexgs_edge.methods.best.effort import EFFORTS, sampled_poses
+from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, sampled_poses, sampling_step
 from flexgs_edge.methods.best.margin import with_margin
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import CompressOptions
@@ -41,7 +41,11 @@ class ScoredPoses:
 
 
 def scored_poses(
-    cameras: Sequence[Camera], options: CompressOptions, renderer: Renderer, source: SceneSource
+    cameras: Sequence[Camera],
+    options: CompressOptions,
+    renderer: Renderer,
+    source: SceneSource,
+    covered_decides: bool = False,
 ) -> ScoredPoses:
     """Choose as many poses as the effort scores. Each next pose is the one that adds most to what those before it see.
 
@@ -58,6 +62,8 @@ def scored_poses(
         With nothing loaded.
     source : SceneSource
         The original.
+    covered_decides : bool
+        As for `Quality`: only pixels that the scene covers count as pixels to look at. Default: all pixels count.
     """
     plan = EFFORTS[options.effort]
     order = covering_order(cameras, some_positions(source), renderer.near, plan.views)
@@ -67,8 +73,27 @@ def scored_poses(
     most = plan.views if fine else plan.poses_of([camera.width * camera.height for camera in ordered], source.count)
     chosen = with_margin(renderer, source, ordered, most) if options.views_margin else ordered[:most]
     given = {id(camera) for camera in cameras}
-    drawn = chosen if fine else sampled_poses(chosen, source.count * plan.pixels)
+    drawn = chosen
+    if not fine:
+        step = sampling_step(chosen, source.count * plan.pixels)
+        if step > 1 and covered_decides:
+            # A small object in a large view would fall between the pixels.
+            step = sampling_step(chosen, source.count * plan.pixels, _coverage(renderer, source, chosen))
+        drawn = sampled_poses(chosen, step)
     return ScoredPoses(drawn, sum(id(camera) not in given for camera in chosen))
+
+
+def _coverage(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera]) -> float:
+    """Share of the pixels of all views that the scene covers, from every `LARGEST_STEP`-th pixel in both directions."""
+    covered, pixels = 0.0, 0
+    with renderer.load(source) as scene:
+        few = [camera.every(LARGEST_STEP) for camera in cameras]
+        for camera in renderer.in_turn(scene, few):
+            renderer.render_planes(scene, camera)
+            covered += renderer.drawn_coverage() * camera.width * camera.height
+            pixels += camera.width * camera.height
+    renderer.release()
+    return covered / pixels
 
 
 def some_positions(source: SceneSource) -> np.ndarray:

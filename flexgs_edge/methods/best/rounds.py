@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flexgs_edge.errors import InputError
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.checkpoint import Checkpoint
 from flexgs_edge.methods.best.costs import (
@@ -136,6 +137,11 @@ class PruneRounds:
         costs = RemovalCosts.of(self._parts, storage)
         rows = storage.copy(np.arange(len(self.rows)))
         keep = np.flatnonzero(~_hidden(start, costs.weight2, unseen))
+        if not len(keep):
+            raise InputError(
+                f"none of {len(original.cameras)} scored views sees any Gaussian, and --unseen {unseen:g} keeps none of those "
+                "that no view sees: nothing would be left. Give cameras that look at the scene, or leave --unseen out"
+            )
         if len(keep) < len(rows):
             rows, start = storage.take(rows, keep), take_rows(start, keep, storage)
             self._parts = [part.take(keep, storage) for part in self._parts]
@@ -155,7 +161,7 @@ class PruneRounds:
         if self._resumed():
             return self.snapshots[-1]
         last = self.snapshots[-1]
-        keep = np.flatnonzero(last.cheapest(last.count - round(last.count * share)))
+        keep = np.flatnonzero(last.cheapest(last.count - max(round(last.count * share), 1)))
         planes = take_rows(last.planes, keep, self.storage)
         source = MemorySource(planes, origin=self.original.origin)
         with self.original.bench.renderer.load(source, sum_row_bytes(source.sh_degree), references=self.refit) as scene:

@@ -24,9 +24,9 @@ from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.rounds import PruneRounds, take_rows
 from flexgs_edge.methods.foreign.file_maker import FileMaker, WrittenFile
-from flexgs_edge.methods.foreign.lower_sh import lower_degree
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
+from flexgs_edge.scene.lower_sh import lower_degree
 from flexgs_edge.scene.source import MemorySource
 
 
@@ -117,9 +117,13 @@ def _put(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def bit_model(format: Format, sh_degree: int) -> BitModel:
-    """Bits of a Gaussian in a format; those of SH are shared equally among their coefficients."""
+    """Bits of a Gaussian in a format; those of SH are shared equally among their coefficients.
+
+    Degrees that the format does not hold take infinitely many bits.
+    """
     each = 8 * format.sh_bytes / sh_rest_count(3)
-    bands = tuple((2 * level + 1) * each for level in range(1, sh_degree + 1))
+    degrees = range(1, sh_degree + 1)
+    bands = tuple((2 * level + 1) * each if level <= format.max_degree else np.inf for level in degrees)
     return BitModel(8 * (format.row_bytes - format.sh_bytes), bands)
 
 

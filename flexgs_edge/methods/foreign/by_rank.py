@@ -14,10 +14,10 @@ from flexgs_edge.goals.steps import MAX_PRUNE, Phase, SearchResult, Step, better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.io.exchange import near_order
 from flexgs_edge.methods.foreign.file_maker import LOG, FileMaker, WrittenFile
-from flexgs_edge.methods.foreign.lower_sh import TrimmedSource
 from flexgs_edge.methods.paper.prune import nonzero_sh, ranks_from_order, select_rows
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import sh_rest_count
+from flexgs_edge.scene.lower_sh import TrimmedSource
 from flexgs_edge.scene.source import SceneSource
 
 SH_A_PRUNE = {".spz": 0.5, ".sog": 1.5}
@@ -59,15 +59,15 @@ def search_pruned_files(
     """
     search = _PrunedFiles(files, source, order, target, on_step)
     if options.fixed is not None:
-        search.measure(options.fixed, source.sh_degree, "fixed")
-    elif files.format.one_degree and source.sh_degree:
+        search.measure(options.fixed, search.most_degree, "fixed")
+    elif files.format.one_degree and search.most_degree:
         search.by_degrees(LINE_STEPS[options.effort])
     else:
-        search.line(source.sh_degree, LINE_STEPS[options.effort])
+        search.line(search.most_degree, LINE_STEPS[options.effort])
     assert search.best is not None
     chosen, file = search.best
     if target is not None and not chosen.holds and not options.best_effort:
-        raise out_of_reach(target, chosen)
+        raise out_of_reach(target, chosen, source.count)
     return file, SearchResult(chosen, chosen.holds, tuple(search.steps))
 
 
@@ -84,6 +84,7 @@ class _PrunedFiles:
     ) -> None:
         self.files, self.source, self.target, self.on_step = files, source, target, on_step
         self.ranks, self.has_sh = ranks_from_order(order), nonzero_sh(source)
+        self.most_degree = min(source.sh_degree, files.format.max_degree)
         self.steps: list[Step] = []
         self.best: tuple[Step, WrittenFile] | None = None
 
@@ -122,7 +123,7 @@ class _PrunedFiles:
     def by_degrees(self, steps: int) -> None:
         """Search once for each SH degree that may win: few rows with many SH, or many rows with few SH."""
         assert self.target is not None
-        top = self.source.sh_degree
+        top = self.most_degree
         if self.target.limit_bytes is not None:
             for degree in range(top + 1):
                 LOG.info("SH up to degree %d:", degree)

@@ -17,10 +17,10 @@ import numpy as np
 
 from flexgs_edge.files import check_writable
 from flexgs_edge.goals.target import Measurement
-from flexgs_edge.io.converter import converter_bytes
 from flexgs_edge.io.exchange import read_foreign, write_foreign
 from flexgs_edge.io.formats import Format
 from flexgs_edge.io.geometry import read_geometry
+from flexgs_edge.io.reading import PLAIN, Writing
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.render.renderer import Renderer
@@ -74,7 +74,7 @@ def open_files(
     beside = None if output is None else check_writable(output, run.options.force).parent
     renderer, judge = None if bench is None else bench.renderer, None if judges is None else judges.decide
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=beside) as folder:
-        yield FileMaker(format, Path(folder), run.budget, renderer, judge)
+        yield FileMaker(format, Path(folder), run.budget, renderer, judge, run.options.writing)
 
 
 class FileMaker:
@@ -87,15 +87,23 @@ class FileMaker:
     folder : Path
         For the files.
     budget : MemoryBudget
-        The converter's memory is taken from it.
+        The memory that writing and reading back take is taken from it.
     renderer, judge : Renderer, Judge or None
         `None`: nothing is measured.
+    writing : Writing, optional
+        What the user says about the format.
     """
 
     def __init__(
-        self, format: Format, folder: Path, budget: MemoryBudget, renderer: Renderer | None, judge: Judge | None
+        self,
+        format: Format,
+        folder: Path,
+        budget: MemoryBudget,
+        renderer: Renderer | None,
+        judge: Judge | None,
+        writing: Writing = PLAIN,
     ) -> None:
-        self.format, self.folder = format, folder
+        self.format, self.folder, self.writing = format, folder, writing
         self._budget, self._renderer, self._judge = budget, renderer, judge
         self._made = 0
 
@@ -114,7 +122,7 @@ class FileMaker:
         self._made += 1
         path = self.folder / f"{self._made}{self.format.suffix}"
         with self._converting(source.count):
-            write_foreign(path, source)
+            write_foreign(path, source, writing=self.writing)
             return path, read_foreign(path)
 
     def geometry(self, source: SceneSource) -> tuple[SceneSource, np.ndarray]:
@@ -124,9 +132,9 @@ class FileMaker:
 
     @contextmanager
     def _converting(self, count: int) -> Iterator[None]:
-        """Take the converter's memory from the budget while the block lasts."""
-        size = converter_bytes(self.format, count)
-        self._budget.take("the converter", size)
+        """Take the memory of writing and reading back from the budget while the block lasts."""
+        size = self.format.memory * count
+        self._budget.take(f"writing a {self.format.suffix}", size)
         try:
             yield
         finally:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 
@@ -39,6 +40,9 @@ def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray 
     scores : np.ndarray or None
         [N] f64 from a file, for `paper`.
     """
+    if not run.options.targets:
+        # A format may round more coarsely than our default target allows. Who named no target wants a file of it all the same.
+        run = replace(run, options=replace(run.options, best_effort=True))
     options, plan, output, format = run.options, run.plan, run.output.path, run.output.format
     assert plan is not None and format is not None
     with nullcontext() if bench is None else Judges(run, bench) as judges:
@@ -49,11 +53,12 @@ def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray 
             order, reused = ranking.order, ranking.reused
         elif judges is not None:
             judges.prepare()
-        if options.antialiased:
+        if options.antialiased and not format.marks_antialiased:
             LOG.warning("%s does not say that the model is antialiased: viewers must be told", format.suffix)
         poses = None
-        if order is None and bench is not None:
-            poses = scored_poses(run.seen.of(run.seen.train), options, bench.renderer, run.source)
+        if order is None and bench is not None and judges is not None:
+            cameras, covered = run.seen.of(run.seen.train), judges.decide.covered_decides
+            poses = scored_poses(cameras, options, bench.renderer, run.source, covered)
         with open_files(run, format, bench, judges) as files:
             if plan.target is not None:
                 LOG.info("searching for %s", plan.target.describe())

@@ -33,7 +33,7 @@ def bits_by_sensitivity(
 
     def error(bits: BitSpec) -> float:
         with evaluator.quantized(EVERYTHING, bits) as quantized, renderer.load_quantized(quantized) as scene:
-            return judge.compare(scene).error
+            return judge.compare(scene).deciding_error
 
     kept, with_sh = evaluator.counts(EVERYTHING)
     bits, found = search_bits(error, source.sh_degree, with_sh / kept, error_for_drop(ALLOWED_DROP, base_psnr))

@@ -14,7 +14,7 @@ import numpy as np
 from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v1.packed_source import FgsSource
 from flexgs_edge.files import temporary_name
-from flexgs_edge.goals.steps import SearchResult, step_words
+from flexgs_edge.goals.steps import SearchResult, Step, step_words
 from flexgs_edge.methods.paper.auto_bits import bits_by_sensitivity
 from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
@@ -157,9 +157,11 @@ def _search(run: Run[CompressOptions], evaluator: SceneEvaluator) -> SearchResul
         return measure_fixed(evaluator, run.options.fixed)
     target, options = run.target, run.options
     LOG.info("searching for %s", target.describe())
-    return adapt(
-        evaluator, target, options.effort, options.best_effort, lambda step: LOG.info("%s", step_words(step, target))
-    )
+
+    def said(step: Step) -> None:
+        LOG.info("%s", step_words(step, target))
+
+    return adapt(evaluator, target, options.effort, options.best_effort, said, run.source.count)
 
 
 def _write(

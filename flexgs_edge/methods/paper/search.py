@@ -60,6 +60,7 @@ def adapt(
     effort: str = "balanced",
     best_effort: bool = False,
     on_step: Callable[[Step], None] | None = None,
+    rows: int | None = None,
 ) -> SearchResult:
     """Find the choice that meets `target` with the fewest bytes (for a size target: with the best quality).
 
@@ -75,6 +76,8 @@ def adapt(
         Return the closest point with `reached` False when nothing holds.
     on_step : callable, optional
         Called after each new step.
+    rows : int, optional
+        Rows of the scene; an error then says if one Gaussian is left.
 
     Raises
     ------
@@ -89,7 +92,7 @@ def adapt(
         chosen = _search_size(search, target.limit_bytes, refine_steps)
     chosen = _confirmed(search, chosen)
     if not chosen.holds and not best_effort:
-        raise out_of_reach(target, chosen)
+        raise out_of_reach(target, chosen, rows)
     return SearchResult(chosen, chosen.holds, tuple(search.steps))
 
 

@@ -14,7 +14,6 @@ from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.target import MaxSize, min_ratio
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import from_grid
-from flexgs_edge.io.converter import check_converter
 from flexgs_edge.io.exchange import near_order
 from flexgs_edge.io.formats import FORMATS, Format
 from flexgs_edge.methods.best.grid_coder import GridCoder
@@ -77,6 +76,10 @@ class RatePoint:
     def ssim(self) -> float | None:
         """SSIM against the photos if there are any, else against the original's renders."""
         return self.quality.ssim_original if self.quality.ssim_photo is None else self.quality.ssim_photo
+
+
+PEERS = (".spz", ".sog", ".compressed.ply")
+"""Formats of other programs that the study compares with."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +186,8 @@ def best_points(
     largest = replace(
         options, max_drop=None, min_fidelity=None, max_size=None, min_ratio=min(ratios), max_worst_drop=None
     )
-    poses = scored_poses(studied.views.of(studied.views.train), largest, studied.bench.renderer, source)
+    cameras, covered = studied.views.of(studied.views.train), studied.judge.covered_decides
+    poses = scored_poses(cameras, largest, studied.bench.renderer, source, covered)
     found = NOTHING
     started = time.perf_counter()
     run = replace(run, options=options)
@@ -225,12 +229,12 @@ def peer_points(studied: StudyScene, folder: Path) -> Found:
         For the files, which are removed afterwards.
     """
     found = NOTHING
-    for suffix, format in FORMATS.items():
-        name = suffix[1:]
+    for suffix in PEERS:
+        format = FORMATS[suffix]
+        name = format.word
         try:
-            check_converter(f"a {suffix} to compare with")
             found += Found((_said(_peer_point(studied, name, format, folder / f"scene{suffix}")),))
-        except InputError as error:  # the converter is missing, or the format cannot hold this scene
+        except InputError as error:  # the format cannot hold this scene
             LOG.warning("%s left out: %s", name, error)
             found += Found((), (f"{name} ({error})",))
     return found

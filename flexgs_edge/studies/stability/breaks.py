@@ -60,17 +60,19 @@ class Outcome:
 
 
 def view_loss(studied: StudyScene, view: ViewQuality) -> float:
-    """Loss of one view in dB: its drop against the photo if there is one, else its modelled drop."""
+    """Loss of one view in dB, in the figure that decides: its drop against the photo, or its modelled drop."""
     if studied.plan.figure == "drop" and view.drop is not None:
         return view.drop
-    return modelled_drop(view.error, studied.run.options.base_psnr)
+    error = view.covered_error or 0.0 if studied.judge.covered_decides else view.error
+    return modelled_drop(error, studied.run.options.base_psnr)
 
 
 def mean_loss(studied: StudyScene, views: Sequence[ViewQuality]) -> float:
     """Mean loss of some views in the figure that decides, dB."""
     if studied.plan.figure == "drop":
         return math.fsum(view_loss(studied, view) for view in views) / len(views)
-    return Quality(tuple(views), studied.run.options.base_psnr).modelled_drop
+    base_psnr = studied.run.options.base_psnr
+    return modelled_drop(Quality(tuple(views), covered_decides=studied.judge.covered_decides).deciding_error, base_psnr)
 
 
 def outcome(studied: StudyScene, make: Callable[[], tuple[int, AbstractContextManager[DeviceScene]]]) -> Outcome:

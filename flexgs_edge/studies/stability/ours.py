@@ -77,7 +77,8 @@ def walked(
     """Open rounds of pruning over some poses (with `margin`, also generated ones), for any number of searches."""
     options, bench = replace(studied.run.options, views_margin=margin), bench or studied.bench
     run = replace(studied.run.of_source(source), options=options)
-    with open_rounds(run, bench, scored_poses(cameras, options, bench.renderer, source).cameras) as rounds:
+    poses = scored_poses(cameras, options, bench.renderer, source, studied.judge.covered_decides)
+    with open_rounds(run, bench, poses.cameras) as rounds:
         yield rounds
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexgs_edge.cameras.auto import fibonacci
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.cameras.directions import fibonacci
 from flexgs_edge.codec.v2.container import coded_size
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid

@@ -16,6 +16,7 @@ from flexgs_edge.methods.best.allocation import (
     choose,
     choose_one_degree,
     drop_bands,
+    keep_one,
 )
 from flexgs_edge.methods.best.costs import RemovalCosts
 
@@ -185,3 +186,20 @@ def test_one_degree_keeps_what_nobody_sees() -> None:
     costs = costs_of([0.0, 1e9, 0.0], [[0, 1e6, 0]] * 3, weight2=[0.0, 1.0, 1.0])
     keep, degrees = choose_one_degree(costs, BITS, 1.0)
     assert keep.tolist() == [True, True, False] and degrees.tolist() == [3, 3, 3]
+
+
+def test_one_that_a_pose_sees_is_always_kept() -> None:
+    """The one whose removal costs most; rows that no pose sees do not count."""
+    costs = costs_of([3, 9, 9, 1e9], [], [1.0, 1.0, 1.0, 0.0])
+    keep = np.array([False, False, False, True])
+    keep_one(keep, costs)
+    assert keep.tolist() == [False, True, False, True]
+    keep_one(keep, costs)
+    assert keep.tolist() == [False, True, False, True]
+    unseen = costs_of([3, 9], [], [0.0, 0.0])
+    none = np.zeros(2, bool)
+    keep_one(none, unseen)
+    assert not none.any()
+    worthless = np.zeros(2, bool)
+    keep_one(worthless, costs_of([0, 0], [], [1.0, 1.0]))
+    assert worthless.tolist() == [True, False]

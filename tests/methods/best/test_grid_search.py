@@ -19,7 +19,7 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
-from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses
+from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses, sampling_step
 from flexgs_edge.methods.best.grid_search import DISTILLED, GridSearch, rate_from
 from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.multiplier import EXTRA_STEPS
@@ -350,7 +350,10 @@ def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> Non
 @pytest.mark.parametrize(("count", "step"), [(10, LARGEST_STEP), (100, 3), (240, 2), (260, 1), (10**6, 1)])
 def test_poses_have_no_more_pixels_than_the_rows_need(count: int, step: int) -> None:
     cameras = [make_camera(64, 48) for _ in range(8)]
-    sampled = sampled_poses(cameras, 24 * count)
+    assert sampling_step(cameras, 24 * count) == step
+    assert sampling_step(cameras, 24 * count, 0.5) == sampling_step(cameras, 48 * count)
+    assert sampling_step(cameras, 24 * count, 0.0) == 1
+    sampled = sampled_poses(cameras, step)
     assert {camera.width for camera in sampled} == {-(-64 // step)} | ({64 // step} if 64 % step else set())
     if 1 < step < LARGEST_STEP:
         pixels = sum(camera.width * camera.height for camera in sampled)

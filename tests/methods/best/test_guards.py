@@ -276,7 +276,7 @@ def test_fidelity_on_training_poses(project: Path, plain: CompressResult) -> Non
     assert len(cameras) <= FIT_VIEWS
     renderer = Renderer(open_form("w16"), large_budget())
     with renderer.load(source) as scene:
-        poses = TrainingPoses(renderer, scene, cameras)
+        poses = TrainingPoses(renderer, scene, cameras, covered_decides=False)
     with renderer.load(coded) as scene:
         found = poses.fidelity(scene)
     poses.close()

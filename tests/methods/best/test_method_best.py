@@ -24,11 +24,11 @@ from flexgs_edge.grid.values import from_grid
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.grid_coder import SETTINGS_MOST, GridCoder, bit_model
-from flexgs_edge.methods.best.method import alive
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.scene.check import alive
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from grid_scenes import make_grid

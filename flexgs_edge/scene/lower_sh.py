@@ -13,11 +13,13 @@ from flexgs_edge.scene.source import Planes, Rows, SceneSource
 class TrimmedSource(SceneSource):
     """A scene with SH up to a lower degree, and without SH where `keeps_sh` ([N] bool) is false."""
 
-    def __init__(self, parent: SceneSource, keeps_sh: np.ndarray, degree: int) -> None:
+    def __init__(self, parent: SceneSource, keeps_sh: np.ndarray, degree: int, notes: tuple[str, ...] = ()) -> None:
         self.parent, self.keeps_sh = parent, keeps_sh
-        self.name, self.origin, self.notes, self.count = parent.name, parent.origin, parent.notes, parent.count
+        self.name, self.origin, self.count = parent.name, parent.origin, parent.count
+        self.notes, self.settings, self.valid = parent.notes + notes, parent.settings, parent.valid
         self.sh_degree = min(degree, parent.sh_degree)
-        self.sh_count = self.count if self.sh_degree else 0
+        self.sh_count = parent.sh_count if self.sh_degree else 0
+        self.held_bytes = parent.held_bytes
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`."""
@@ -29,11 +31,20 @@ class TrimmedSource(SceneSource):
         return planes
 
 
+def without_degrees(source: SceneSource, most: int | None) -> SceneSource:
+    """`source` with SH up to degree `most`, and a note on what is left out; `source` itself if nothing is."""
+    if most is None or source.sh_degree <= most:
+        return source
+    note = f"SH above degree {most} left out (the file has degree {source.sh_degree})"
+    return TrimmedSource(source, np.ones(source.count, bool), most, (note,))
+
+
 def lower_degree(sh_rest: np.ndarray, degree: int) -> np.ndarray:
     """[3 K', n] SH up to `degree` from [3 K, n] SH. Both lie channel by channel.
 
     >>> lower_degree(np.arange(24.0).reshape(24, 1), 1).ravel().tolist()
     [0.0, 1.0, 2.0, 8.0, 9.0, 10.0, 16.0, 17.0, 18.0]
     """
-    channels = sh_rest.reshape(3, sh_rest.shape[0] // 3, -1)[:, : sh_rest_count(degree)]
-    return np.ascontiguousarray(channels.reshape(-1, sh_rest.shape[1]))
+    width, count = sh_rest.shape
+    channels = sh_rest.reshape(3, width // 3, count)[:, : sh_rest_count(degree)]
+    return np.ascontiguousarray(channels.reshape(3 * channels.shape[1], count))

@@ -1,0 +1,83 @@
+"""The frame of all readers that hold a file's packed values in memory and decode rows when they are asked for."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexgs_edge.io.frames import Frame
+from flexgs_edge.scene.fields import FIELD, OPACITY_LIMIT
+from flexgs_edge.scene.source import Planes, Rows, SceneSource
+
+_BLOCK_ROWS = 16384
+"""Rows decoded at a time, so that intermediate arrays stay small."""
+
+
+class DecodedSource(SceneSource):
+    """A scene whose packed values lie in memory, in the file's own frame.
+
+    Parameters
+    ----------
+    name : str
+        The user's path, for messages.
+    count : int
+        Gaussians.
+    sh_degree : int
+        0 to 4.
+    held_bytes : int
+        Bytes that the packed values take in memory.
+
+    Attributes
+    ----------
+    frame : Frame or None
+        The frame that the file itself states; `None`: that of its format.
+    settings : mapping
+        How the file says that it is drawn, such as `{"antialiased": True}`.
+    """
+
+    frame: Frame | None = None
+
+    def __init__(self, name: str, count: int, sh_degree: int, held_bytes: int = 0) -> None:
+        self.name, self.count, self.sh_degree = name, count, sh_degree
+        self.sh_count = count if sh_degree else 0
+        self.origin = np.zeros(3)
+        self.held_bytes = held_bytes
+
+    @abstractmethod
+    def decode(self, rows: Rows, field: str) -> np.ndarray:
+        """Values of one field, [width, n] f32 or f64, in the file's frame.
+
+        `rows` is `slice(start, stop)` within the scene, or [n] i64.
+        """
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`; needs about 4 MB beside the arrays."""
+        rows, planes = self.begin_read(rows, fields, out)
+        size = rows.stop - rows.start if isinstance(rows, slice) else len(rows)
+        for start in range(0, size, _BLOCK_ROWS):
+            part = slice(start, min(start + _BLOCK_ROWS, size))
+            some: Rows = (
+                slice(rows.start + part.start, rows.start + part.stop) if isinstance(rows, slice) else rows[part]
+            )
+            for field, plane in planes.items():
+                if FIELD[field].width(self.sh_degree):
+                    # Values beyond float32 become infinite here, and check_scene reports them.
+                    with np.errstate(over="ignore", invalid="ignore"):
+                        plane[:, part] = self.decode(some, field)
+        return planes
+
+
+def opacity_logits(opacities: np.ndarray, limit: float = OPACITY_LIMIT) -> np.ndarray:
+    """f64 logits of opacities in [0, 1], clamped to +-`limit`; NaN stays NaN.
+
+    The default is for opacities of 8 bits, whose 0 and 1 mean "nearly".
+
+    >>> opacity_logits(np.array([0.0, 0.5, 1.0])).tolist()
+    [-7.0, 0.0, 7.0]
+    """
+    wide = np.asarray(opacities, np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logits: np.ndarray = np.clip(np.log(wide / (1 - wide)), -limit, limit)
+    return logits

@@ -1,0 +1,156 @@
+"""Nodes of a glTF: which meshes a scene shows, where, and what a node's matrix makes of Gaussians.
+
+Positions are moved by the matrix M. A Gaussian's covariance C C^T becomes M C C^T M^T. If M is a rotation and one scale, its
+quaternion is turned and its scales are multiplied; otherwise the singular values and vectors of M C are its new scales and
+axes, which is the eigen decomposition of the covariance without squaring it. SH are turned by the rotation part of M, its
+polar factor, which may be a mirror.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexgs_edge.errors import FormatError
+from flexgs_edge.io.gltf_json import Record
+from flexgs_edge.scene.rotations import combined, matrices, quats_of, times
+from flexgs_edge.scene.turn_sh import band_matrices, turn_sh
+
+_SAME = 1e-6
+"""Largest difference between the scales of axes that count as one: the rounding of float32."""
+_STILL = 1e-12
+"""Largest difference from the identity that is rounding alone."""
+
+Reader = Callable[[str], np.ndarray]
+"""Gives the values of a field before they are moved, [width, n] f64."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A mesh that a node shows.
+
+    Parameters
+    ----------
+    mesh : int
+        Index of the mesh.
+    node : int
+        Index of the node.
+    matrix : np.ndarray
+        [4, 4] f64, from the mesh to the world.
+    """
+
+    mesh: int
+    node: int
+    matrix: np.ndarray
+
+
+def shown_meshes(file: Record) -> Iterator[Shown]:
+    """All meshes that the default scene shows: the named one, else the first; without scenes, all nodes.
+
+    Raises
+    ------
+    FormatError
+        If nodes do not form trees, or a transform is not finite.
+    """
+    seen: set[int] = set()
+    waiting = [(index, np.eye(4), asker) for index, asker in reversed(_roots(file))]
+    while waiting:
+        index, parent, asker = waiting.pop()
+        node = file.item("nodes", index, asker)
+        if index in seen:
+            raise FormatError(f"{file.name}: {asker}: {node.place} has two parents; expected a tree of nodes")
+        seen.add(index)
+        with np.errstate(over="ignore", invalid="ignore"):
+            matrix = parent @ _local_matrix(node)
+        if not np.isfinite(matrix).all():
+            raise FormatError(f"{file.name}: {node.place}: its transform goes beyond float64; expected finite numbers")
+        if "mesh" in node:
+            yield Shown(node.whole("mesh"), index, matrix)
+        waiting += [(child, matrix, node.place) for child in reversed(node.wholes("children"))]
+
+
+def _roots(file: Record) -> list[tuple[int, str]]:
+    scenes, nodes = file.items("scenes"), file.items("nodes")
+    if scenes:
+        scene = file.item("scenes", file.whole("scene", 0), "scene")
+        return [(index, scene.place) for index in scene.wholes("nodes")]
+    children = {child for i in range(len(nodes)) for child in file.item("nodes", i, "nodes").wholes("children")}
+    return [(index, "nodes") for index in range(len(nodes)) if index not in children]
+
+
+def _local_matrix(node: Record) -> np.ndarray:
+    """[4, 4] f64, from the node to its parent."""
+    if "matrix" in node:
+        matrix = node.numbers("matrix", tuple(np.eye(4).ravel())).reshape(4, 4).T
+        matrix[3] = (0, 0, 0, 1)
+        return matrix
+    move, scale = node.numbers("translation", (0, 0, 0)), node.numbers("scale", (1, 1, 1))
+    x, y, z, w = node.numbers("rotation", (0, 0, 0, 1))
+    quat = np.array([w, x, y, z])
+    largest = np.abs(quat).max()
+    if largest == 0:
+        raise node.fail("rotation", "a quaternion that is not zero", quat.tolist())
+    matrix = np.eye(4)
+    matrix[:3, :3] = matrices((quat / largest)[:, None])[0] * scale
+    matrix[:3, 3] = move
+    return matrix
+
+
+class Move:
+    """What a matrix makes of Gaussians.
+
+    Parameters
+    ----------
+    matrix : np.ndarray
+        [4, 4] f64.
+    """
+
+    def __init__(self, matrix: np.ndarray) -> None:
+        self.linear, self.offset = matrix[:3, :3], matrix[:3, 3]
+        self.size = float(np.abs(self.linear).max())
+        left, scales, right = np.linalg.svd(self.linear / (self.size or 1.0))
+        turn = left @ right
+        self._still = bool(np.array_equal(self.linear, np.eye(3)))
+        self._uniform = bool(scales[0] - scales[2] <= _SAME * scales[0])
+        # The determinant is the cube of one scale, so that a matrix of few digits keeps its volume.
+        self._log_scale = float(np.log(scales).mean() + np.log(self.size)) if self._uniform and self.size else 0.0
+        # A Gaussian looks the same when its own axes turn round, so that a mirror turns it as its negative does.
+        self._quat = quats_of((turn * np.linalg.det(turn))[None])[:, 0]
+        self._bands = [] if np.abs(turn - np.eye(3)).max() < _STILL else band_matrices(turn)
+
+    def apply(self, field: str, read: Reader) -> np.ndarray:
+        """[width, n] f64, the values of a field after the move. Positions are moved by the linear part only."""
+        values = read(field)
+        if self._still or field in ("opacity_logits", "sh_dc"):
+            return values
+        # Values that are not finite pass on to the checks of a scene.
+        with np.errstate(over="ignore", invalid="ignore"):
+            if field == "means":
+                return combined(self.linear, values)
+            if field == "sh_rest":
+                return turn_sh(values, self._bands)
+            if self._uniform:
+                return values + self._log_scale if field == "log_scales" else times(self._quat, values)
+        quats, log_scales = (values, read("log_scales")) if field == "quats" else (read("quats"), values)
+        return self._sheared(quats, log_scales)[field]
+
+    def _sheared(self, quats: np.ndarray, log_scales: np.ndarray) -> dict[str, np.ndarray]:
+        """Rotations and log-scales after a move that is no rotation; rows that are not valid stay as they are."""
+        found = {"quats": quats.copy(), "log_scales": log_scales.copy()}
+        largest = np.abs(quats).max(axis=0)
+        good = np.isfinite(quats).all(axis=0) & (largest > 0) & (log_scales < np.inf).all(axis=0)
+        if not good.any():
+            return found
+        # The largest numbers become 1 before anything is multiplied, so that nothing overflows.
+        most = log_scales[:, good].max(axis=0)
+        most = np.where(np.isneginf(most), 0.0, most)
+        axes = matrices(quats[:, good] / largest[good]) * np.exp(log_scales[:, good] - most).T[:, None, :]
+        moved = combined(self.linear / self.size, axes.transpose(1, 0, 2)).transpose(1, 0, 2)
+        left, scales, _ = np.linalg.svd(moved)
+        left[np.linalg.det(left) < 0, :, 2] *= -1
+        found["quats"][:, good] = quats_of(left)
+        with np.errstate(divide="ignore"):
+            found["log_scales"][:, good] = np.log(scales).T + most + np.log(self.size)
+        return found

@@ -1,0 +1,63 @@
+"""What a user may say about how a scene file is read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flexgs_edge.constants import MAX_SH_DEGREE
+from flexgs_edge.errors import InputError
+from flexgs_edge.io.frames import Frame
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How to read a scene file.
+
+    Parameters
+    ----------
+    frame : Frame or None
+        The frame of the file's axes, if it breaks the rule of its format. Default: as the file says, else as its format has it.
+    lod : int or None
+        Level of detail of a streamed scene, 0 is the finest. Default: the finest that is there.
+    sh_degree : int or None
+        Leave out SH above this degree. Default: keep all.
+    """
+
+    frame: Frame | None = None
+    lod: int | None = None
+    sh_degree: int | None = None
+
+    @classmethod
+    def of(cls, frame: str | None, lod: int | None = None, sh_degree: int | None = None) -> Reading:
+        """From the words of options."""
+        return cls(None if frame is None else Frame(frame.strip().upper()), lod, sh_degree)
+
+    def __post_init__(self) -> None:
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
+            raise InputError(f"--sh-degree {self.sh_degree}: expected 0 to {MAX_SH_DEGREE}")
+        if self.lod is not None and self.lod < 0:
+            raise InputError(f"--lod {self.lod}: expected 0 (the finest level) or more")
+
+
+@dataclass(frozen=True)
+class Writing:
+    """How to write another program's format.
+
+    Parameters
+    ----------
+    spz_version : {3, 4}
+        Version of a `.spz`. Older programs read only 3.
+    antialiased : bool
+        The model is antialiased; formats that can say so, do.
+    """
+
+    spz_version: int = 3
+    antialiased: bool = False
+
+    def __post_init__(self) -> None:
+        if self.spz_version not in (3, 4):
+            raise InputError(f"--spz-version {self.spz_version}: expected 3 or 4")
+
+
+AS_WRITTEN = Reading()
+PLAIN = Writing()

@@ -1,0 +1,63 @@
+"""Automatic views in a run: which way is up, and the near plane of small scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.constants import DEFAULT_NEAR
+from flexgs_edge.errors import InputError
+from flexgs_edge.io.ply import write_ply
+from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.run import open_run
+from flexgs_edge.run.view_set import GivenViews
+from flexgs_edge.scene.source import MemorySource
+from synthetic import make_camera, make_splats
+
+
+def scene(scale: float) -> MemorySource:
+    points = np.random.default_rng(0).normal(size=(200, 3)) * scale
+    return make_splats(points, np.full((200, 3), 0.1 * scale))
+
+
+@pytest.fixture
+def lone(tmp_path: Path) -> Path:
+    """A scene of ordinary size, without cameras."""
+    write_ply(tmp_path / "lone.ply", scene(1.0))
+    return tmp_path / "lone.ply"
+
+
+def test_a_small_scene_lowers_the_near_plane(tmp_path: Path, lone: Path) -> None:
+    run = open_run(lone, ViewOptions())
+    assert run.options.near == DEFAULT_NEAR and not any("near plane" in note for note in run.seen.notes)
+    write_ply(tmp_path / "small.ply", scene(1e-3))
+    run = open_run(tmp_path / "small.ply", ViewOptions())
+    assert run.options.near is not None and run.options.near < 2e-3
+    assert f"near plane {run.options.near:g} instead of 0.2" in run.seen.notes[-1]
+    # What the user asks for stays.
+    assert open_run(tmp_path / "small.ply", ViewOptions(near=0.5)).options.near == 0.5
+    # Cameras of the user's own keep the usual near plane.
+    given = GivenViews([make_camera()])
+    assert open_run(tmp_path / "small.ply", ViewOptions(), given=given).options.near == DEFAULT_NEAR
+
+
+def test_up_turns_automatic_views(lone: Path) -> None:
+    run = open_run(lone, ViewOptions(up=(1.0, 0.0, 0.0)))
+    assert "up is +x (--up)" in run.seen.notes[0]
+    assert all(abs(camera.rotation[0, 0]) < 1e-12 for camera in run.seen.cameras)
+    assert "up is -y (convention)" in open_run(lone, ViewOptions()).seen.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("cameras", "given"),
+    [("none", None), ("poses.json", None), (None, [make_camera()])],
+    ids=["none", "file", "memory"],
+)
+def test_up_is_refused_where_cameras_are_not_automatic(
+    lone: Path, cameras: str | None, given: list[Camera] | None
+) -> None:
+    with pytest.raises(InputError, match=f"--up turns automatic views, but cameras come from {cameras or 'memory'}"):
+        open_run(lone, ViewOptions(cameras=cameras, up=(0.0, 0.0, 1.0)), given=GivenViews(given))
