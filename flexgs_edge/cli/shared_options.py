@@ -187,7 +187,7 @@ run_options = stack(memory_option, device_option, write_options)
 photos_options = stack(cameras_option, images_option, holdout_option)
 """Options for cameras, photos and held-out views."""
 study_options = stack(
-    photos_options, select_option, drawing_options, base_psnr_option, drop_invalid_option, run_options
+    reading_options, photos_options, select_option, drawing_options, base_psnr_option, drop_invalid_option, run_options
 )
 """Options of every study."""
 results_option = option(

@@ -94,7 +94,7 @@ def test_markers_are_read_for_the_target(script: ModuleType) -> None:
 
 def test_versions_are_those_of_the_tests(script: ModuleType) -> None:
     names = {r.name for r in script.runtime_requirements()}
-    assert names >= {"numpy", "pyopencl", "plyfile", "pillow", "click", "tqdm", "gaussforge"}
+    assert names >= {"numpy", "pyopencl", "plyfile", "pillow", "click", "tqdm", "zstandard"}
     assert not names & {"pytest", "ruff", "torch"}
     for version in script.VERSIONS:
         names = [line.split("==")[0] for line in script.constraints(version)]

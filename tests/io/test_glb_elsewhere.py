@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -21,19 +19,6 @@ from synthetic import random_scene
 
 SCRIPT = Path(__file__).with_name("load_glb.mjs")
 COUNT = 100
-
-
-@pytest.fixture(scope="session")
-def glb_modules(repository: Path) -> Path:
-    """The folder of npm's packages: FLEXGS_NODE_MODULES, by default `.node/node_modules`."""
-    folder = Path(os.environ.get("FLEXGS_NODE_MODULES", repository / ".node" / "node_modules"))
-    names = ("playcanvas", "three", "gltf-validator", "@playcanvas/splat-transform")
-    missing = [name for name in names if not (folder / name).is_dir()]
-    if shutil.which("node") is None or missing:
-        pytest.skip(
-            f"no node, or {folder} lacks {', '.join(missing)}: npm install them there, or set FLEXGS_NODE_MODULES"
-        )
-    return folder
 
 
 def loaded(modules: Path, path: Path) -> dict[str, Any]:
@@ -74,10 +59,10 @@ def ours(scene: MemorySource) -> Planes:
 
 
 @pytest.fixture(scope="session")
-def theirs(glb_modules: Path, scene: MemorySource, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def theirs(node_modules: Path, scene: MemorySource, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     path = tmp_path_factory.mktemp("glb") / "a.glb"
     write_foreign(path, scene)
-    return loaded(glb_modules, path)
+    return loaded(node_modules, path)
 
 
 def test_playcanvas_reads_the_same_values(theirs: dict[str, Any], ours: Planes) -> None:
@@ -125,9 +110,9 @@ def test_the_validator_finds_nothing(theirs: dict[str, Any]) -> None:
     assert strange == []
 
 
-def test_splat_transform_writes_what_we_read(glb_modules: Path, scene: MemorySource, tmp_path: Path) -> None:
+def test_splat_transform_writes_what_we_read(node_modules: Path, scene: MemorySource, tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", scene)
-    program = glb_modules / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
+    program = node_modules / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
     done = subprocess.run(
         ["node", str(program), "-q", "-w", "-g", "cpu", str(tmp_path / "a.ply"), str(tmp_path / "b.glb")],
         capture_output=True, text=True, timeout=120, check=False,

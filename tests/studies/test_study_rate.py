@@ -23,7 +23,6 @@ from flexgs_edge.goals.target import min_ratio
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.io.exchange import read_foreign, write_foreign
-from flexgs_edge.io.formats import FORMATS
 from flexgs_edge.methods.best.allocation import BitModel, choose
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.method import open_rounds
@@ -65,7 +64,7 @@ def study(project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Rate
     out = tmp_path_factory.mktemp("written") / "out"
     with pytest.MonkeyPatch.context() as patch:
         # One format of another program and every other part: what is left out goes the same way.
-        patch.setattr("flexgs_edge.studies.rate.points.FORMATS", {".spz": FORMATS[".spz"]})
+        patch.setattr("flexgs_edge.studies.rate.points.PEERS", (".spz",))
         patch.setattr("flexgs_edge.studies.rate.study.parts_of", lambda *words: ablations.parts_of(*words)[::2])
         found = study_rate(
             project / "point_cloud.ply",
