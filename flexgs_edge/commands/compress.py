@@ -63,6 +63,9 @@ def compress(
         `InputError`, `TargetError`, `DeviceError` or `BudgetError`; nothing is left behind then.
     """
     options = replace(options or CompressOptions(), **words)
+    if options.target_is_default:
+        # The scene or the format may be out of the default target's reach. Who named no target wants a file all the same.
+        options = replace(options, best_effort=True)
     run = open_compression(input, output, options, progress, given)
     with run.clock.stage("open"):
         prepare_memory(run)
@@ -94,7 +97,7 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
         held_out = measurement_of(made.quality).figure("fidelity")
     warnings = doubts(views, scored, run.scene.input_count, made.trained, held_out) if views else ()
     reached = search.reached if search and options.fixed is None else None
-    warnings += _rounding_doubts(run, reached)
+    warnings += _default_doubts(run, reached)
     for warning in warnings:
         LOG.warning("warning: %s", warning)
     return CompressResult(
@@ -132,12 +135,13 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
     )
 
 
-def _rounding_doubts(run: Run[CompressOptions], reached: bool | None) -> tuple[str, ...]:
-    """Warn if the default target was missed because another program's format rounds more coarsely than it allows."""
+def _default_doubts(run: Run[CompressOptions], reached: bool | None) -> tuple[str, ...]:
+    """Warn if the default target was missed."""
     format, plan = run.output.format, run.plan
-    if format is None or reached is not False or run.options.targets or plan is None or plan.target is None:
+    if reached is not False or not run.options.target_is_default or plan is None or plan.target is None:
         return ()
-    return (
-        f"{plan.target.describe()} (the default) is out of reach of {format.suffix}, which rounds too coarsely for this scene. "
-        "The closest result was written. A .fgs rounds as finely as the target asks.",
-    )
+    missed = f"{plan.target.describe()} (the default) is out of reach"
+    if format is not None:
+        missed += f" of {format.suffix}, which rounds too coarsely for this scene"
+    finer = "" if format is None else " A .fgs rounds as finely as the target asks."
+    return (f"{missed}. The closest result was written.{finer}",)

@@ -292,6 +292,11 @@ class CompressOptions(ViewOptions):
         return ["--" + word.replace("_", "-") for word in words if getattr(self, word) is not None]
 
     @property
+    def target_is_default(self) -> bool:
+        """Whether the user named no target and no limit of the worst view."""
+        return not self.targets and self.max_worst_drop is None
+
+    @property
     def writing(self) -> Writing:
         """How a file of another program's format is written."""
         return Writing(self.spz_version, bool(self.antialiased))

@@ -49,6 +49,9 @@ def planes_of(count: int, degree: int, shape: str) -> dict[str, np.ndarray]:
         planes["means"][1] = -0.2
     elif shape == "two groups far apart":
         planes["means"][0, count // 2 :] += 1000.0
+    elif shape == "small and far apart":
+        planes["means"] *= 1e5
+        planes["log_scales"] -= 4.0
     elif shape == "SH of zero":
         planes["sh_rest"][:] = 0
     elif shape == "all alike":
@@ -148,6 +151,16 @@ def test_one_gaussian_is_left_where_a_size_is_out_of_reach(tmp_path: Path, words
     result = compress(path, tmp_path / "a.fgs", given=views(), max_size=10, best_effort=True, **FAST, **words)
     assert result.reached is False and result.count == 1
     assert decompress(tmp_path / "a.fgs", tmp_path / "a.ply").scene.count == 1
+
+
+def test_a_default_target_out_of_reach_still_makes_a_file(tmp_path: Path) -> None:
+    """Splats far smaller than the finest step of positions. A named target ends in an error instead."""
+    path, file = scene(tmp_path, 12, 0, "small and far apart"), tmp_path / "a.fgs"
+    result = compress(path, file, **FAST)
+    assert result.reached is False and open_scene(file).count == result.count >= 1
+    assert any("(the default) is out of reach" in warning for warning in result.warnings)
+    with pytest.raises(TargetError, match="out of reach"):
+        compress(path, file, max_drop=1.0, force=True, **FAST)
 
 
 def test_a_loose_target_keeps_one(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import replace
 
 import numpy as np
 
@@ -40,9 +39,6 @@ def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray 
     scores : np.ndarray or None
         [N] f64 from a file, for `paper`.
     """
-    if not run.options.targets:
-        # A format may round more coarsely than our default target allows. Who named no target wants a file of it all the same.
-        run = replace(run, options=replace(run.options, best_effort=True))
     options, plan, output, format = run.options, run.plan, run.output.path, run.output.format
     assert plan is not None and format is not None
     with nullcontext() if bench is None else Judges(run, bench) as judges:
