@@ -57,7 +57,9 @@ class CompressWords(TypedDict, total=False):
     score_cache: str | None
     max_drop: float | None
     min_fidelity: float | None
-    max_worst_drop: float | None
+    promise: str
+    max_worst_drop: float | str | None
+    max_ssim_drop: float | str | None
     max_size: int | None
     min_ratio: float | None
     prune_rate: float | None
@@ -68,7 +70,7 @@ class CompressWords(TypedDict, total=False):
     effort: str
     best_effort: bool
     unseen: str
-    views_margin: bool
+    views_margin: bool | None
     refit: bool
     distil: int | None
     spz_version: int

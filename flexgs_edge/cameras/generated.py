@@ -9,6 +9,9 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 
+NEARER, FARTHER = 0.5, 2.0
+"""Distances of made poses from the scene, in distances of the given pose. Scenes differ in which views are missing, so we
+make both kinds: docs/results/tuning.md#nearer"""
 LEAST_ALIKE = 0.7
 """Least cosine between two directions of view (45 degrees). Beyond it, the middle view would see what neither of the
 two sees."""

@@ -26,7 +26,7 @@ USUAL = (
     "cameras",
     "images",
     "antialiased",
-    "views_margin",
+    "promise",
     "effort",
     "memory_limit",
     "device",
@@ -83,8 +83,23 @@ Several scenes:
     REACH,
     "--max-worst-drop",
     metavar="DB",
-    type=float,
-    help="With one of the two above: no view may lose more.",
+    type=value_types.BOUND,
+    help="No view may lose more; none: no bound. Default: in proportion to the mean.",
+)
+@option(
+    REACH,
+    "--max-ssim-drop",
+    metavar="X",
+    type=value_types.BOUND,
+    help="Most SSIM lost in the mean; none: no bound. Default: in proportion to the target.",
+)
+@option(
+    REACH,
+    "--promise",
+    type=click.Choice(["whole", "mean"]),
+    default="whole",
+    show_default=True,
+    help="whole: also bound the worst view, SSIM and made poses. mean: the target alone, by the mean of the views.",
 )
 @option(REACH, "--max-size", type=value_types.SIZE, help="Best quality in at most this size, such as 8MB or 8MiB.")
 @option(
@@ -99,10 +114,9 @@ Several scenes:
 @shared_options.photos_options
 @option(
     VIEWS,
-    "--views-margin",
-    is_flag=True,
-    help="Also use generated camera views: closer, farther and in between. For scenes that people walk through. "
-    "Slower, slightly larger files.",
+    "--views-margin/--no-views-margin",
+    default=None,
+    help="Also use made camera views: closer, farther and in between, and bound what they lose. Default: as --promise says.",
 )
 @shared_options.select_option
 @shared_options.drawing_options

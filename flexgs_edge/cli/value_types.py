@@ -52,6 +52,20 @@ class ColourType(click.ParamType):
         return numbers[0], numbers[1], numbers[2]
 
 
+class BoundType(click.ParamType):
+    """A number, or `none`."""
+
+    name = "BOUND"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
+        if isinstance(value, str) and value.strip().lower() == "none":
+            return "none"
+        try:
+            return float(value)
+        except ValueError:
+            self.fail(f"{value!r}: expected a number or none", param, ctx)
+
+
 class AxisType(click.ParamType):
     """A direction: an axis such as `-y`, or three numbers such as `0,-1,0.2`."""
 
@@ -100,4 +114,4 @@ class ViewsType(click.ParamType):
         return chosen
 
 
-SIZE, COLOUR, AXIS, VIEWS = SizeType(), ColourType(), AxisType(), ViewsType()
+SIZE, COLOUR, AXIS, BOUND, VIEWS = SizeType(), ColourType(), AxisType(), BoundType(), ViewsType()

@@ -8,6 +8,8 @@ from contextlib import ExitStack
 from dataclasses import asdict, replace
 from typing import Any
 
+from flexgs_edge.goals.promise import in_the_way, kept_promise
+from flexgs_edge.goals.steps import SearchResult
 from flexgs_edge.methods.best import method as best
 from flexgs_edge.methods.best.spill import prepare_memory
 from flexgs_edge.methods.foreign import method as foreign
@@ -97,7 +99,8 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
         held_out = measurement_of(made.quality).figure("fidelity")
     warnings = doubts(views, scored, run.scene.input_count, made.trained, held_out) if views else ()
     reached = search.reached if search and options.fixed is None else None
-    warnings += _default_doubts(run, reached)
+    warnings += _default_doubts(run, reached, search)
+    promise = kept_promise(plan.target, made.size, search.chosen.measurement) if search else None
     for warning in warnings:
         LOG.warning("warning: %s", warning)
     return CompressResult(
@@ -120,6 +123,7 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
         reached=reached,
         decision_views=plan.kind_of(plan.decide, views),
         search=search,
+        promise=promise,
         sensitivity=made.sensitivity,
         quality=made.quality,
         quality_views=plan.kind_of(plan.report, views),
@@ -135,11 +139,19 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
     )
 
 
-def _default_doubts(run: Run[CompressOptions], reached: bool | None) -> tuple[str, ...]:
-    """Warn if the default target was missed."""
+def _default_doubts(run: Run[CompressOptions], reached: bool | None, search: SearchResult | None) -> tuple[str, ...]:
+    """Warn if the default target was missed, or if a size leaves no room for the promise."""
     format, plan = run.output.format, run.plan
-    if reached is not False or not run.options.target_is_default or plan is None or plan.target is None:
+    if plan is None or plan.target is None or search is None:
         return ()
+    chosen = search.chosen
+    obstacle = in_the_way(plan.target, chosen.size, chosen.measurement)
+    if plan.target.limit_bytes is not None:
+        return (f"the size leaves no room for the whole promise: {obstacle}",) if obstacle else ()
+    if reached is not False or not run.options.target_is_default:
+        return ()
+    if obstacle:
+        return (f"the default target is out of reach. Of the promise, {obstacle}. The closest result was written.",)
     missed = f"{plan.target.describe()} (the default) is out of reach"
     if format is not None:
         missed += f" of {format.suffix}, which rounds too coarsely for this scene"

@@ -7,6 +7,7 @@ from typing import Literal, Protocol
 
 from flexgs_edge.errors import TargetError
 from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.promise import Promised, in_the_way
 from flexgs_edge.goals.target import Measurement, Target
 
 Phase = Literal["list", "refine", "confirm", "fixed", "line", "multiplier"]
@@ -114,12 +115,19 @@ class Point(Protocol):
 
 
 def better(step: Point, other: Point, target: Target) -> bool:
-    """Whether `step` is the better answer: one that holds, then the smaller file (for a size target, the lower loss)."""
+    """Whether `step` is the better answer: one that holds, then the smaller file.
+
+    For a size target, of two that hold: the one that keeps the promise, then the lower loss.
+    """
     if step.holds != other.holds:
         return step.holds
     if not step.holds:
         return step.excess < other.excess
     if target.limit_bytes is not None and step.measurement is not None and other.measurement is not None:
+        if isinstance(target, Promised):
+            broken, other_broken = (target.broken(point.measurement) > 0 for point in (step, other))
+            if broken != other_broken:
+                return other_broken
         return step.measurement.loss(target.figure) < other.measurement.loss(target.figure)
     return step.size < other.size
 
@@ -139,5 +147,11 @@ def out_of_reach(target: Target, closest: Step, rows: int | None = None) -> Targ
     return TargetError(
         f"{target.describe()} cannot be reached: the closest point is {target.report(closest.size, closest.measurement)} "
         f"(prune rate {closest.choice.prune / 1000:g}, SH rate {closest.choice.sh / 1000:g}{last}); "
-        f"relax the target, or take that point with --best-effort"
+        f"relax the target, or take that point with --best-effort{obstacle(target, closest)}"
     )
+
+
+def obstacle(target: Target, closest: Point) -> str:
+    """What of the promise stands in the way at the closest point, to end a message with; empty if the target itself does."""
+    words = in_the_way(target, closest.size, closest.measurement)
+    return words and f". Of the promise, {words}"

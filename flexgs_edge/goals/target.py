@@ -52,6 +52,12 @@ class Measurement:
         Quality of the worst view alone.
     covered : Covered or None
         The same figures over covered pixels, which decide in place of the plain ones; `None` if the plain ones decide.
+    usual : float or None
+        Mean over the views of the drop that decides, where a view that gains counts as 0; `None` if not known.
+    ssim_drop : float or None
+        SSIM lost, against photos or modelled; `None` if not measured.
+    made_gap : float or None
+        How much less fidelity made poses have, dB; `None` if not measured.
     """
 
     drop: float | None
@@ -59,6 +65,9 @@ class Measurement:
     modelled_drop: float
     worst: Measurement | None = None
     covered: Covered | None = None
+    usual: float | None = None
+    ssim_drop: float | None = None
+    made_gap: float | None = None
 
     def figure(self, figure: Figure) -> float | None:
         """The figure of this name that decides, dB; `None` if renders are identical or photos are missing."""
@@ -111,7 +120,7 @@ class MaxDrop:
 
     def excess(self, size: int, measurement: Measurement | None) -> float:
         assert measurement is not None
-        return _log_loss(measurement.loss(self.figure), self.limit)
+        return log_loss(measurement.loss(self.figure), self.limit)
 
     def describe(self) -> str:
         return f"{self.figure} <= {self.limit:g} dB"
@@ -121,8 +130,8 @@ class MaxDrop:
         return f"{self.figure} {measurement.loss(self.figure):.3f} dB at {format_size(size)}"
 
 
-def _log_loss(loss: float, limit: float) -> float:
-    """Log of loss over limit.
+def log_loss(loss: float, limit: float) -> float:
+    """The excess of a loss: log of `loss` over `limit`, both in the same unit.
 
     The error grows about exponentially with the rates, so that this is nearly linear in them. The floor allows for
     drops at or below zero (the compressed scene beats the original), which hold by far.
@@ -156,47 +165,6 @@ class MinFidelity:
         found = measurement.figure("fidelity")
         fidelity = "identical" if found is None else f"{found:.3f} dB"
         return f"fidelity {fidelity} at {format_size(size)}"
-
-
-@dataclass(frozen=True)
-class WorstToo:
-    """Hold `target`, and also lose at most `limit_worst` dB in the worst view."""
-
-    target: MaxDrop | MinFidelity
-    limit_worst: float
-    drop: Figure
-    """Figure for the worst view: `drop` or `modelled drop`."""
-    limit_bytes: int | None = None
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.limit_worst) and self.limit_worst > 0.0):
-            raise InputError(
-                f"--max-worst-drop {self.limit_worst:g}: expected a drop above 0 dB (1.5 times --max-drop is a usual choice)"
-            )
-
-    @property
-    def figure(self) -> Figure:
-        """The figure of the target for the mean."""
-        return self.target.figure
-
-    @property
-    def limit(self) -> float:
-        """The limit of the target for the mean."""
-        return self.target.limit
-
-    def _loss(self, measurement: Measurement | None) -> float:
-        assert measurement is not None and measurement.worst is not None
-        return measurement.worst.loss(self.drop)
-
-    def excess(self, size: int, measurement: Measurement | None) -> float:
-        return max(self.target.excess(size, measurement), _log_loss(self._loss(measurement), self.limit_worst))
-
-    def describe(self) -> str:
-        return f"{self.target.describe()}, {self.drop} <= {self.limit_worst:g} dB in every view"
-
-    def report(self, size: int, measurement: Measurement | None) -> str:
-        worst = self._loss(measurement)
-        return f"{self.target.report(size, measurement)}, {self.drop} {worst:.3f} dB in the worst view"
 
 
 @dataclass(frozen=True)

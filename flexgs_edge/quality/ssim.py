@@ -9,6 +9,9 @@ import numpy as np
 from flexgs_edge.constants import LANES, SSIM_SIGMA, SSIM_WINDOW
 from flexgs_edge.kernels.backend import Backend
 
+LOST_SHARE = 0.7
+"""SSIM lost against photos, as a share of what is lost against the original's renders."""
+
 
 def window() -> np.ndarray:
     """[SSIM_WINDOW] f32, the weights of the Gaussian window, with the sum 1."""
@@ -16,6 +19,18 @@ def window() -> np.ndarray:
     taps = np.exp(-0.5 * np.square(away / SSIM_SIGMA))
     window: np.ndarray = (taps / taps.sum()).astype(np.float32)
     return window
+
+
+def modelled_ssim_drop(unlike: float) -> float:
+    """SSIM lost against photos that are not there, from `unlike`, 1 - SSIM against the original's renders.
+
+    A photo shares only a part of its structure with the original, and the rest cannot be lost:
+    docs/results/tuning.md#lost_share
+
+    >>> round(modelled_ssim_drop(0.02), 3)
+    0.014
+    """
+    return LOST_SHARE * unlike
 
 
 def ssim_bytes(width: int, height: int) -> int:

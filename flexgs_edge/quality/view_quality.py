@@ -15,12 +15,15 @@ import numpy as np
 
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.quality.psnr import drop, mean_psnr, modelled_drop, mse, psnr
+from flexgs_edge.quality.ssim import modelled_ssim_drop
 
 Distance = Callable[[np.ndarray, np.ndarray], float | None]
 """Distance of two [H, W, 3] images; `None` if it is not defined for them."""
 LEAST_COVERAGE = 0.1
 """The worst view by covered figures has at least this share of the mean coverage. Views that see a few faint pixels have
 large errors relative to them, and nobody would see these."""
+ALIKE = 48.0
+"""Fidelity in dB from which on more of it shows nothing: an error of one level of 255."""
 Similarities = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | None]]
 """Similarities of pairs of [H, W, 3] images, all of one size."""
 
@@ -102,11 +105,14 @@ class Quality:
         Assumed PSNR of the original against photos, for the modelled drop, dB.
     covered_decides : bool
         The covered figures decide: there are no photos. Default: the plain figures decide.
+    made : Quality or None
+        Quality at made poses, where no given camera stood; `None` if not measured.
     """
 
     views: tuple[ViewQuality, ...]
     base_psnr: float = DEFAULT_BASE_PSNR
     covered_decides: bool = False
+    made: Quality | None = None
 
     def _mean(self, name: str) -> float | None:
         return mean_psnr([getattr(view, name) for view in self.views])
@@ -172,6 +178,45 @@ class Quality:
     def covered_modelled_drop(self) -> float:
         """Modelled drop in dB, from `covered_error`."""
         return modelled_drop(self.covered_error, self.base_psnr)
+
+    @property
+    def deciding_fidelity(self) -> float | None:
+        """The mean fidelity that decides: `covered_fidelity` or `fidelity`."""
+        return self.covered_fidelity if self.covered_decides else self.fidelity
+
+    @property
+    def usual_drop(self) -> float | None:
+        """Mean over the views of the drop that decides, where a view that gains counts as 0, dB; `None` without views."""
+        losses = [max(loss, 0.0) for loss in self._losses() if loss is not None]
+        return math.fsum(losses) / len(losses) if losses else None
+
+    def _losses(self) -> list[float | None]:
+        """The drop of each view that decides: against the photo, else modelled; `None` for views with hardly any coverage."""
+        drops = [view.drop for view in self.views]
+        if None not in drops:
+            return drops
+        least = LEAST_COVERAGE * self.coverage if self.covered_decides else 0.0
+        errors = [view.covered_error if self.covered_decides else view.error for view in self.views]
+        return [
+            modelled_drop(error or 0.0, self.base_psnr) if view.coverage >= least else None
+            for view, error in zip(self.views, errors, strict=True)
+        ]
+
+    @property
+    def ssim_drop(self) -> float | None:
+        """SSIM lost against the photos, mean over the views; modelled without photos; `None` if not measured."""
+        if self.original_ssim is not None and self.ssim_photo is not None:
+            return self.original_ssim - self.ssim_photo
+        if self.ssim_original is None:
+            return None
+        shared = 1.0 - self.ssim_original
+        return modelled_ssim_drop(shared / (self.coverage or 1.0) if self.covered_decides else shared)
+
+    @property
+    def made_gap(self) -> float | None:
+        """How much less fidelity made poses have, dB, of at most `ALIKE`; `None` if they were not measured or are identical."""
+        own, made = self.deciding_fidelity, None if self.made is None else self.made.deciding_fidelity
+        return None if own is None or made is None else min(own, ALIKE) - made
 
     @property
     def identical(self) -> int:

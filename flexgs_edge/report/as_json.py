@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from flexgs_edge.goals.promise import KeptPromise
 from flexgs_edge.goals.steps import Step
 from flexgs_edge.goals.target import Measurement
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
@@ -28,9 +29,26 @@ def step_json(step: Step) -> dict[str, Any]:
         "modelled_drop": rounded(found.modelled_drop if found else None),
         **_covered_json(found),
         "worst": _worst_json(found.worst) if found and found.worst else None,
+        "usual_drop": rounded(found.usual if found else None),
+        "ssim_drop": rounded(found.ssim_drop if found else None, 5),
+        "made_gap": rounded(found.made_gap if found else None),
         "holds": step.holds,
         "estimated": step.estimated,
         "seconds": round(step.seconds, 3),
+    }
+
+
+def promise_json(promise: KeptPromise | None) -> dict[str, Any] | None:
+    """Return the bounds beside the target as JSON values."""
+    if promise is None:
+        return None
+    return {
+        "held": promise.held,
+        "decided": promise.decided,
+        "parts": [
+            {"name": part.name, "found": rounded(part.found, 5), "allowed": rounded(part.allowed, 5), "held": part.held}
+            for part in promise.parts
+        ],
     }
 
 
@@ -76,8 +94,21 @@ def quality_json(quality: Quality) -> dict[str, Any]:
         "original_lpips": rounded(quality.original_lpips, 5),
         "lpips_fidelity": rounded(quality.lpips_original, 5),
         "identical_views": quality.identical,
+        "made": None if quality.made is None else _made_json(quality.made),
         "worst": _view_json(worst) if worst else None,
         "views": [_view_json(view) for view in quality.views],
+    }
+
+
+def _made_json(made: Quality) -> dict[str, Any]:
+    """Fidelity at made poses."""
+    return {
+        "fidelity": rounded(made.fidelity),
+        "covered_fidelity": rounded(made.covered_fidelity),
+        "views": [
+            {"name": view.name, "fidelity": rounded(view.fidelity), "covered_fidelity": rounded(view.covered_fidelity)}
+            for view in made.views
+        ],
     }
 
 

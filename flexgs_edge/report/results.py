@@ -12,10 +12,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from flexgs_edge._version import __version__
+from flexgs_edge.goals.promise import KeptPromise
 from flexgs_edge.goals.steps import Scored, SearchResult
 from flexgs_edge.packed.sensitivity import Sensitivity
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
-from flexgs_edge.report.as_json import quality_json, rounded, step_json
+from flexgs_edge.report.as_json import promise_json, quality_json, rounded, step_json
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
 from flexgs_edge.report.summary import (
     decibel,
@@ -89,6 +90,8 @@ class CompressResult:
         Fidelity of the decoded file on some training views, dB. Measured only if `quality` comes from held-out views.
     warnings : tuple of str
         Reasons to trust the figures less. Each names a number and what to do.
+    promise : KeptPromise or None
+        How the bounds beside the target stand on the deciding views; `None` without such bounds.
     """
 
     scene: SceneInfo
@@ -122,6 +125,7 @@ class CompressResult:
     scored: Scored | None = None
     training_fidelity: float | None = None
     warnings: tuple[str, ...] = ()
+    promise: KeptPromise | None = None
 
     @property
     def ratio(self) -> float:
@@ -165,6 +169,7 @@ class CompressResult:
             "target": self.target,
             "decided_by": self.decided_by,
             "reached": self.reached,
+            "promise": promise_json(self.promise),
             "decision_views": self.decision_views,
             "search": [step_json(step) for step in self.search.steps] if self.search else [],
             "sensitivity": [{**asdict(item), "loss": item.loss} for item in self.sensitivity],
@@ -221,6 +226,10 @@ def _decision_lines(result: CompressResult) -> list[str]:
     verdict = "reached" if result.reached else "NOT reached: this is the closest point"
     lines = [line("target", f"{result.target}: {verdict}, after {len(steps)} steps")]
     lines.append(line("decided by", decided_words(result)))
+    if result.promise is not None:
+        words = [part.words if part.held else f"{part.words}: NOT kept" for part in result.promise.parts]
+        decided = "" if result.promise.decided == "target" else f" (the {result.promise.decided} decided)"
+        lines.append(line("promise", f"{'; '.join(words)}{decided}"))
     return lines
 
 

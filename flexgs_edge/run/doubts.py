@@ -2,28 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.goals.steps import Scored
 from flexgs_edge.io.frames import RDF
-from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.quality.psnr import mse
-from flexgs_edge.quality.view_quality import Quality, ViewQuality
-from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.inputs import CheckedScene
-from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.views.references import References
 
-FIT_VIEWS = 8
-"""At most this many training views, evenly spread, compare the finished file with the original."""
-FIT_STEP = 2
-"""The comparison reads every second pixel in both directions."""
 FIT_GAP = 2.0
 """We warn of overfitting when training views show this much more fidelity than held-out views, dB."""
 NEEDED_VIEWS = 16
@@ -36,63 +22,6 @@ BEHIND_SHARE = 0.5
 """We warn when more than this share of the Gaussians lies behind all cameras."""
 _SAMPLE_ROWS = 2048
 _SAMPLE_VIEWS = 64
-
-
-class TrainingPoses:
-    """Compares a finished file with the original on some training views.
-
-    The figures of a run come from other views. Training views only show whether the result fits the scored views too closely.
-
-    Parameters
-    ----------
-    renderer : Renderer
-        Draws both scenes.
-    original : DeviceScene
-        The loaded original; the constructor draws its references.
-    cameras : sequence of Camera
-        All training views; up to `FIT_VIEWS` of them are used.
-    covered_decides : bool
-        As for `Quality`: fidelity is over covered pixels.
-    progress : Progress, optional
-        Shows a bar while the references are drawn.
-    """
-
-    def __init__(
-        self,
-        renderer: Renderer,
-        original: DeviceScene,
-        cameras: Sequence[Camera],
-        covered_decides: bool,
-        progress: Progress = SILENT,
-    ) -> None:
-        count = min(FIT_VIEWS, len(cameras))
-        self._renderer = renderer
-        self._cameras = [cameras[i * len(cameras) // count].every(FIT_STEP) for i in range(count)]
-        self._covered_decides = covered_decides
-        self._coverage: list[float] = []
-        self._references = References()
-        in_turn = renderer.in_turn(original, self._cameras)
-        try:
-            for view, camera in enumerate(progress.track(in_turn, "rendering the original", count)):
-                self._references.add(view, renderer.render_planes(original, camera))
-                self._coverage.append(renderer.drawn_coverage())
-        except BaseException:
-            self.close()
-            raise
-
-    def fidelity(self, scene: DeviceScene) -> float | None:
-        """Mean fidelity of `scene` over these views, dB; `None` if all renders are identical."""
-        found = []
-        for view, camera in enumerate(self._renderer.in_turn(scene, self._cameras)):
-            inside = (slice(None), slice(camera.height), slice(camera.width))
-            planes = self._renderer.render_planes(scene, camera)
-            error = mse(planes[inside], self._references[view][inside])
-            found.append(ViewQuality(camera.name, error, coverage=self._coverage[view]))
-        return measurement_of(Quality(tuple(found), covered_decides=self._covered_decides)).figure("fidelity")
-
-    def close(self) -> None:
-        """Free the renders of the original."""
-        self._references.close()
 
 
 def frame_doubts(views: ViewSet, scene: CheckedScene) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from flexgs_edge.quality.psnr import mse
 from flexgs_edge.quality.ssim import ssim_bytes, ssims
 from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view
 from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.run.few_poses import FewPoses
 from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.check import alive, invisible
@@ -86,6 +87,8 @@ class Judge:
         self._coverage: list[float] = []
         self._coarse_error: dict[int, float] = {}
         self._known: dict[bytes, Quality] = {}
+        self.made: FewPoses | None = None
+        """Made poses that whole comparisons look at too."""
         # Reserve the memory now: scenes that are loaded later must not count on it.
         pixels = [camera.width * camera.height for camera in self.cameras]
         images = 1 if self.photos is None else 2
@@ -197,7 +200,8 @@ class Judge:
             ssims = self._ssims if with_ssim else None
             coverage = self._coverage[i]
             found.append(compare_view(self.cameras[i].name, image, *references, error, ssims, lpips, coverage))
-        quality = Quality(tuple(found), self.base_psnr, self.covered_decides)
+        made = None if self.made is None else self.made.quality(scene)
+        quality = Quality(tuple(found), self.base_psnr, self.covered_decides, made)
         if whole and drawn is None:
             drawn = scene.fingerprint(elsewhere)
         if drawn is not None:
@@ -288,8 +292,14 @@ def _coarse_pixels(camera: Camera) -> int:
 def measurement_of(quality: Quality) -> Measurement:
     """The figures that a search decides on: the means, and those of the worst view."""
     worst = quality.worst
-    alone = None if worst is None else replace(quality, views=(worst,))
-    return replace(_means(quality), worst=None if alone is None else _means(alone))
+    alone = None if worst is None else _means(replace(quality, views=(worst,), made=None))
+    return replace(
+        _means(quality),
+        worst=alone,
+        usual=quality.usual_drop,
+        ssim_drop=quality.ssim_drop,
+        made_gap=quality.made_gap,
+    )
 
 
 def _means(quality: Quality) -> Measurement:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.packed.quantize import QuantizedScene
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.run.decoding import ahead, coding_device
-from flexgs_edge.run.doubts import TrainingPoses
+from flexgs_edge.run.few_poses import MOST, FewPoses, evenly, made_poses
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.source import SceneSource
@@ -35,7 +36,8 @@ class Judges:
         self.report = self._judge(run.plan.report, reports=True)
         on_train = run.plan.decide != run.plan.report
         self.decide = self._judge(run.plan.decide, reports=False) if on_train else self.report
-        self.training: TrainingPoses | None = None
+        self.training: FewPoses | None = None
+        self._made: FewPoses | None = None
         self.trained: float | None = None
         """Fidelity of what was measured last on training poses, dB."""
 
@@ -53,7 +55,10 @@ class Judges:
     def original(self) -> Iterator[DeviceScene]:
         """The original, loaded once: its references are drawn at the start, and it is released at the end."""
         run, renderer = self._run, self._bench.renderer
-        views = run.seen
+        views, made = run.seen, None
+        if self._plan.makes_poses:
+            with run.clock.stage("load"):
+                made = made_poses(renderer, run.source, self.decide.cameras)
         with run.clock.stage("load"):
             device_scene = renderer.load(run.source)
         with device_scene:
@@ -62,10 +67,16 @@ class Judges:
                 if self.decide is not self.report:
                     self.decide.prepare(device_scene, run.progress)
                 if views.train and self._plan.report == views.held_out:
-                    cameras, covered_decides = views.of(views.train), self.report.covered_decides
-                    self.training = TrainingPoses(renderer, device_scene, cameras, covered_decides, run.progress)
+                    cameras = evenly(views.of(views.train), MOST)
+                    self.training = self._few(device_scene, cameras)
+                if made is not None:
+                    self.decide.made = self.report.made = self._made = self._few(device_scene, made)
             yield device_scene
         renderer.release()
+
+    def _few(self, original: DeviceScene, cameras: Sequence[Camera]) -> FewPoses:
+        covered_decides, progress = self.report.covered_decides, self._run.progress
+        return FewPoses(self._bench.renderer, original, cameras, covered_decides, progress)
 
     def prepare(self) -> None:
         """Draw the references, where nothing else is asked of the original."""
@@ -88,7 +99,7 @@ class Judges:
         with run.clock.stage("measure"), load() as scene:
             # First, since it brings the scene to the backend: the judge then sees whether it is what the search measured.
             if self.training is not None:
-                self.trained = self.training.fidelity(scene)
+                self.trained = self.training.quality(scene).deciding_fidelity
             quality = self.report.compare(scene, with_ssim=True, progress=run.progress)
             if run.reporter is not None:
                 run.reporter.look(self.report, scene, quality, run.clock, run.progress)
@@ -100,9 +111,10 @@ class Judges:
             self.decide.close()
 
     def close(self) -> None:
-        """Remove what the original looked like from training poses."""
-        if self.training is not None:
-            self.training.close()
+        """Remove what the original looked like from training poses and made ones."""
+        for few in (self.training, self._made):
+            if few is not None:
+                few.close()
 
     def __enter__(self) -> Judges:
         return self

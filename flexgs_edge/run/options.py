@@ -10,10 +10,12 @@ from flexgs_edge.cameras.camera import split_views
 from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, MAX_VIEW_WIDTH
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.promise import LEAST_SSIM, SSIM_PER_DB, MadePoses, MeanSsim, Part, WorstView, promised
 from flexgs_edge.goals.steps import REFINE_STEPS
-from flexgs_edge.goals.target import Figure, MaxDrop, MaxSize, MinFidelity, Target, WorstToo, min_ratio
+from flexgs_edge.goals.target import Figure, MaxDrop, MaxSize, MinFidelity, Target, min_ratio
 from flexgs_edge.io.reading import Reading, Writing
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.quality.psnr import modelled_drop, mse_of_psnr
 
 NO_PHOTOS = "none"
 """`--images none`: do not use the photos beside the scene."""
@@ -25,6 +27,9 @@ METHODS = ("best", "paper")
 EFFORT_WORDS = (*REFINE_STEPS, "max")
 """`max` also distils. Only the method `best` knows it, and only for a `.fgs`."""
 SELECTS = ("test", "train")
+PROMISES = ("whole", "mean")
+NONE = "none"
+"""Lifts a bound of the promise."""
 LAYERS_MOST = 4
 DISTIL_MOST = 100_000
 """Most iterations of distillation. This many take hours on any machine; beyond a few thousand nothing is gained."""
@@ -38,7 +43,6 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "bits": ("paper", "paper"),
     "groups": ("paper", None),
     "unseen": ("best", "keep"),
-    "views_margin": ("best", False),
     "refit": ("best", True),
     "distil": ("best", None),
     "layers": ("best", 1),
@@ -158,8 +162,13 @@ class CompressOptions(ViewOptions):
         Keep the scores in this file. Reuse them when scene, views and score are the same (`paper`).
     max_drop, min_fidelity : float, optional
         Quality target: most PSNR lost, or least fidelity, dB. Default: `max_drop=1`.
-    max_worst_drop : float, optional
-        Largest drop of any single deciding view, in addition to a quality target, dB.
+    promise : {"whole", "mean"}
+        What holds beside the target: bounds on the worst view, on SSIM and on made poses (`whole`), or nothing (`mean`).
+        Default: `whole`.
+    max_worst_drop : float or "none", optional
+        Largest drop of any single deciding view, dB. Default: 1.5 times their mean and 0.2 dB.
+    max_ssim_drop : float or "none", optional
+        Largest loss of SSIM, mean over the deciding views. Default: 0.015 for each dB that the target allows.
     max_size : int, optional
         Size target: most bytes of the file.
     min_ratio : float, optional
@@ -179,8 +188,8 @@ class CompressOptions(ViewOptions):
     unseen : str
         What to do with Gaussians that no training view sees (`best`): `keep`, `drop`, or a share such as `20%`, which keeps
         the most visible ones. Default: `keep`, without view-dependent colour.
-    views_margin : bool
-        Also score generated camera views: closer, farther and in between (`best`). Slower, slightly larger files. Default: no.
+    views_margin : bool, optional
+        Bound the loss at made poses, where no camera stood, and score some too (`best`). Default: as `promise` says.
     refit : bool
         Refit colours after pruning and quantizing (`best`). Default: yes; without it files are larger.
     distil : int, optional
@@ -212,7 +221,9 @@ class CompressOptions(ViewOptions):
     score_cache: str | None = None
     max_drop: float | None = None
     min_fidelity: float | None = None
-    max_worst_drop: float | None = None
+    promise: str = "whole"
+    max_worst_drop: float | str | None = None
+    max_ssim_drop: float | str | None = None
     max_size: int | None = None
     min_ratio: float | None = None
     prune_rate: float | None = None
@@ -223,7 +234,7 @@ class CompressOptions(ViewOptions):
     effort: str = "balanced"
     best_effort: bool = False
     unseen: str = "keep"
-    views_margin: bool = False
+    views_margin: bool | None = None
     refit: bool = True
     distil: int | None = None
     spz_version: int = 3
@@ -241,6 +252,7 @@ class CompressOptions(ViewOptions):
             ("--method", self.method, METHODS),
             ("--select", self.select, SELECTS),
             ("--effort", self.effort, EFFORT_WORDS),
+            ("--promise", self.promise, PROMISES),
         ):
             if value not in known:
                 raise InputError(f"{word} {value!r}: expected one of {', '.join(known)}")
@@ -277,12 +289,11 @@ class CompressOptions(ViewOptions):
             raise InputError(
                 f"{given[0]} with --prune-rate and --sh-rate: fixed rates leave nothing to search; give one or the other"
             )
-        sized = [word for word in given if word in ("--max-size", "--min-ratio")]
-        if self.max_worst_drop is not None and (sized or self.fixed is not None):
-            other = sized[0] if sized else "--prune-rate and --sh-rate"
-            raise InputError(
-                f"--max-worst-drop with {other}: it goes with --max-drop or --min-fidelity; leave one of them out"
-            )
+        for word, bound in (("--max-worst-drop", self.max_worst_drop), ("--max-ssim-drop", self.max_ssim_drop)):
+            if isinstance(bound, str) and bound != NONE:
+                raise InputError(f"{word} {bound}: expected a number or none")
+            if bound is not None and self.fixed is not None:
+                raise InputError(f"{word} with --prune-rate and --sh-rate: fixed rates leave nothing to search")
         self.target("drop", 1)
 
     @property
@@ -293,8 +304,13 @@ class CompressOptions(ViewOptions):
 
     @property
     def target_is_default(self) -> bool:
-        """Whether the user named no target and no limit of the worst view."""
-        return not self.targets and self.max_worst_drop is None
+        """Whether the user named no target and no bound of the promise."""
+        return not self.targets and self.max_worst_drop in (None, NONE) and self.max_ssim_drop in (None, NONE)
+
+    @property
+    def makes_poses(self) -> bool:
+        """Whether made poses are scored and bounded."""
+        return self.promise == "whole" if self.views_margin is None else self.views_margin
 
     @property
     def writing(self) -> Writing:
@@ -329,13 +345,35 @@ class CompressOptions(ViewOptions):
         """The target of the search, or `None` for fixed rates. `figure` is the kind of drop that decides."""
         if self.fixed is not None:
             return None
+        target: Target
+        allowed: float | None = None
         if self.max_size is not None:
-            return MaxSize(self.max_size, figure)
-        if self.min_ratio is not None:
-            return min_ratio(self.min_ratio, ply_bytes, figure)
-        drop = MaxDrop(DEFAULT_MAX_DROP if self.max_drop is None else self.max_drop, figure)
-        mean = drop if self.min_fidelity is None else MinFidelity(self.min_fidelity)
-        return mean if self.max_worst_drop is None else WorstToo(mean, self.max_worst_drop, figure)
+            target = MaxSize(self.max_size, figure)
+        elif self.min_ratio is not None:
+            target = min_ratio(self.min_ratio, ply_bytes, figure)
+        elif self.min_fidelity is not None:
+            target = MinFidelity(self.min_fidelity)
+            allowed = modelled_drop(mse_of_psnr(self.min_fidelity), self.base_psnr)
+        else:
+            allowed = DEFAULT_MAX_DROP if self.max_drop is None else self.max_drop
+            target = MaxDrop(allowed, figure)
+        return promised(target, self._parts(figure, allowed))
+
+    def _parts(self, figure: Figure, allowed: float | None) -> list[Part]:
+        """The bounds beside the target; `allowed` is the drop that the target allows, dB, if it says so."""
+        parts: list[Part] = []
+        whole = self.promise == "whole"
+        if isinstance(self.max_worst_drop, (int, float)):
+            parts.append(WorstView(figure, self.max_worst_drop))
+        elif whole and self.max_worst_drop is None:
+            parts.append(WorstView(figure))
+        if isinstance(self.max_ssim_drop, (int, float)):
+            parts.append(MeanSsim(self.max_ssim_drop))
+        elif whole and self.max_ssim_drop is None and allowed is not None:
+            parts.append(MeanSsim(max(SSIM_PER_DB * allowed, LEAST_SSIM)))
+        if self.makes_poses:
+            parts.append(MadePoses())
+        return parts
 
     def bit_spec(self) -> tuple[BitSpec | None, int | None]:
         """Bits and groups that `--bits` and `--groups` ask for. `None` for bits: measure them (`auto`)."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.promise import MadePoses, Promised
 from flexgs_edge.goals.target import Figure, Target
 from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.options import CompressOptions
@@ -81,6 +82,12 @@ class Plan:
             needs_scores=needs_scores,
             computes_scores=computes,
         )
+
+    @property
+    def makes_poses(self) -> bool:
+        """Whether the promise is about made poses too."""
+        target = self.target
+        return isinstance(target, Promised) and any(isinstance(part, MadePoses) for part in target.parts)
 
     @property
     def decided_by(self) -> str | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -218,6 +218,8 @@ def open_study_scene(
     FlexGSError
         As `compress`.
     """
+    # Studies compare methods by the mean alone, each with the poses that it is given.
+    options = replace(options, promise="mean")
     # Planning refuses scenes without cameras, and splits without training poses, as `compress` does.
     run = planned(open_run(path, options, progress))
     source, views, plan, clock = run.source, run.seen, run.plan, run.clock

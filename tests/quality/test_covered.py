@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexgs_edge.goals.target import Covered, MaxDrop, MaxSize, Measurement, MinFidelity, WorstToo
+from flexgs_edge.goals.promise import Promised, WorstView
+from flexgs_edge.goals.target import Covered, MaxDrop, MaxSize, Measurement, MinFidelity
 from flexgs_edge.quality.psnr import modelled_drop, mse
 from flexgs_edge.quality.view_quality import LEAST_COVERAGE, Quality, ViewQuality, compare_view
 from flexgs_edge.report.as_json import quality_json
@@ -93,8 +94,8 @@ def test_targets_ask_the_figures_that_decide() -> None:
     found = Measurement(None, 70.0, 0.001, inner, Covered(30.0, 3.0))
     assert MinFidelity(40.0).excess(1, found) > 0 and MaxDrop(1.0, "modelled drop").excess(1, found) > 0
     assert MinFidelity(25.0).excess(1, found) < 0 and "fidelity 30.000 dB" in MinFidelity(25.0).report(1, found)
-    worst = WorstToo(MinFidelity(25.0), 1.5, "modelled drop")
-    assert worst.excess(1, found) > 0 and "modelled drop 12.000 dB in the worst view" in worst.report(1, found)
+    worst = Promised(MinFidelity(25.0), (WorstView("modelled drop", 1.5),))
+    assert worst.excess(1, found) > 0 and "worst view 12.000 of 1.500 dB" in worst.report(1, found)
     assert "modelled drop 3.000 dB" in MaxSize(10).report(1, found)
 
 

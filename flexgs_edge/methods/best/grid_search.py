@@ -155,6 +155,10 @@ class GridSearch(MultiplierSearch[GridScene]):
                 offset += self._drift + FARTHER * max(misses(steps) - 1, 0)
         low, high = bounds(steps, by_size)
         place = min(max(math.log(multiplier), low), high)
+        if math.isfinite(high - low):
+            # Between two whole results, their own line is better than probes, whose colours make up for missing rows.
+            self._expected = AIM
+            return math.exp(place)
         # If nothing holds and the curve is flat, the search must not run away to infinity.
         low, high = max(low, place - FARTHEST), min(high, place + FARTHEST)
         seen: list[tuple[float, float]] = []

@@ -67,7 +67,7 @@ def kept_as_it_is(
     if round(layers_cost * size) > limit:
         return None
     with bench.renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
-        measurement = measurement_of(judge.compare(scene, with_ssim=judge.reports))
+        measurement = measurement_of(judge.compare(scene, with_ssim=True))
     without = 1000 - min(round(1000 * grid.sh_count / grid.count), 1000)
     seconds = time.perf_counter() - started
     step = Step(Choice(0, without), size, measurement, target.excess(size, measurement), "multiplier", seconds)

@@ -10,25 +10,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.generated import at_distance, between
+from flexgs_edge.cameras.generated import FARTHER, NEARER, at_distance, between
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.depths import visible_depths
 
-NEARER, FARTHER = 0.5, 2.0
-"""Distances of generated poses from the scene, in distances of the given pose. Generated poses come on top of the given
-ones; in place of them they would make files larger. Scenes differ in which views are missing, so we make both kinds:
-docs/results/tuning.md#nearer"""
-BETWEEN, FAR = 8, 2
-"""One of `BETWEEN` given poses gets a pose half way to its nearest neighbour instead of a nearer one. One of `FAR` given
-poses gets a farther one too."""
+EVERY, BETWEEN = 8, 7
+"""Of `EVERY` given poses, the first and fifth get a nearer one, the third and seventh a farther one, and number `BETWEEN` one
+half way to its nearest neighbour: docs/results/tuning.md#margin. They come on top of the given poses; in place of them they
+would make files larger."""
+TIMES = {0: NEARER, 2: FARTHER, 4: NEARER, 6: FARTHER}
 
 
 def with_margin(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """The first `most` of `cameras` to score, and three generated poses for every two of them.
-
-    Each given pose gets a nearer one; one of eight gets one half way to its nearest neighbour instead. Every second
-    pose also gets a farther one.
+    """The first `most` of `cameras` to score, and five made poses for every eight of them.
 
     Parameters
     ----------
@@ -42,14 +37,14 @@ def with_margin(renderer: Renderer, source: SceneSource, cameras: Sequence[Camer
         Most given poses.
     """
     real = list(cameras[:most])
+    moved = [place for place in range(len(real)) if place % EVERY in TIMES]
+    depths = dict(zip(moved, visible_depths(renderer, source, [real[place] for place in moved]), strict=True))
     made = []
-    for place, (camera, depth) in enumerate(zip(real, visible_depths(renderer, source, real))):
-        others = [other for other in cameras if other is not camera]
-        if place % BETWEEN == BETWEEN // 2 - 1 and others:
+    for place, camera in enumerate(real):
+        if place in depths:
+            made.append(at_distance(camera, depths[place], TIMES[place % EVERY]))
+        elif place % EVERY == BETWEEN and len(cameras) > 1:
+            others = [other for other in cameras if other is not camera]
             away = [float(np.linalg.norm(other.center - camera.center)) for other in others]
             made.append(between(camera, others[int(np.argmin(away))]))
-        else:
-            made.append(at_distance(camera, depth, NEARER))
-        if place % FAR == 0:
-            made.append(at_distance(camera, depth, FARTHER))
     return real + made

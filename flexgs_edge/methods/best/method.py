@@ -265,7 +265,7 @@ def search_rounds(
 
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=source.origin)) as kept_scene:
-            quality = judge.estimate(kept_scene) if estimate else judge.compare(kept_scene, with_ssim=judge.reports)
+            quality = judge.estimate(kept_scene) if estimate else judge.compare(kept_scene, with_ssim=True)
             return measurement_of(quality)
 
     def report(step: Candidate) -> None:

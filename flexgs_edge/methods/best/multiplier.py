@@ -17,7 +17,7 @@ import numpy as np
 
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
-from flexgs_edge.goals.steps import better
+from flexgs_edge.goals.steps import better, obstacle
 from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.methods.best.allocation import BitModel, choose, drop_bands, keep_one
 from flexgs_edge.methods.best.candidates import Candidate, Product, RateResult, next_multiplier
@@ -144,7 +144,7 @@ class MultiplierSearch(ABC, Generic[Product]):
             last = ", with one Gaussian left" if target.limit_bytes is not None and chosen.count == 1 else ""
             raise TargetError(
                 f"{target.describe()} is out of reach; the closest point has {target.report(chosen.size, chosen.measurement)}"
-                f"{last} (--best-effort writes it)"
+                f"{last} (--best-effort writes it){obstacle(target, chosen)}"
             )
         return RateResult(product, chosen, chosen.holds, tuple(steps))
 

@@ -49,7 +49,7 @@ def scored_poses(
 ) -> ScoredPoses:
     """Choose as many poses as the effort scores. Each next pose is the one that adds most to what those before it see.
 
-    With `views_margin`, generated poses come on top (see `with_margin`). A few poses chosen like this give costs about as
+    With `makes_poses`, generated poses come on top (see `with_margin`). A few poses chosen like this give costs about as
     good as all poses do: docs/results/speed.md#scoring-fewer-views
 
     Parameters
@@ -57,7 +57,7 @@ def scored_poses(
     cameras : sequence of Camera
         All training poses.
     options : CompressOptions
-        Effort, target and `views_margin`.
+        Effort, target and `makes_poses`.
     renderer : Renderer
         With nothing loaded.
     source : SceneSource
@@ -71,7 +71,7 @@ def scored_poses(
     ordered = [cameras[i] for i in (*order, *rest)]
     fine = is_fine(options, source)
     most = plan.views if fine else plan.poses_of([camera.width * camera.height for camera in ordered], source.count)
-    chosen = with_margin(renderer, source, ordered, most) if options.views_margin else ordered[:most]
+    chosen = with_margin(renderer, source, ordered, most) if options.makes_poses else ordered[:most]
     given = {id(camera) for camera in cameras}
     drawn = chosen
     if not fine:

@@ -113,7 +113,7 @@ class FileMaker:
         measurement = None
         if self._renderer is not None and self._judge is not None:
             with self._renderer.load(found) as scene:
-                measurement = measurement_of(self._judge.compare(scene))
+                measurement = measurement_of(self._judge.compare(scene, with_ssim=True))
         sh_count = int(np.count_nonzero(nonzero_sh(source))) if found.sh_degree else 0
         return WrittenFile(path, path.stat().st_size, found.count, sh_count, found.sh_degree, measurement)
 

@@ -85,7 +85,7 @@ class SceneEvaluator:
         """Prune, quantize, dequantize, render and compare."""
         assert self.judge is not None
         with self.quantized(choice) as quantized, self.judge.renderer.load_quantized(quantized) as scene:
-            return measurement_of(self.judge.compare(scene))
+            return measurement_of(self.judge.compare(scene, with_ssim=True))
 
     def estimate(self, choice: Choice) -> Measurement:
         """As `measure`, from a fourth of the pixels."""

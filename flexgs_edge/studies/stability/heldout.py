@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexgs_edge.goals.target import MaxDrop, WorstToo
+from flexgs_edge.goals.promise import WORST_MORE, WORST_TIMES, Promised, WorstView
+from flexgs_edge.goals.target import MaxDrop
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
@@ -21,8 +22,6 @@ from flexgs_edge.studies.stability.ours import Whole, search
 from flexgs_edge.studies.stability.unseen_poses import TILE_SIDE, evenly, worst_tile
 from flexgs_edge.studies.study_scene import StudyScene
 
-WORST_TIMES, WORST_MORE = 1.5, 0.2
-"""The worst view may lose `WORST_TIMES` times the mean and `WORST_MORE` dB."""
 EVEN, HELD = "best, decided on even views", "best, --max-worst-drop"
 HEADS = {
     "method": "method",
@@ -50,7 +49,7 @@ def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amo
         whole[EVEN] = _decided_on_even(studied, path)
         if isinstance(studied.target, MaxDrop):
             limit = WORST_TIMES * studied.target.limit
-            whole[HELD] = search(studied, path, WorstToo(studied.target, limit, studied.target.figure))
+            whole[HELD] = search(studied, path, Promised(studied.target, (WorstView(studied.target.figure, limit),)))
     rows = []
     train = evenly(studied.views.of(studied.views.train), len(cameras))
     renderer = studied.bench.renderer

@@ -189,7 +189,13 @@ def test_gaussians_that_no_pose_sees(project: Path, tmp_path: Path, unseen: str,
     planes["log_scales"][:2, COUNT + 5 : COUNT + 15] = -2  # these ten would show most of all
     planes["opacity_logits"][:, COUNT:] = 2
     write_ply(tmp_path / "far.ply", MemorySource(planes, 1))
-    words = {**TINY, "cameras": str(project / "cameras.json"), "min_fidelity": 30.0, "unseen": unseen}
+    words = {
+        **TINY,
+        "cameras": str(project / "cameras.json"),
+        "min_fidelity": 30.0,
+        "unseen": unseen,
+        "promise": "mean",
+    }
     compress(tmp_path / "far.ply", tmp_path / "a.fgs", **words)
     source = open_scene(tmp_path / "a.fgs")
     depth = source.read(slice(0, source.count), ["means"])["means"][2] + source.origin[2]

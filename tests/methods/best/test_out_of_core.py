@@ -43,7 +43,7 @@ from synthetic import NotedSource, joined, look_from, make_camera, random_scene
 from tiny_project import make_project, write_cameras
 
 SCENE = joined(random_scene(700, 5, 2), random_scene(300, 6, 2, size=-1.0))
-TINY: dict[str, Any] = {"effort": "fast", "holdout": 4, "min_fidelity": 35.0, "best_effort": True}
+TINY: dict[str, Any] = {"effort": "fast", "holdout": 4, "min_fidelity": 35.0, "best_effort": True, "promise": "mean"}
 
 
 def cameras() -> list[Camera]:

@@ -34,7 +34,15 @@ def compress(
     """A run of its own, within a memory control group of `cap` bytes where one can be had."""
     command = [sys.executable, "-m", "flexgs_edge", "compress", str(folder / "point_cloud.ply"), "-f"]
     command += ["-o", str(folder / f"{name}.fgs"), "--json", str(folder / f"{name}.json"), "--effort", "fast"]
-    command += ["--min-fidelity", "38", "--best-effort", *(() if limit is None else ("--memory-limit", limit)), *more]
+    command += [
+        "--min-fidelity",
+        "38",
+        "--best-effort",
+        "--promise",
+        "mean",
+        *(() if limit is None else ("--memory-limit", limit)),
+        *more,
+    ]
     environment = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     if cap is not None:
         done = subprocess.run(

@@ -1,0 +1,272 @@
+"""What a file keeps beside its target: no view breaks, structure stays, and other poses look alike.
+
+A target is about the mean of the views that decide. The promise adds bounds that a mean would hide: on the worst view, on
+the SSIM that is lost, and on made poses, where no given camera stood.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from flexgs_edge.errors import InputError
+from flexgs_edge.goals.target import Figure, Measurement, Target, log_loss
+
+WORST_TIMES, WORST_MORE = 1.5, 0.2
+"""The worst view may lose `WORST_TIMES` times the mean and `WORST_MORE` dB."""
+SSIM_PER_DB = 0.015
+"""SSIM that may be lost for each dB of the target. The paper's method loses 0.010 to 0.019 at 1 dB:
+docs/results/tuning.md#ssim_per_db"""
+LEAST_SSIM = 1e-4
+"""Least SSIM that a target allows to lose; rounding alone loses a part of it."""
+MADE_GAP = 3.0
+"""Made poses may have this much less fidelity than the views that decide, dB: twice their squared error."""
+
+
+class Part(Protocol):
+    """One bound of the promise."""
+
+    @property
+    def name(self) -> str:
+        """What it is about, in two words."""
+
+    @property
+    def option(self) -> str:
+        """The option that moves or lifts it."""
+
+    def found(self, measurement: Measurement) -> float | None:
+        """The figure that it bounds; `None` if it was not measured."""
+
+    def allowed(self, measurement: Measurement) -> float:
+        """The bound of that figure."""
+
+    def excess(self, measurement: Measurement) -> float | None:
+        """By how much the bound is missed, as `Target.excess`; `None` if its figure was not measured."""
+
+    def report(self, measurement: Measurement) -> str:
+        """The figure and its bound in words."""
+
+
+@dataclass(frozen=True)
+class WorstView:
+    """No view loses more than `limit` dB, or without a limit than `WORST_TIMES` the mean and `WORST_MORE` dB."""
+
+    figure: Figure
+    limit: float | None = None
+    name = "worst view"
+    option = "--max-worst-drop"
+
+    def __post_init__(self) -> None:
+        if self.limit is not None and not (math.isfinite(self.limit) and self.limit > 0.0):
+            raise InputError(f"--max-worst-drop {self.limit:g}: expected a drop above 0 dB, or none")
+
+    def found(self, measurement: Measurement) -> float | None:
+        return None if measurement.worst is None else measurement.worst.loss(self.figure)
+
+    def allowed(self, measurement: Measurement) -> float:
+        return WORST_TIMES * (measurement.usual or 0.0) + WORST_MORE if self.limit is None else self.limit
+
+    def excess(self, measurement: Measurement) -> float | None:
+        found = self.found(measurement)
+        if found is None or self.limit is not None:
+            return None if found is None else log_loss(found, self.limit or 0.0)
+        # Worst view over bound would hardly change with compression. What it loses beyond the mean's share does.
+        return log_loss(found - WORST_TIMES * (measurement.usual or 0.0), WORST_MORE)
+
+    def report(self, measurement: Measurement) -> str:
+        found = self.found(measurement)
+        return f"worst view {'-' if found is None else f'{found:.3f}'} of {self.allowed(measurement):.3f} dB"
+
+
+@dataclass(frozen=True)
+class MeanSsim:
+    """The views lose at most `limit` of SSIM in the mean."""
+
+    limit: float
+    name = "SSIM lost"
+    option = "--max-ssim-drop"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.limit) and 0.0 < self.limit <= 2.0):
+            raise InputError(f"--max-ssim-drop {self.limit:g}: expected a number above 0 (0.015 is usual), or none")
+
+    def found(self, measurement: Measurement) -> float | None:
+        return measurement.ssim_drop
+
+    def allowed(self, measurement: Measurement) -> float:
+        return self.limit
+
+    def excess(self, measurement: Measurement) -> float | None:
+        return None if measurement.ssim_drop is None else log_loss(measurement.ssim_drop, self.limit)
+
+    def report(self, measurement: Measurement) -> str:
+        found = measurement.ssim_drop
+        return f"SSIM lost {'-' if found is None else f'{found:.4f}'} of {self.limit:.3g}"
+
+
+@dataclass(frozen=True)
+class MadePoses:
+    """Made poses have at most `gap` dB less fidelity than the views that decide."""
+
+    gap: float = MADE_GAP
+    name = "made poses"
+    option = "--no-views-margin"
+
+    def found(self, measurement: Measurement) -> float | None:
+        return measurement.made_gap
+
+    def allowed(self, measurement: Measurement) -> float:
+        return self.gap
+
+    def excess(self, measurement: Measurement) -> float | None:
+        return None if measurement.made_gap is None else (measurement.made_gap - self.gap) * (math.log(10.0) / 10.0)
+
+    def report(self, measurement: Measurement) -> str:
+        found = measurement.made_gap
+        return f"made poses {'-' if found is None else f'{found:.2f}'} of {self.gap:g} dB less fidelity"
+
+
+@dataclass(frozen=True)
+class Promised:
+    """A target, and the parts of the promise that hold with it.
+
+    With a size target the size alone says whether a point holds; of those that fit, one that keeps the promise is better.
+
+    Parameters
+    ----------
+    target : Target
+        What the user asked for.
+    parts : tuple of Part
+        The other bounds.
+    """
+
+    target: Target
+    parts: tuple[Part, ...]
+
+    @property
+    def figure(self) -> Figure:
+        """The figure of the target."""
+        return self.target.figure
+
+    @property
+    def limit_bytes(self) -> int | None:
+        """The size limit of the target."""
+        return self.target.limit_bytes
+
+    def excess(self, size: int, measurement: Measurement | None) -> float:
+        own = self.target.excess(size, measurement)
+        return own if self.limit_bytes is not None or measurement is None else max(own, self.broken(measurement))
+
+    def broken(self, measurement: Measurement | None) -> float:
+        """The largest excess of the parts; zero or less if all of them hold or none was measured."""
+        found = () if measurement is None else (part.excess(measurement) for part in self.parts)
+        return max((excess for excess in found if excess is not None), default=-math.inf)
+
+    def decides(self, size: int, measurement: Measurement) -> Part | None:
+        """The part that is nearest to its bound or farthest beyond; `None` if that is the target itself."""
+        own = self.target.excess(size, measurement)
+        found = [(part.excess(measurement), part) for part in self.parts]
+        known = [(excess, part) for excess, part in found if excess is not None]
+        excess, part = max(known, key=lambda pair: pair[0], default=(-math.inf, None))
+        return part if excess > own else None
+
+    def describe(self) -> str:
+        return self.target.describe()
+
+    def report(self, size: int, measurement: Measurement | None) -> str:
+        found = self.target.report(size, measurement)
+        if measurement is None:
+            return found
+        known = [part for part in self.parts if part.found(measurement) is not None]
+        return ", ".join([found, *(part.report(measurement) for part in known)])
+
+
+def in_the_way(target: Target, size: int, measurement: Measurement | None) -> str:
+    """A sentence on the part of the promise that a point misses by most, and what would lift it; empty if there is none."""
+    if not isinstance(target, Promised) or measurement is None:
+        return ""
+    part = target.decides(size, measurement)
+    if part is None or (part.excess(measurement) or 0.0) <= 0.0:
+        return ""
+    return f"the {part.name} stands in the way: {part.report(measurement)}; {lifting(part, measurement)}"
+
+
+def lifting(part: Part, measurement: Measurement) -> str:
+    """What the user may say to move or lift a part, in words."""
+    found = part.found(measurement)
+    if isinstance(part, MadePoses) or found is None:
+        return f"{part.option} lifts it"
+    digits = 1 if isinstance(part, WorstView) else 3
+    enough = math.ceil(found * 10**digits - 1e-6) / 10**digits
+    return f"{part.option} {enough:g} would allow this point, {part.option} none lifts it"
+
+
+def promised(target: Target, parts: Sequence[Part]) -> Target:
+    """`target` with the parts; the target itself if there are none."""
+    return Promised(target, tuple(parts)) if parts else target
+
+
+@dataclass(frozen=True)
+class KeptPart:
+    """How a part of the promise stands at a measured point.
+
+    Parameters
+    ----------
+    name : str
+        `worst view`, `SSIM lost` or `made poses`.
+    words : str
+        The figure and its bound in words.
+    found, allowed : float or None
+        The figure, `None` if it was not measured, and its bound.
+    held : bool
+        Whether the bound holds; True for a figure that was not measured.
+    """
+
+    name: str
+    words: str
+    found: float | None
+    allowed: float
+    held: bool
+
+
+@dataclass(frozen=True)
+class KeptPromise:
+    """How the promise stands at a measured point.
+
+    Parameters
+    ----------
+    parts : tuple of KeptPart
+        In the order of the promise.
+    decided : str
+        Name of the part that is nearest to its bound or farthest beyond, or `target`.
+    """
+
+    parts: tuple[KeptPart, ...]
+    decided: str
+
+    @property
+    def held(self) -> bool:
+        """Whether all parts hold."""
+        return all(part.held for part in self.parts)
+
+
+def kept_promise(target: Target | None, size: int, measurement: Measurement | None) -> KeptPromise | None:
+    """How the promise stands; `None` if there is none, or nothing was measured."""
+    if not isinstance(target, Promised) or measurement is None:
+        return None
+    decides = target.decides(size, measurement)
+    return KeptPromise(
+        tuple(
+            KeptPart(
+                part.name,
+                part.report(measurement),
+                part.found(measurement),
+                part.allowed(measurement),
+                (part.excess(measurement) or 0.0) <= 0.0,
+            )
+            for part in target.parts
+        ),
+        "target" if decides is None else decides.name,
+    )
