@@ -93,7 +93,11 @@ def flip_maps(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) 
     height, width = images[0].shape[:2]
     stride, rows = _layout(width, height)
     most = rows * stride
-    shapes = [(FILTERS, 2 * FLIP_REACH + 1), (3, (rows + 2 * FLIP_REACH) * stride), (FILTERS, most + LANES)]
+    shapes: list[tuple[int, ...]] = [
+        (FILTERS, 2 * FLIP_REACH + 1),
+        (3, (rows + 2 * FLIP_REACH) * stride),
+        (FILTERS, most + LANES),
+    ]
     shapes += [(SEEN, most)] * len(images) + [(most,)]
     found = [np.empty((height, width), np.float32) for _ in pairs]
     arrays: list[Any] = []

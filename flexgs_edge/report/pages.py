@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
+from flexgs_edge.constants import FLIP_DEGREE
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.report.camera_plan import plans
 from flexgs_edge.report.html import count, figure, render
@@ -87,6 +88,7 @@ def _shared(result: CompressResult | EvaluateResult, material: Material) -> dict
         "numbers": numbers,
         "few": FEW_ROWS,
         "error_scale": ERROR_SCALE,
+        "flip_degree": FLIP_DEGREE,
         "error_ramp": css_ramp(),
         "channels": _channel_rows(material.contents or {}),
         "camera_plans": plans(rig, shown) if rig is not None and result.views is not None else "",
@@ -128,6 +130,10 @@ def _quality_tiles(quality: Quality | None) -> list[tuple[str, str]]:
     tiles.append((_decibel(quality.covered_fidelity), covered))
     if quality.ssim_original is not None:
         tiles.append((f"{quality.ssim_original:.4f}", "SSIM against the original"))
+    seen = quality.worst_flip
+    if seen is not None:
+        words = f"FLIP against the original; {figure(seen.flip_original, '.4f')} in its worst view, {seen.name}"
+        tiles.append((f"{quality.flip_original:.4f}", words))
     return tiles
 
 
