@@ -6,7 +6,7 @@
 // x^p for 0 <= x <= 1000 and 0 <= p <= 3.
 inline FW flip_power(FW x, FW p) {
   const IW none = MASK(x < (FW)FLIP_LEAST);
-  const FW power = fexp2(p * flog2(pick(none, (FW)1.0f, x)));
+  const FW power = fexp2_within(p * flog2(pick(none, (FW)1.0f, x)));
   return pick(none, (FW)0.0f, power);
 }
 

@@ -182,8 +182,8 @@ FLIP_COLOUR_MOST: Final = 41.27657
 FLIP_KNEE: Final = 0.4 * FLIP_COLOUR_MOST
 FLIP_KNEE_SHARE: Final = 0.95
 """Differences of colours below the knee take this share of the range from 0 to 1."""
-FLIP_LEAST: Final = 1e-20
-"""Smallest base of a power; the power of anything less is 0."""
+FLIP_LEAST: Final = 1e-12
+"""Smallest base of a power; the power of anything less is 0. Its cube is still a normal float32."""
 
 # --- container version 2 ----------------------------------------------------------------------
 RANS_PRECISION: Final = 14

@@ -92,12 +92,8 @@ def flip_maps(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) 
         return []
     height, width = images[0].shape[:2]
     stride, rows = _layout(width, height)
-    most = rows * stride
-    shapes: list[tuple[int, ...]] = [
-        (FILTERS, 2 * FLIP_REACH + 1),
-        (3, (rows + 2 * FLIP_REACH) * stride),
-        (FILTERS, most + LANES),
-    ]
+    most, read = rows * stride, (rows + 2 * FLIP_REACH) * stride
+    shapes: list[tuple[int, ...]] = [(FILTERS, 2 * FLIP_REACH + 1), (3, read), (FILTERS, most + LANES)]
     shapes += [(SEEN, most)] * len(images) + [(most,)]
     found = [np.empty((height, width), np.float32) for _ in pairs]
     arrays: list[Any] = []
@@ -111,7 +107,6 @@ def flip_maps(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) 
         for top in range(0, height, rows):
             for image in images:
                 backend.write(planes, _padded(image, top, rows, stride))
-                read = planes.shape[1]
                 backend.launch("flip_colours", (read,), read, read, planes)
                 backend.launch("flip_columns", (most,), most, stride, read, most + LANES, weights, planes, columns)
                 backend.launch("flip_rows", (most,), most, most + LANES, weights, columns, numbers[id(image)])

@@ -215,7 +215,7 @@ def hand_made(name: str, **changes: Any) -> tuple[CompressResult, Material]:
         "drop", True, "held-out", SearchResult(steps[1], True, steps), (), Quality((ViewQuality(name, 1e-3, 2e-3, 1e-3),)),
         "held-out", name, None, False, RUN,
     )  # fmt: skip
-    shot = Shot(0, 0, 0, 1, 4, 3, b"a", b"b", b"c", b"d")
+    shot = Shot(0, 0, 0, 1, 4, 3, b"a", b"b", b"c", b"f", b"d")
     eye = np.eye(3)[None].repeat(2, axis=0)
     rig = Rig(
         (name, "other"), np.array([[0.0, 0, 0], [1, 0, 0]]), eye, np.ones((2, 2)), frozenset({0}), np.zeros((0, 3))

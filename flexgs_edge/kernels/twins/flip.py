@@ -16,13 +16,13 @@ from flexgs_edge.constants import (
     FLIP_RGB,
     FLIP_XYZ,
 )
-from flexgs_edge.kernels.twins.arithmetic import f32, fexp2, flog2
+from flexgs_edge.kernels.twins.arithmetic import f32, fexp2_within, flog2
 
 
 def flip_power(x: np.ndarray, p: np.ndarray | np.float32) -> np.ndarray:
     """x^p for 0 <= x <= 1000 and 0 <= p <= 3."""
     none = x < f32(FLIP_LEAST)
-    return np.where(none, f32(0), fexp2(p * flog2(np.where(none, f32(1), x))))
+    return np.where(none, f32(0), fexp2_within(p * flog2(np.where(none, f32(1), x))))
 
 
 def _mix(parts: list[np.ndarray], weights: tuple[float, ...]) -> list[np.ndarray]:

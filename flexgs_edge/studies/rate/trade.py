@@ -37,8 +37,8 @@ def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str
         "Bytes and quality",
         f"Every method at the sizes asked for: best at the effort {effort} and distilled (the effort {MAX}), paper with "
         "its rates to choose, and the whole scene in the formats of other programs as this one writes them. "
-        f"{against}; {FIDELITY_WORDS}. The rows hold all points of this study, also those without a part of the method. The first seconds "
-        "of a curve include most of the rounds of pruning, which its other points share.",
+        f"{against}; {FIDELITY_WORDS}. The rows hold all points of this study, also those without a part of the method. "
+        "The first seconds of a curve include most of the rounds of pruning, which its other points share.",
         table,
         _chart(table, "Bytes and quality", figure, effort),
         tuple(findings),
