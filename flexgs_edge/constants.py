@@ -158,11 +158,15 @@ SSIM_C2: Final = 0.03**2
 FLIP_DEGREE: Final = 0.7 * 3840 / 0.7 * math.pi / 180
 """Pixels per degree of the visual field, 67.02: a screen of 3840 pixels and 0.7 m, seen from 0.7 m, as NVIDIA's program
 assumes."""
-FLIP_REACH: Final = math.ceil(3 * math.sqrt(0.04 / (2 * math.pi**2)) * FLIP_DEGREE)
+FLIP_WIDEST: Final = 0.04
+"""Width of the widest Gaussian of colours, exp(-(pi x)^2 / width) with x in degrees."""
+FLIP_FEATURE: Final = 0.082
+"""Width of the filters of edges and points, degrees: two standard deviations."""
+FLIP_REACH: Final = math.ceil(3 * math.sqrt(FLIP_WIDEST / (2 * math.pi**2)) * FLIP_DEGREE)
 """Pixels that the widest filter of colours reaches from its centre: three standard deviations."""
 FLIP_FINE_REACH: Final = 6
 """Pixels that the filters of light and of red against green reach. Weights beyond are below 1e-7 of the sum."""
-FLIP_FEATURE_REACH: Final = math.ceil(3 * 0.5 * 0.082 * FLIP_DEGREE)
+FLIP_FEATURE_REACH: Final = math.ceil(3 * 0.5 * FLIP_FEATURE * FLIP_DEGREE)
 """Pixels that the filters of edges and points reach."""
 FLIP_XYZ: Final = (
     *(0.43388735, 0.37622401, 0.18988865),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.constants import FLIP_DEGREE, FLIP_FEATURE_REACH, FLIP_REACH, LANES
+from flexgs_edge.constants import FLIP_DEGREE, FLIP_FEATURE, FLIP_FEATURE_REACH, FLIP_REACH, FLIP_WIDEST, LANES
 from flexgs_edge.errors import InputError
 from flexgs_edge.kernels.backend import Backend
 
@@ -18,11 +18,10 @@ SEEN = 5
 """Values of a pixel that are compared: colour (three), edges and points."""
 BAND = 1 << 16
 """Most elements of a band of rows, so that all planes together take 8 MB, and one fits a core's cache. Values do not
-depend on bands."""
-_LIGHT, _RED_GREEN, _BLUE, _WIDER_BLUE = (1.0, 0.0047), (1.0, 0.0053), (34.1, 0.04), (13.5, 0.025)
-"""Height and width of the Gaussians that fit the eye's contrast sensitivity: table 1 of the paper."""
-_FEATURE = 0.082
-"""Width of the filters of edges and points, degrees."""
+depend on bands. docs/results/tuning.md#flip"""
+_LIGHT, _RED_GREEN, _BLUES = 0.0047, 0.0053, ((34.1, FLIP_WIDEST), (13.5, 0.025))
+"""Widths of the Gaussians that the paper fits to the eye's sensitivity to contrast. Yellow against blue has the sum of two, of
+which the first number is the height."""
 
 
 def taps() -> np.ndarray:
@@ -37,15 +36,15 @@ def taps() -> np.ndarray:
         taps: np.ndarray = np.exp(-(math.pi**2) * np.square(away / FLIP_DEGREE) / width)
         return taps
 
-    light, red_green = (gaussian(width) for _, width in (_LIGHT, _RED_GREEN))
-    blues = [gaussian(width) for _, width in (_BLUE, _WIDER_BLUE)]
+    light, red_green = gaussian(_LIGHT), gaussian(_RED_GREEN)
+    blues = [gaussian(width) for _, width in _BLUES]
     # In two dimensions both have the heights of one: their shares of the sum follow from that.
     weights = [
         height * math.sqrt(math.pi / width) * taps.sum() ** 2
-        for (height, width), taps in zip((_BLUE, _WIDER_BLUE), blues, strict=True)
+        for (height, width), taps in zip(_BLUES, blues, strict=True)
     ]
     blues = [math.sqrt(weight / sum(weights)) * taps / taps.sum() for weight, taps in zip(weights, blues, strict=True)]
-    deviation = 0.5 * _FEATURE * FLIP_DEGREE
+    deviation = 0.5 * FLIP_FEATURE * FLIP_DEGREE
     smooth = np.where(np.abs(away) <= FLIP_FEATURE_REACH, np.exp(-0.5 * np.square(away / deviation)), 0.0)
     slope, bend = -away * smooth, (np.square(away / deviation) - 1.0) * smooth
     for filter in (slope, bend):
@@ -56,9 +55,10 @@ def taps() -> np.ndarray:
 
 
 def _layout(width: int, height: int) -> tuple[int, int]:
-    """Elements of a row, and rows of a band."""
+    """Elements of a row, and rows of a band: bands are about equal."""
     stride = -(-(width + 2 * FLIP_REACH) // LANES) * LANES
-    return stride, min(height, max(BAND // stride, 1))
+    bands = -(-height // max(BAND // stride, 1))
+    return stride, -(-height // bands)
 
 
 def flip_bytes(width: int, height: int, images: int = 3) -> int:
@@ -72,8 +72,8 @@ def flip_bytes(width: int, height: int, images: int = 3) -> int:
 def flip_maps(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
     """FLIP at every pixel of pairs of images of one size (LDR-FLIP, Andersson et al. 2020).
 
-    FLIP says how different two images look to somebody who flips between them: 0 for equal, 1 for black and white. It
-    assumes `FLIP_DEGREE` pixels per degree.
+    FLIP says how different two images look to somebody who flips between them: 0 for equal ones, at most 1. It assumes
+    `FLIP_DEGREE` pixels per degree.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from flexgs_edge.report.results import CompressResult, EvaluateResult, decided_w
 from flexgs_edge.report.run_info import RunInfo, SceneInfo
 from flexgs_edge.report.search_chart import step_chart
 from flexgs_edge.report.summary import device_words, memory_words
-from flexgs_edge.report.tones import ERROR_SCALE, css_ramp
+from flexgs_edge.report.tones import ERROR_SCALE, FLIP_SCALE, css_ramp
 from flexgs_edge.units import format_size, times_words
 
 FEW_ROWS = 16
@@ -88,6 +88,7 @@ def _shared(result: CompressResult | EvaluateResult, material: Material) -> dict
         "numbers": numbers,
         "few": FEW_ROWS,
         "error_scale": ERROR_SCALE,
+        "flip_scale": FLIP_SCALE,
         "flip_degree": FLIP_DEGREE,
         "error_ramp": css_ramp(),
         "channels": _channel_rows(material.contents or {}),

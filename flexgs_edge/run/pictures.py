@@ -12,7 +12,7 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.report.material import Rig, Shot
-from flexgs_edge.report.tones import error_map, ramp
+from flexgs_edge.report.tones import FLIP_SCALE, error_map, ramp
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.source import SceneSource
@@ -85,7 +85,7 @@ def draw_shots(judge: Judge, scene: DeviceScene, quality: Quality, progress: Pro
                 original=encode(original, (width, height)),
                 compressed=encode(image, (width, height)),
                 error=encode_map(error_map(image, original), (width, height)),
-                flip=encode_map(judge.flip_map(image, original), (width, height)),
+                flip=encode_map(np.minimum(judge.flip_map(image, original) / FLIP_SCALE, 1.0), (width, height)),
                 photo=None if photo is None else encode(photo, (width, height)),
             )
         )
