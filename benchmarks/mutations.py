@@ -54,6 +54,7 @@ BACKWARD = Tests(
     ("tests/kernels/test_backward.py",), "float64", ("tests/kernels/test_backward.py",), "descents and {form}"
 )
 SIMILARITY = Tests(("tests/quality/test_ssim.py",), "scikit", ("tests/quality/test_ssim.py",), "scikit")
+FLIP = Tests(("tests/quality/test_flip.py",), "gave", ("tests/quality/test_flip.py",), "gave")
 CODER = Tests((), "", ("tests/codec/v2/test_codec_kernel.py",), "same and {form}")
 GOLDEN = ("tests/render/test_golden_fox.py",)
 
@@ -232,6 +233,10 @@ MUTATIONS = (
     Mutation(
         "SSIM: windows one pixel short", "similarity.cl", "k < SSIM_WINDOW", "k < SSIM_WINDOW - 1", tests=SIMILARITY
     ),
+    Mutation("FLIP: no edges across", "flip.cl", "edge_x * edge_x + ", "", tests=FLIP),
+    Mutation("FLIP: no points", "flip.cl", "larger(fabs(away[3]), fabs(away[4]))", "fabs(away[3])", tests=FLIP),
+    Mutation("FLIP: one of two filters of blue", "flip.cl", "b = b + (FW)taps[3 *", "b = b + (FW)taps[2 *", tests=FLIP),
+    Mutation("FLIP: dark colours count in full", "flip.cl", "(FW)0.01f * lightness", "(FW)1.0f", tests=FLIP),
     coder("coder: states are not filled up", "return (state / RANS_FLOOR - 1) >> 31", "return 0"),
     coder("coder: predictions rounded down", "mean * (DW)(1.0 / 65536.0) + (DW)0.5", "mean * (DW)(1.0 / 65536.0)"),
     coder("coder: places of far values", "long code = start + (rounded[j] & keep) + more", "long code = start + more"),

@@ -154,6 +154,41 @@ SSIM_C1: Final = 0.01**2
 SSIM_C2: Final = 0.03**2
 """Keeps the quotients of means and of variances finite, for a data range of 1."""
 
+# --- difference of images as seen in alternation, LDR-FLIP (Andersson et al. 2020) ---------------
+FLIP_DEGREE: Final = 0.7 * 3840 / 0.7 * math.pi / 180
+"""Pixels per degree of the visual field, 67.02: a screen of 3840 pixels and 0.7 m, seen from 0.7 m, as NVIDIA's program
+assumes."""
+FLIP_WIDEST: Final = 0.04
+"""Width of the widest Gaussian of colours, exp(-(pi x)^2 / width) with x in degrees."""
+FLIP_FEATURE: Final = 0.082
+"""Width of the filters of edges and points, degrees: two standard deviations."""
+FLIP_REACH: Final = math.ceil(3 * math.sqrt(FLIP_WIDEST / (2 * math.pi**2)) * FLIP_DEGREE)
+"""Pixels that the widest filter of colours reaches from its centre: three standard deviations."""
+FLIP_FINE_REACH: Final = 6
+"""Pixels that the filters of light and of red against green reach. Weights beyond are below 1e-7 of the sum."""
+FLIP_FEATURE_REACH: Final = math.ceil(3 * 0.5 * FLIP_FEATURE * FLIP_DEGREE)
+"""Pixels that the filters of edges and points reach."""
+FLIP_XYZ: Final = (
+    *(0.43388735, 0.37622401, 0.18988865),
+    *(0.21263901, 0.71516868, 0.07219232),
+    *(0.01775004, 0.10944762, 0.87280234),
+)
+"""Linear sRGB to CIE XYZ over that of white, row by row: from the chromaticities of IEC 61966-2-1, white (0.3127, 0.3290)."""
+FLIP_RGB: Final = (
+    *(3.08039909, -1.53738318, -0.54301591),
+    *(-0.92122336, 1.8759675, 0.04525586),
+    *(0.05287394, -0.20397696, 1.15110302),
+)
+"""The inverse of `FLIP_XYZ`."""
+FLIP_COLOUR_POWER: Final = 0.7
+FLIP_COLOUR_MOST: Final = 41.27657
+"""Largest difference of colours, to `FLIP_COLOUR_POWER`: that of green and blue."""
+FLIP_KNEE: Final = 0.4 * FLIP_COLOUR_MOST
+FLIP_KNEE_SHARE: Final = 0.95
+"""Differences of colours below the knee take this share of the range from 0 to 1."""
+FLIP_LEAST: Final = 1e-12
+"""Smallest base of a power; the power of anything less is 0. Its cube is still a normal float32."""
+
 # --- container version 2 ----------------------------------------------------------------------
 RANS_PRECISION: Final = 14
 """Probabilities are multiples of 1/2^14."""

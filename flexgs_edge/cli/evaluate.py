@@ -44,8 +44,8 @@ def command(
 ) -> None:
     """Compare a scene with its original, view by view.
 
-    Fidelity is the PSNR between the renders of INPUT and those of REF, in dB. SSIM is measured too. Drop is the PSNR that was
-    lost against the photos, in dB; without photos it is estimated. The summary shows the mean and the worst view.
+    Fidelity is the PSNR between the renders of INPUT and those of REF, in dB. SSIM and FLIP are measured too. Drop is the PSNR
+    that was lost against the photos, in dB; without photos it is estimated. The summary shows the mean and the worst view.
 
     Only held-out views are measured; --holdout 0 measures all. Cameras and photos are those beside REF, else those beside
     INPUT.

@@ -18,7 +18,7 @@ KERNEL_DIR_VARIABLE = "FLEXGS_KERNEL_DIR"
 _COMMON = "common.clh"
 _SHARED = (_COMMON, "sh.clh")
 """Files of helpers, which come before every kernel file."""
-_TOGETHER = ("activate.cl", "project.cl", "sort.cl", "score.cl", "similarity.cl")
+_TOGETHER = ("activate.cl", "project.cl", "sort.cl", "score.cl", "similarity.cl", "flip.cl")
 _CODEC = ("code_chunks.cl", "encode_chunks.cl")
 """Files that together make one program of the codec."""
 _BLENDS = {spec.stats: name for name, spec in KERNELS.items() if spec.stats is not None}

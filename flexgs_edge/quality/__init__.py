@@ -1,1 +1,1 @@
-"""Compare two images by PSNR, SSIM and LPIPS, and collect the figures over views."""
+"""Compare two images by PSNR, SSIM, FLIP and LPIPS, and collect the figures over views."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,8 +24,8 @@ LEAST_COVERAGE = 0.1
 large errors relative to them, and nobody would see these."""
 ALIKE = 48.0
 """Fidelity in dB from which on more of it shows nothing: an error of one level of 255."""
-Similarities = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | None]]
-"""Similarities of pairs of [H, W, 3] images, all of one size."""
+Figures = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | None]]
+"""Figures of pairs of [H, W, 3] images, all of one size."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,8 @@ class ViewQuality:
         SSIM against the original's render, against the photo, and of the original against the photo.
     lpips_original, lpips_photo, original_lpips : float or None
         LPIPS of the same three pairs; `None` unless it was asked for.
+    flip_original, flip_photo, original_flip : float or None
+        FLIP of the same three pairs, mean over the pixels.
     coverage : float
         Share of the picture that the original covers, 0 to 1: the mean over the pixels of its accumulated alpha.
     """
@@ -58,6 +60,9 @@ class ViewQuality:
     lpips_original: float | None = None
     lpips_photo: float | None = None
     original_lpips: float | None = None
+    flip_original: float | None = None
+    flip_photo: float | None = None
+    original_flip: float | None = None
     coverage: float = 1.0
 
     @property
@@ -270,6 +275,27 @@ class Quality:
         return self._mean("original_lpips")
 
     @property
+    def flip_original(self) -> float | None:
+        """Mean FLIP against the original's renders."""
+        return self._mean("flip_original")
+
+    @property
+    def flip_photo(self) -> float | None:
+        """Mean FLIP against the photos."""
+        return self._mean("flip_photo")
+
+    @property
+    def original_flip(self) -> float | None:
+        """Mean FLIP of the original against the photos."""
+        return self._mean("original_flip")
+
+    @property
+    def worst_flip(self) -> ViewQuality | None:
+        """The view with the largest FLIP against the original's render; `None` if it was not measured."""
+        known = [view for view in self.views if view.flip_original is not None]
+        return max(known, key=lambda view: view.flip_original or 0.0) if known else None
+
+    @property
     def worst(self) -> ViewQuality | None:
         """The view with the largest drop (with photos) or the lowest fidelity (without); `None` without views."""
         return self.views[self.by_loss[0]] if self.views else None
@@ -281,9 +307,10 @@ def compare_view(
     original: np.ndarray,
     photo: np.ndarray | None = None,
     original_error: float | None = None,
-    ssims: Similarities | None = None,
+    ssims: Figures | None = None,
     lpips: Distance | None = None,
     coverage: float = 1.0,
+    flips: Figures | None = None,
 ) -> ViewQuality:
     """Measure the quality of one render.
 
@@ -303,14 +330,13 @@ def compare_view(
         Measures a distance of all pairs of images; left out by default. LPIPS takes seconds for each pair.
     coverage : float
         Share of the picture that the original covers. Default: all of it.
+    flips : callable, optional
+        Measures FLIP of all pairs of images; left out by default.
     """
     if photo is not None and original_error is None:
         original_error = mse(original, photo)
-    similar: list[float | None] = [None] * 3
-    if ssims:
-        pairs = [(image, original), *([(image, photo), (original, photo)] if photo is not None else ())]
-        similar[: len(pairs)] = ssims(pairs)
-    return ViewQuality(
+    similar = _three(ssims, image, original, photo)
+    view = ViewQuality(
         name=name,
         error=mse(image, original),
         photo_error=None if photo is None else mse(image, photo),
@@ -323,3 +349,23 @@ def compare_view(
         original_lpips=lpips(original, photo) if lpips and photo is not None else None,
         coverage=coverage,
     )
+    return with_flip(view, image, original, photo, flips) if flips else view
+
+
+def with_flip(
+    view: ViewQuality, image: np.ndarray, original: np.ndarray, photo: np.ndarray | None, flips: Figures
+) -> ViewQuality:
+    """The quality of a view with its FLIP, from the images that `compare_view` takes."""
+    against_original, against_photo, originals = _three(flips, image, original, photo)
+    return replace(view, flip_original=against_original, flip_photo=against_photo, original_flip=originals)
+
+
+def _three(
+    figures: Figures | None, image: np.ndarray, original: np.ndarray, photo: np.ndarray | None
+) -> list[float | None]:
+    """Figures of the image against the original and the photo, and of the original against the photo."""
+    found: list[float | None] = [None] * 3
+    if figures:
+        pairs = [(image, original), *([(image, photo), (original, photo)] if photo is not None else ())]
+        found[: len(pairs)] = figures(pairs)
+    return found

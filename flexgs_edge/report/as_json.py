@@ -75,7 +75,7 @@ def quality_json(quality: Quality) -> dict[str, Any]:
 
     null stands for identical images, for no photo, or for a figure that was not measured.
     """
-    worst = quality.worst
+    worst, worst_flip = quality.worst, quality.worst_flip
     return {
         "drop": rounded(quality.drop),
         "fidelity": rounded(quality.fidelity),
@@ -93,6 +93,10 @@ def quality_json(quality: Quality) -> dict[str, Any]:
         "lpips": rounded(quality.lpips_photo, 5),
         "original_lpips": rounded(quality.original_lpips, 5),
         "lpips_fidelity": rounded(quality.lpips_original, 5),
+        "flip": rounded(quality.flip_photo, 5),
+        "original_flip": rounded(quality.original_flip, 5),
+        "flip_fidelity": rounded(quality.flip_original, 5),
+        "worst_flip": rounded(worst_flip.flip_original, 5) if worst_flip else None,
         "identical_views": quality.identical,
         "made": None if quality.made is None else _made_json(quality.made),
         "worst": _view_json(worst) if worst else None,
@@ -127,6 +131,9 @@ def _view_json(view: ViewQuality) -> dict[str, Any]:
         "lpips": rounded(view.lpips_photo, 5),
         "original_lpips": rounded(view.original_lpips, 5),
         "lpips_fidelity": rounded(view.lpips_original, 5),
+        "flip": rounded(view.flip_photo, 5),
+        "original_flip": rounded(view.original_flip, 5),
+        "flip_fidelity": rounded(view.flip_original, 5),
         "mse": view.error,
     }
 

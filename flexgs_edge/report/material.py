@@ -26,6 +26,8 @@ class Shot:
         Pixels of the pictures. Wider views were scaled down.
     original, compressed, error : bytes
         Render of the original, render of the decoded file, and the error map between them.
+    flip : bytes
+        Map of FLIP between both renders.
     photo : bytes or None
         The photo of this view, if there is one.
     """
@@ -39,13 +41,14 @@ class Shot:
     original: bytes
     compressed: bytes
     error: bytes
+    flip: bytes
     photo: bytes | None = None
 
     @property
     def place(self) -> str:
         """Describe the rank in words.
 
-        >>> Shot(0, 0, 0, 5, 1, 1, b"", b"", b"").place, Shot(0, 0, 1, 5, 1, 1, b"", b"", b"").place
+        >>> Shot(0, 0, 0, 5, 1, 1, b"", b"", b"", b"").place, Shot(0, 0, 1, 5, 1, 1, b"", b"", b"", b"").place
         ('Worst view', 'View 2 of 5 from the worst')
         """
         if self.of == 1:

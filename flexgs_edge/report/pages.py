@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
+from flexgs_edge.constants import FLIP_DEGREE
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.report.camera_plan import plans
 from flexgs_edge.report.html import count, figure, render
@@ -14,7 +15,7 @@ from flexgs_edge.report.results import CompressResult, EvaluateResult, decided_w
 from flexgs_edge.report.run_info import RunInfo, SceneInfo
 from flexgs_edge.report.search_chart import step_chart
 from flexgs_edge.report.summary import device_words, memory_words
-from flexgs_edge.report.tones import ERROR_SCALE, css_ramp
+from flexgs_edge.report.tones import ERROR_SCALE, FLIP_SCALE, css_ramp
 from flexgs_edge.units import format_size, times_words
 
 FEW_ROWS = 16
@@ -87,6 +88,8 @@ def _shared(result: CompressResult | EvaluateResult, material: Material) -> dict
         "numbers": numbers,
         "few": FEW_ROWS,
         "error_scale": ERROR_SCALE,
+        "flip_scale": FLIP_SCALE,
+        "flip_degree": FLIP_DEGREE,
         "error_ramp": css_ramp(),
         "channels": _channel_rows(material.contents or {}),
         "camera_plans": plans(rig, shown) if rig is not None and result.views is not None else "",
@@ -128,6 +131,10 @@ def _quality_tiles(quality: Quality | None) -> list[tuple[str, str]]:
     tiles.append((_decibel(quality.covered_fidelity), covered))
     if quality.ssim_original is not None:
         tiles.append((f"{quality.ssim_original:.4f}", "SSIM against the original"))
+    seen = quality.worst_flip
+    if seen is not None:
+        words = f"FLIP against the original; {figure(seen.flip_original, '.4f')} in its worst view, {seen.name}"
+        tiles.append((f"{quality.flip_original:.4f}", words))
     return tiles
 
 

@@ -295,10 +295,13 @@ def _view_table(views: Sequence[ViewQuality]) -> list[str]:
             "covered",
             "coverage",
             "SSIM to ref.",
+            "FLIP to ref.",
             "drop",
             "PSNR",
             "of original",
             "SSIM",
+            "of original",
+            "FLIP",
             "of original",
         )
     ]
@@ -314,11 +317,14 @@ def _view_table(views: Sequence[ViewQuality]) -> list[str]:
                 decibel(view.covered_fidelity) if view.coverage else "-",
                 f"{100 * view.coverage:.3g} %",
                 similar(view.ssim_original),
+                similar(view.flip_original),
                 decibel(view.drop) if photo else "-",
                 decibel(view.psnr) if photo else "-",
                 decibel(view.original_psnr) if photo else "-",
                 similar(view.ssim_photo),
                 similar(view.original_ssim),
+                similar(view.flip_photo),
+                similar(view.original_flip),
             )
         )
         if with_lpips:

@@ -46,6 +46,8 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
             if quality.ssim_photo is None
             else f", SSIM {similar(quality.original_ssim)} -> {similar(quality.ssim_photo)}"
         )
+        if quality.flip_photo is not None:
+            also += f", FLIP {similar(quality.original_flip)} -> {similar(quality.flip_photo)}"
         if quality.lpips_photo is not None:
             also += f", LPIPS {similar(quality.original_lpips)} -> {similar(quality.lpips_photo)}"
         lines.append(
@@ -58,6 +60,8 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
     identical = f", {quality.identical} views identical" if quality.identical and quality.fidelity is not None else ""
     unit = "" if quality.fidelity is None else " dB"
     also = "" if quality.ssim_original is None else f", SSIM {similar(quality.ssim_original)}"
+    if quality.flip_original is not None:
+        also += f", FLIP {similar(quality.flip_original)}"
     if quality.lpips_original is not None:
         also += f", LPIPS {similar(quality.lpips_original)}"
     lines.append(
@@ -73,6 +77,9 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
         drop = "" if worst.drop is None else f"drop {decibel(worst.drop)} dB, "
         covered = f", {decibel(worst.covered_fidelity)}{unit} covered" if quality.covered_decides else ""
         lines.append(line("worst view", f"{worst.name}: {drop}fidelity {decibel(worst.fidelity)}{unit}{covered}"))
+    seen = quality.worst_flip
+    if seen is not None:
+        lines.append(line("worst FLIP", f"{similar(seen.flip_original)} against the original's render, {seen.name}"))
     return lines
 
 
@@ -118,7 +125,7 @@ def decibel(value: float | None) -> str:
 
 
 def similar(value: float | None) -> str:
-    """Format an SSIM or LPIPS; `None` means not measured."""
+    """Format an SSIM, FLIP or LPIPS; `None` means not measured."""
     return "-" if value is None else f"{value:.4f}"
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,10 @@ from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import Covered, Measurement
 from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.quality.flip import flip_bytes, flip_maps, flips
 from flexgs_edge.quality.psnr import mse
 from flexgs_edge.quality.ssim import ssim_bytes, ssims
-from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view
+from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view, with_flip
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.run.few_poses import FewPoses
 from flexgs_edge.run.options import AUTO_CAMERAS
@@ -28,7 +30,7 @@ SHARE = 4
 LIBRARY_BYTES = 12 * 2**20
 """Bound on the bytes that loading Pillow and decoding with it take: docs/results/tuning.md#memory"""
 WORK_BYTES = 100
-"""Bound on the bytes per pixel while a photo is decoded or SSIM is computed. SSIM's share includes the backend's buffers."""
+"""Bound on the bytes per pixel while a photo is decoded, or SSIM or FLIP is computed, with the backend's buffers."""
 CHECK_ROWS = 1 << 18
 """Rows whose opacity is read at a time, where no view sees any Gaussian."""
 ESTIMATE_STEP = 2
@@ -172,6 +174,7 @@ class Judge:
         with_ssim: bool = False,
         progress: Progress = SILENT,
         lpips: Distance | None = None,
+        flip: bool = False,
     ) -> Quality:
         """Measure the quality of `scene` over the views.
 
@@ -187,20 +190,28 @@ class Judge:
             Shows a bar.
         lpips : Distance, optional
             Also measure LPIPS with this network. It takes far longer than drawing the views. Default: no LPIPS.
+        flip : bool
+            Also measure FLIP, about as fast as SSIM. Searches do without it.
         """
         whole, elsewhere = self.reports and with_ssim and lpips is None, self.bench.ready_cluster is not None
         drawn = scene.fingerprint(elsewhere) if whole else None
-        if drawn in self._known:
-            return self._known[drawn]
+        known = self._known.get(drawn) if drawn is not None else None
+        if known is not None and (known.worst_flip or not flip):
+            return known
+        ssims, flips = self._ssims if with_ssim else None, self._flips if flip else None
         found: list[ViewQuality] = []
         images = self.bench.images(scene, self.cameras)
         for i, image in enumerate(progress.track(images, "comparing views", len(self.cameras))):
             error = self._original_error[i] if self.photos is not None else None
             references = self.original(i), self._photo(i)
-            ssims = self._ssims if with_ssim else None
-            coverage = self._coverage[i]
-            found.append(compare_view(self.cameras[i].name, image, *references, error, ssims, lpips, coverage))
-        made = None if self.made is None else self.made.quality(scene)
+            if known is not None:
+                found.append(with_flip(known.views[i], image, *references, self._flips))
+                continue
+            name, coverage = self.cameras[i].name, self._coverage[i]
+            found.append(compare_view(name, image, *references, error, ssims, lpips, coverage, flips))
+        made = None if known is None else known.made
+        if known is None and self.made is not None:
+            made = self.made.quality(scene)
         quality = Quality(tuple(found), self.base_psnr, self.covered_decides, made)
         if whole and drawn is None:
             drawn = scene.fingerprint(elsewhere)
@@ -237,10 +248,27 @@ class Judge:
 
     def _ssims(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
         height, width = pairs[0][0].shape[:2]
-        work = min(ssim_bytes(width, height), self._work)
-        self._budget.give(work)  # the arrays of `ssims` take it themselves
-        try:
+        with self._lent(ssim_bytes(width, height)):
             return ssims(self.renderer.backend, pairs)
+
+    def _flips(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
+        height, width = pairs[0][0].shape[:2]
+        with self._lent(flip_bytes(width, height)):
+            return flips(self.renderer.backend, pairs)
+
+    def flip_map(self, image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+        """FLIP at every pixel of two [H, W, 3] images: [H, W] f32, 0 to 1."""
+        height, width = image.shape[:2]
+        with self._lent(flip_bytes(width, height)):
+            return flip_maps(self.renderer.backend, [(image, reference)])[0]
+
+    @contextmanager
+    def _lent(self, wanted: int) -> Iterator[None]:
+        """Give up to `wanted` bytes of the work memory back for a while: arrays on the backend take them themselves."""
+        work = min(wanted, self._work)
+        self._budget.give(work)
+        try:
+            yield
         finally:
             self._budget.take("comparing views", work)
 

@@ -100,7 +100,7 @@ class Judges:
             # First, since it brings the scene to the backend: the judge then sees whether it is what the search measured.
             if self.training is not None:
                 self.trained = self.training.quality(scene).deciding_fidelity
-            quality = self.report.compare(scene, with_ssim=True, progress=run.progress)
+            quality = self.report.compare(scene, with_ssim=True, progress=run.progress, flip=True)
             if run.reporter is not None:
                 run.reporter.look(self.report, scene, quality, run.clock, run.progress)
         return quality

@@ -12,7 +12,7 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.report.material import Rig, Shot
-from flexgs_edge.report.tones import error_map, ramp
+from flexgs_edge.report.tones import FLIP_SCALE, error_map, ramp
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.source import SceneSource
@@ -21,8 +21,8 @@ MOST_SHOTS = 5
 """A report shows pictures of at most this many views: the worst, the median, the best, and one between each two."""
 MOST_WIDTH = 800
 """Wider pictures are scaled down to this many pixels: sharp on a phone, and a page of a few MB at most."""
-LAYERS = 4
-"""Pictures per view: original, compressed, error map, photo."""
+LAYERS = 5
+"""Pictures per view: original, compressed, error map, map of FLIP, photo."""
 PIXEL_BYTES = 1
 """Bytes per pixel that we reserve for an encoded picture. Only noise takes more: docs/results/tuning.md#memory"""
 JPEG_QUALITY = 95
@@ -84,7 +84,8 @@ def draw_shots(judge: Judge, scene: DeviceScene, quality: Quality, progress: Pro
                 height=height,
                 original=encode(original, (width, height)),
                 compressed=encode(image, (width, height)),
-                error=encode_error(image, original, (width, height)),
+                error=encode_map(error_map(image, original), (width, height)),
+                flip=encode_map(np.minimum(judge.flip_map(image, original) / FLIP_SCALE, 1.0), (width, height)),
                 photo=None if photo is None else encode(photo, (width, height)),
             )
         )
@@ -104,14 +105,13 @@ def encode(image: np.ndarray, size: tuple[int, int], quality: int = JPEG_QUALITY
     return out.getvalue()
 
 
-def encode_error(image: np.ndarray, original: np.ndarray, size: tuple[int, int]) -> bytes:
-    """Encode the error map between two renders as JPEG.
+def encode_map(errors: np.ndarray, size: tuple[int, int]) -> bytes:
+    """Encode a map of errors between two renders, [H, W] f32 from 0 to 1, as JPEG.
 
-    The map is computed at full size and then scaled down: averaging the pictures first would hide errors.
+    The map comes at full size and is scaled down here: averaging the pictures first would hide errors.
     """
     from PIL import Image
 
-    errors = error_map(image, original)
     if errors.shape != size[::-1]:
         errors = np.asarray(Image.fromarray(np.ascontiguousarray(errors)).resize(size, Image.Resampling.BOX))
     return encode(ramp()[np.rint(errors * 255.0).astype(np.uint8)] / np.float32(255.0), size, ERROR_QUALITY)

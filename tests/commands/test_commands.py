@@ -96,7 +96,7 @@ def test_json_has_every_documented_key_and_no_infinity(done: tuple[Path, Compres
     }  # fmt: skip
     assert set(record["quality"]) == {
         "drop", "fidelity", "modelled_drop", "base_psnr", "psnr", "original_psnr", "ssim", "original_ssim", "ssim_fidelity",
-        "lpips", "original_lpips", "lpips_fidelity",
+        "lpips", "original_lpips", "lpips_fidelity", "flip", "original_flip", "flip_fidelity", "worst_flip",
         "coverage", "covered_fidelity", "covered_modelled_drop", "covered_decides", "identical_views", "worst", "views",
     }  # fmt: skip
     assert set(record["run"]) == {

@@ -30,6 +30,7 @@ from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
+from flexgs_edge.quality.flip import flips
 from flexgs_edge.quality.ssim import ssims
 from flexgs_edge.render.fit import Fit
 from flexgs_edge.render.renderer import Renderer
@@ -90,6 +91,7 @@ def results(backend: OpenCLBackend | TwinBackend) -> Iterator[np.ndarray]:
         image = drawer.render(scene, camera)
         yield image
     yield np.array(ssims(counting, [(image, image[::-1])]), np.float64)
+    yield np.array(flips(counting, [(image, image[::-1])]), np.float64)
     yield from second_passes(drawer, camera)
     drawer.release()
     assert set(counting.launched) == set(KERNELS)

@@ -75,7 +75,9 @@ def test_a_view_with_a_photo() -> None:
     original, image = images(3, 20, 20)
     photo = np.clip(original + 0.1, 0, 1)
     view = view_quality.compare_view(
-        "v", image, original, photo, ssims=lambda pairs: [float(a[0, 0, 0] - b[0, 0, 0]) for a, b in pairs]
+        *("v", image, original, photo),
+        ssims=lambda pairs: [float(a[0, 0, 0] - b[0, 0, 0]) for a, b in pairs],
+        flips=lambda pairs: [float(a[1, 0, 0] - b[1, 0, 0]) for a, b in pairs],
     )
     assert view.psnr is not None and view.original_psnr is not None and view.drop is not None
     assert view.drop == pytest.approx(view.original_psnr - view.psnr)
@@ -83,6 +85,9 @@ def test_a_view_with_a_photo() -> None:
     assert view.ssim_original == float(image[0, 0, 0] - original[0, 0, 0])
     assert view.ssim_photo == float(image[0, 0, 0] - photo[0, 0, 0])
     assert view.original_ssim == float(original[0, 0, 0] - photo[0, 0, 0])
+    assert view.flip_original == float(image[1, 0, 0] - original[1, 0, 0])
+    assert view.flip_photo == float(image[1, 0, 0] - photo[1, 0, 0])
+    assert view.original_flip == float(original[1, 0, 0] - photo[1, 0, 0])
 
 
 def test_a_view_without_a_photo_has_no_drop() -> None:

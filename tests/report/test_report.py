@@ -23,6 +23,7 @@ from flexgs_edge.goals.steps import SearchResult, Step
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement
 from flexgs_edge.kernels.open_backend import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.quality.flip import flip_maps
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.camera_plan import plans
@@ -31,7 +32,7 @@ from flexgs_edge.report.pages import compress_page, evaluate_page
 from flexgs_edge.report.results import CompressResult, EvaluateResult
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
 from flexgs_edge.report.search_chart import nice_range, step_chart
-from flexgs_edge.report.tones import ERROR_SCALE, error_map, ramp
+from flexgs_edge.report.tones import ERROR_SCALE, FLIP_SCALE, error_map, ramp
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.companions import companions_of
 from flexgs_edge.run.open_scene import open_scene
@@ -79,6 +80,7 @@ def test_the_page_tells_what_the_record_holds(done: tuple[Path, CompressResult, 
     size = f"{result.size:,}".replace(",", "\u202f")
     for words in (
         f"{result.ratio:.2f}\u00d7",
+        f"{result.quality.flip_original:.4f} FLIP against the original",
         f"{size} bytes",
         f"{result.quality.drop:.2f} dB of PSNR were lost",
         str(folder / "a.fgs"),
@@ -113,8 +115,8 @@ def test_pictures_are_of_the_original_and_of_the_decoded_file(
     for kind, path in (("original", project / "point_cloud.ply"), ("compressed", folder / "a.fgs")):
         with renderer.load(open_scene(path)) as scene:
             renders[kind] = [np.clip(renderer.render(scene, camera), 0, 1) for camera in worst_first]
-    originals, decoded, errors = (page.pictures(kind) for kind in ("original", "compressed", "error"))
-    assert len(originals) == len(decoded) == len(errors) == len(page.pictures("photo")) == 3
+    originals, decoded, errors, seen = (page.pictures(kind) for kind in ("original", "compressed", "error", "flip"))
+    assert len(originals) == len(decoded) == len(errors) == len(seen) == len(page.pictures("photo")) == 3
     for i in range(3):
         # The same bits give the same JPEG: no tolerance could tell the scenes apart where little was lost.
         assert np.array_equal(originals[i], shown(encode(renders["original"][i], (WIDTH, HEIGHT))))
@@ -122,6 +124,9 @@ def test_pictures_are_of_the_original_and_of_the_decoded_file(
         assert not np.array_equal(decoded[i], originals[i])
         expected = ramp()[np.rint(255 * error_map(*(renders[k][i] for k in renders))).astype(int)] / 255
         assert np.abs(errors[i] - expected).mean() < 0.05
+        (flip,) = flip_maps(renderer.backend, [(renders["compressed"][i], renders["original"][i])])
+        assert np.abs(seen[i] - ramp()[np.rint(255 * np.minimum(flip / FLIP_SCALE, 1)).astype(int)] / 255).mean() < 0.05
+        assert flip.mean(dtype=float) == result.quality.views[result.quality.by_loss[i]].flip_original
 
 
 def shown(jpeg: bytes) -> np.ndarray:
@@ -145,7 +150,7 @@ def test_a_dry_run_shows_what_the_file_would_decode_to(
     assert dry.size == result.size and [path.name for path in tmp_path.iterdir()] == ["page"]
     shown = read_page(tmp_path / "page")
     assert "A dry run" in shown.text
-    for kind in ("original", "compressed", "error", "photo"):
+    for kind in ("original", "compressed", "error", "flip", "photo"):
         assert all(np.array_equal(a, b) for a, b in zip(shown.pictures(kind), page.pictures(kind), strict=True))
     assert shown.cells[2] == page.cells[2], "bytes of the channels"
 
@@ -215,7 +220,7 @@ def hand_made(name: str, **changes: Any) -> tuple[CompressResult, Material]:
         "drop", True, "held-out", SearchResult(steps[1], True, steps), (), Quality((ViewQuality(name, 1e-3, 2e-3, 1e-3),)),
         "held-out", name, None, False, RUN,
     )  # fmt: skip
-    shot = Shot(0, 0, 0, 1, 4, 3, b"a", b"b", b"c", b"d")
+    shot = Shot(0, 0, 0, 1, 4, 3, b"a", b"b", b"c", b"f", b"d")
     eye = np.eye(3)[None].repeat(2, axis=0)
     rig = Rig(
         (name, "other"), np.array([[0.0, 0, 0], [1, 0, 0]]), eye, np.ones((2, 2)), frozenset({0}), np.zeros((0, 3))
@@ -327,7 +332,7 @@ def test_pictures_are_taken_from_the_budget(project: Path) -> None:
     views = find_views(ViewOptions(background=(0.0, 0.0, 0.0)), companions_of(project), source)
     assert views is not None
     views = replace(views, held_out=[])
-    budget = MemoryBudget(WIDTH * HEIGHT * 4 * 5)
+    budget = MemoryBudget(WIDTH * HEIGHT * 5 * 5)
     Reporter(project / "page", False).reserve(budget, views)
     assert budget.free == 0
     with pytest.raises(BudgetError, match="pictures of the report"):

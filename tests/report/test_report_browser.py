@@ -65,7 +65,7 @@ def test_nothing_is_fetched_nothing_fails_nothing_sticks_out(
     browser.run("document.querySelectorAll('details').forEach(d => d.open = true)")
     assert browser.run("[document.documentElement.scrollWidth, innerWidth]") == [width, width]
     loaded = "[...document.images].map(i => i.complete && i.naturalWidth > 0)"
-    assert all(browser.run(loaded)) and len(browser.run(loaded)) == 4 * 4
+    assert all(browser.run(loaded)) and len(browser.run(loaded)) == 4 * 5
     requests = [e["params"]["request"]["url"] for e in browser.events if e.get("method") == "Network.requestWillBeSent"]
     assert [url for url in requests if not url.startswith("data:")] == [page.as_uri()]
     loud = ("Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded")
@@ -93,16 +93,17 @@ def test_the_slider_wipes_between_original_and_compressed(browser: Browser, page
     assert words == "100 % original, the rest compressed"
 
 
-def test_the_switch_shows_error_map_and_photo(browser: Browser, page: Path) -> None:
+def test_the_switch_shows_error_maps_and_photo(browser: Browser, page: Path) -> None:
     browser.open(page, PHONE)
     slide(browser, 0)
     shown = {"compressed": stage(browser)}
-    for kind in ("error", "photo"):
+    for kind in ("error", "flip", "photo"):
         browser.run(f"document.querySelector('#view-1 input[value={kind}]').focus()")
         browser.press(" ", 32)
         shown[kind] = stage(browser)
     body = slice(20, -50)
     assert shown["error"][body].mean() < 0.5 * shown["compressed"][body].mean(), "dark where nothing is lost"
+    assert all(np.abs(shown["flip"] - shown[kind])[body].mean() > 2 for kind in ("error", "compressed"))
     assert 0.5 < np.abs(shown["photo"] - shown["compressed"])[body].mean() < 30
 
 
@@ -123,6 +124,6 @@ def test_without_script_all_pictures_are_there(browser: Browser, page: Path) -> 
     found = browser.run(
         "[...document.querySelectorAll('.stage img')].map(i => i.getBoundingClientRect()).map(b => [b.width, b.height, b.y])"
     )
-    assert len(found) == 4 * 4 and all(width > 100 and height > 70 for width, height, _ in found)
-    assert len({(round(y)) for _, _, y in found}) == 8, "two rows for each view: nothing lies on anything"
+    assert len(found) == 4 * 5 and all(width > 100 and height > 70 for width, height, _ in found)
+    assert len({(round(y)) for _, _, y in found}) == 12, "three rows for each view: nothing lies on anything"
     assert browser.run("getComputedStyle(document.querySelector('.controls')).display") == "none"

@@ -32,8 +32,8 @@ def test_evaluate_text_has_a_row_a_view_and_says_identical() -> None:
     quality = Quality((ViewQuality("a", 0.0, 1e-3, 1e-3), ViewQuality("b", 1e-4, 2e-3, 1e-3)))
     text = EvaluateResult(SCENE, SCENE, VIEWS, quality, "held-out", RUN).summary()
     rows = [line.split() for line in text.splitlines()]
-    assert ["a", "identical", "identical", "100", "%", "-", "0.000", "30.000", "30.000", "-", "-"] in rows
-    assert ["b", "40.000", "40.000", "100", "%", "-", "3.010", "26.990", "30.000", "-", "-"] in rows
+    assert ["a", "identical", "identical", "100", "%", "-", "-", "0.000", "30.000", "30.000", *4 * "-"] in rows
+    assert ["b", "40.000", "40.000", "100", "%", "-", "-", "3.010", "26.990", "30.000", *4 * "-"] in rows
     for words in (
         "worst view:  b: drop 3.010 dB",
         "1 views identical",
@@ -42,6 +42,29 @@ def test_evaluate_text_has_a_row_a_view_and_says_identical() -> None:
         "no photos",
     ):
         assert words in text
+
+
+def test_flip_is_said_of_the_mean_and_of_the_view_that_looks_worst() -> None:
+    views = (
+        ViewQuality("a", 1e-3, 3e-3, 1e-3, flip_original=0.01, flip_photo=0.03, original_flip=0.02),
+        ViewQuality("b", 1e-4, 2e-3, 1e-3, flip_original=0.05, flip_photo=0.07, original_flip=0.04),
+    )
+    result = EvaluateResult(SCENE, SCENE, VIEWS, Quality(views), "held-out", RUN)
+    text, record = result.summary(), result.to_json()["quality"]
+    assert "FLIP 0.0300 -> 0.0500" in text and ", FLIP 0.0300;" in text
+    assert "worst FLIP:  0.0500 against the original's render, b" in text and "worst view:  a" in text
+    assert (record["flip"], record["original_flip"], record["flip_fidelity"], record["worst_flip"]) == (
+        0.05,
+        0.03,
+        0.03,
+        0.05,
+    )
+    assert [(view["flip"], view["flip_fidelity"]) for view in record["views"]] == [(0.03, 0.01), (0.07, 0.05)]
+    assert (
+        "ssim" in record["views"][0]
+        and "worst FLIP"
+        not in EvaluateResult(SCENE, SCENE, VIEWS, Quality((ViewQuality("b", 1e-4),)), "training", RUN).summary()
+    )
 
 
 def test_without_photos_no_drop_is_claimed() -> None:

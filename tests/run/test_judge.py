@@ -124,6 +124,21 @@ def test_one_that_reports_draws_nothing_twice(judged: MakeJudge) -> None:
         assert bench.drawn == 4
 
 
+def test_flip_is_added_to_what_is_known(judged: MakeJudge) -> None:
+    found = []
+    for first in (False, True):
+        with judged(reports=True) as (judge, source, renderer, _):
+            bench = counting(judge)
+            with renderer.load(MemorySource(half_of(source))) as loaded:
+                renderer.render(loaded, judge.cameras[0])
+                known = judge.compare(loaded, with_ssim=True, flip=first)
+                assert (known.flip_original is not None) == first
+                found.append(judge.compare(loaded, with_ssim=True, flip=True))
+                assert judge.compare(loaded, with_ssim=True) == found[-1]
+            assert bench.drawn == (1 if first else 2)
+    assert found[0] == found[1] and found[0].flip_photo is not None and found[0].ssim_photo is not None
+
+
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_scenes_that_are_not_on_the_backend_are_known_again(
     elsewhere: bool, judged: MakeJudge, monkeypatch: pytest.MonkeyPatch

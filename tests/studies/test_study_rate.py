@@ -94,6 +94,7 @@ def test_points_are_those_of_compress(study: tuple[RateStudy, Path], project: Pa
         assert row["drop"] == pytest.approx(made.quality.drop, abs=1e-4)
         assert row["psnr"] == pytest.approx(made.quality.psnr, abs=1e-4)
         assert row["ssim"] == pytest.approx(made.quality.ssim_photo, abs=1e-5)
+        assert row["flip"] == pytest.approx(made.quality.flip_photo, abs=1e-5)
         assert row["bits"] == pytest.approx(8 * made.size / made.count, abs=0.01)
 
 
@@ -123,7 +124,7 @@ def test_a_coder_changes_the_size_alone(study: tuple[RateStudy, Path]) -> None:
     whole, _ = (row for row in rows if row["variant"] == "whole" and row["method"] == "best")
     recoded = [row for row in rows if row["variant"] in CODERS]
     assert {row["wanted_ratio"] for row in recoded} == {RATIO}
-    same = ("kept", "psnr", "ssim", "drop", "fidelity")
+    same = ("kept", "psnr", "ssim", "flip", "drop", "fidelity")
     assert all(row[name] == whole[name] for row in recoded for name in same)
     for row in rows_of(study, "parts"):
         if row["variant"] in CODERS:

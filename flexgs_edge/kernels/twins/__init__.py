@@ -18,6 +18,7 @@ from flexgs_edge.kernels.twins.blend import (
     blend_stats,
 )
 from flexgs_edge.kernels.twins.dequantize import dequantize
+from flexgs_edge.kernels.twins.flip import flip_colours, flip_columns, flip_pair, flip_rows
 from flexgs_edge.kernels.twins.project import project
 from flexgs_edge.kernels.twins.score import residual, sh_costs, sh_residual
 from flexgs_edge.kernels.twins.similarity import ssim_columns, ssim_rows
@@ -50,6 +51,10 @@ TWINS: dict[str, Callable[..., None]] = {
     "residual": residual,
     "ssim_columns": ssim_columns,
     "ssim_rows": ssim_rows,
+    "flip_colours": flip_colours,
+    "flip_columns": flip_columns,
+    "flip_rows": flip_rows,
+    "flip_pair": flip_pair,
     "sh_costs": sh_costs,
     "sh_residual": sh_residual,
     "project_backward": project_backward,

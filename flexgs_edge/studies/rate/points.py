@@ -58,7 +58,7 @@ class RatePoint:
     kept : int
         Gaussians in the file.
     quality : Quality
-        Over the views that decide, with SSIM.
+        Over the views that decide, with SSIM and FLIP.
     seconds : float or None
         Time of the search or conversion, without measuring the final quality.
     """
@@ -76,6 +76,11 @@ class RatePoint:
     def ssim(self) -> float | None:
         """SSIM against the photos if there are any, else against the original's renders."""
         return self.quality.ssim_original if self.quality.ssim_photo is None else self.quality.ssim_photo
+
+    @property
+    def flip(self) -> float | None:
+        """FLIP against the same."""
+        return self.quality.flip_original if self.quality.flip_photo is None else self.quality.flip_photo
 
 
 PEERS = (".spz", ".sog", ".compressed.ply")
@@ -107,6 +112,7 @@ def point_columns() -> tuple[Column, ...]:
         bits="bits a Gaussian kept",
         psnr="PSNR (dB)",
         ssim="SSIM",
+        flip="FLIP",
         **FIGURES,
         seconds="seconds",
     )
@@ -124,6 +130,7 @@ def point_row(studied: StudyScene, point: RatePoint) -> dict[str, Cell]:
         "bits": round(8 * point.size / point.kept, 2),
         "psnr": None if quality.psnr is None else round(quality.psnr, 4),
         "ssim": None if point.ssim is None else round(point.ssim, 5),
+        "flip": None if point.flip is None else round(point.flip, 5),
         **studied.figures(point.size, measurement_of(quality)),
         "seconds": None if point.seconds is None else round(point.seconds, 2),
     }
@@ -264,7 +271,7 @@ def _judged_source(studied: StudyScene, grid: GridScene) -> Quality:
 
 def _judged(studied: StudyScene, scene: DeviceScene) -> Quality:
     with studied.run.clock.stage("measure"):
-        return studied.judge.compare(scene, with_ssim=True, progress=studied.run.progress)
+        return studied.judge.compare(scene, with_ssim=True, progress=studied.run.progress, flip=True)
 
 
 def _said(point: RatePoint) -> RatePoint:

@@ -26,6 +26,9 @@ def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str
     table = Table(point_columns(), tuple(point_row(studied, point) for point in points))
     with_photos = studied.plan.figure == "drop"
     figure = studied.figure if with_photos else "fidelity"
+    against = "PSNR, SSIM and FLIP are against the photos"
+    if not with_photos:
+        against = "SSIM and FLIP are against the original: there are no photos"
     findings = list(_comparisons(studied, points, effort))
     if missing:
         findings.append(f"Left out or not reached: {'; '.join(missing)}.")
@@ -34,9 +37,8 @@ def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str
         "Bytes and quality",
         f"Every method at the sizes asked for: best at the effort {effort} and distilled (the effort {MAX}), paper with "
         "its rates to choose, and the whole scene in the formats of other programs as this one writes them. "
-        f"{'PSNR and SSIM are against the photos' if with_photos else 'SSIM is against the original: there are no photos'}; "
-        f"{FIDELITY_WORDS}. The rows hold all points of this study, also those without a part of the method. The first seconds "
-        "of a curve include most of the rounds of pruning, which its other points share.",
+        f"{against}; {FIDELITY_WORDS}. The rows hold all points of this study, also those without a part of the method. "
+        "The first seconds of a curve include most of the rounds of pruning, which its other points share.",
         table,
         _chart(table, "Bytes and quality", figure, effort),
         tuple(findings),
