@@ -26,7 +26,6 @@ USUAL = (
     "cameras",
     "images",
     "antialiased",
-    "promise",
     "effort",
     "memory_limit",
     "device",
@@ -84,7 +83,7 @@ Several scenes:
     "--max-worst-drop",
     metavar="DB",
     type=value_types.BOUND,
-    help="No view may lose more; none: no bound. Default: in proportion to the mean.",
+    help="No view may lose more. Default: as the mean allows.",
 )
 @option(
     REACH,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.target import Covered, Measurement
+from flexgs_edge.goals.target import Covered, Measurement, Target
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.flip import flip_bytes, flip_maps, flips
 from flexgs_edge.quality.psnr import mse
@@ -162,6 +162,13 @@ class Judge:
             self._put_away(key, image)
         self._reserved -= freed
         self._budget.give(freed)
+
+    def photos_that_decide(self, target: Target) -> tuple[Sequence[Camera], Callable[[int], np.ndarray] | None]:
+        """The views and what loads the photo of one, by its place, if the drop against photos decides; else nothing."""
+        photos = self.photos
+        if photos is None or target.figure != "drop":
+            return (), None
+        return self.cameras, lambda place: photos.load(self.indices[place])
 
     @property
     def kept(self) -> int:

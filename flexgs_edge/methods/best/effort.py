@@ -80,26 +80,47 @@ class Effort:
         return max(min(self.subsets, poses // LEAST_VIEWS), 1)
 
 
-def sampling_step(cameras: Sequence[Camera], pixels: int, coverage: float = 1.0) -> int:
-    """The largest step k of at most `LARGEST_STEP` at which every k-th pixel leaves `pixels` in all.
+def sampling_steps(
+    cameras: Sequence[Camera], pixels: int, coverage: float = 1.0, weights: np.ndarray | None = None
+) -> list[int]:
+    """The distance in pixels between those that we look at, for each pose.
 
-    With a `coverage` below 1 (share of the pixels that the scene covers), only so many of them count.
+    The distances are the largest, of at most `LARGEST_STEP`, that leave `pixels` in all. A pose of weight w gets about w times
+    as many pixels as one of weight 1, as errors add up over pixels.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        The poses.
+    pixels : int
+        Least pixels of all poses together.
+    coverage : float
+        Share of the pixels that the scene covers, which alone count. Default: all.
+    weights : np.ndarray, optional
+        [n] f64, above 0 to 1, one of them 1. Default: equal ones.
     """
-    step = 1
-    while step < LARGEST_STEP and coverage * sum(_lattice(camera, step + 1) for camera in cameras) >= pixels:
-        step += 1
-    return step
+    spread = np.ones(len(cameras)) if weights is None else 1.0 / np.sqrt(weights)
+    # At these factors, one of the steps changes.
+    changes = np.unique(np.arange(1, LARGEST_STEP + 1)[:, None] / spread)
+    steps = np.ones(len(cameras), np.int64)
+    for factor in changes:
+        farther = np.clip(np.floor(factor * spread * (1 + 1e-9)), 1, LARGEST_STEP).astype(np.int64)
+        if coverage * sum(_lattice(*pair) for pair in zip(cameras, farther.tolist(), strict=True)) < pixels:
+            break
+        steps = farther
+    return [int(step) for step in steps]
 
 
-def sampled_poses(cameras: Sequence[Camera], step: int) -> list[Camera]:
-    """The views at every `step`-th pixel in both directions.
+def sampled_poses(cameras: Sequence[Camera], steps: Sequence[int]) -> list[Camera]:
+    """The views at every k-th pixel in both directions; `steps` has the k of each.
 
-    The lattice is the same in every view, but begins at another pixel, by the order of the views' names. Names do not
-    depend on the order of the poses, where a moved scene may break ties in another way.
+    Lattices of one step begin at other pixels in each view, by the order of the views' names. Names do not depend on the
+    order of the poses, where a moved scene may break ties in another way.
     """
     places = np.argsort(np.argsort([camera.name for camera in cameras], kind="stable"), kind="stable")
     return [
-        camera.every(step, *divmod(int(place) % step**2, step)) for place, camera in zip(places, cameras, strict=True)
+        camera.every(step, *divmod(int(place) % step**2, step))
+        for place, camera, step in zip(places, cameras, steps, strict=True)
     ]
 
 
@@ -110,13 +131,13 @@ def _lattice(camera: Camera, step: int) -> int:
 
 EFFORTS = {
     "fast": Effort(
-        keep=0.77, refit_rounds=0, subsets=7, steps=1, close=0.08, few=18, views=48, pixels=12, refitted=0.86, probed=4
+        keep=0.77, refit_rounds=0, subsets=7, steps=1, close=0.08, few=32, views=96, pixels=12, refitted=0.86, probed=4
     ),
     "balanced": Effort(
-        keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.06, few=32, views=96, pixels=24, refitted=0.7
+        keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.06, few=400, views=400, pixels=24, refitted=0.7
     ),
     "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, few=400, views=400, pixels=24),
-    "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=96, views=96, pixels=24, passes=10.0),
+    "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=400, views=400, pixels=24, passes=10.0),
 }
 
 

@@ -79,7 +79,12 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
     output = run.output.path
     with Judges(run, bench) as judges:
         poses = scored_poses(
-            run.seen.of(run.seen.train), run.options, bench.renderer, run.source, judges.decide.covered_decides
+            run.seen.of(run.seen.train),
+            run.options,
+            bench.renderer,
+            run.source,
+            judges.decide.covered_decides,
+            *judges.decide.photos_that_decide(run.target),
         )
         folder = Path(run.options.scratch or (tempfile.gettempdir() if output is None else output.parent))
         storage = bench.renderer.storage = choose_storage(run, bench.renderer, poses.cameras, folder)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +10,11 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.order import covering_order
 from flexgs_edge.io.ply import inria_dtype
-from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, sampled_poses, sampling_step
+from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, sampled_poses, sampling_steps
 from flexgs_edge.methods.best.margin import with_margin
+from flexgs_edge.methods.best.view_weights import base_errors, view_weights
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.options import DEFAULT_MAX_DROP, CompressOptions
 from flexgs_edge.scene.source import SceneSource
 
 FINE_DROP, FINE_FIDELITY, FINE_RATIO = 0.3, 42.0, 30.0
@@ -46,6 +47,8 @@ def scored_poses(
     renderer: Renderer,
     source: SceneSource,
     covered_decides: bool = False,
+    known: Sequence[Camera] = (),
+    photo: Callable[[int], np.ndarray] | None = None,
 ) -> ScoredPoses:
     """Choose as many poses as the effort scores. Each next pose is the one that adds most to what those before it see.
 
@@ -64,6 +67,10 @@ def scored_poses(
         The original.
     covered_decides : bool
         As for `Quality`: only pixels that the scene covers count as pixels to look at. Default: all pixels count.
+    known : sequence of Camera
+        The views that decide, if photos do.
+    photo : callable, optional
+        The photo of one of these ([H, W, 3] f32). Poses then get pixels by `view_weights`. Default: alike.
     """
     plan = EFFORTS[options.effort]
     order = covering_order(cameras, some_positions(source), renderer.near, plan.views)
@@ -75,11 +82,15 @@ def scored_poses(
     given = {id(camera) for camera in cameras}
     drawn = chosen
     if not fine:
-        step = sampling_step(chosen, source.count * plan.pixels)
-        if step > 1 and covered_decides:
+        weights = None
+        if photo is not None:
+            errors = base_errors(renderer, source, known, photo)
+            weights = view_weights(errors, known, chosen, options.max_drop or DEFAULT_MAX_DROP)
+        steps = sampling_steps(chosen, source.count * plan.pixels, weights=weights)
+        if max(steps) > 1 and covered_decides:
             # A small object in a large view would fall between the pixels.
-            step = sampling_step(chosen, source.count * plan.pixels, _coverage(renderer, source, chosen))
-        drawn = sampled_poses(chosen, step)
+            steps = sampling_steps(chosen, source.count * plan.pixels, _coverage(renderer, source, chosen))
+        drawn = sampled_poses(chosen, steps)
     return ScoredPoses(drawn, sum(id(camera) not in given for camera in chosen))
 
 

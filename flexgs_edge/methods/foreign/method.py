@@ -54,7 +54,8 @@ def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray 
         poses = None
         if order is None and bench is not None and judges is not None:
             cameras, covered = run.seen.of(run.seen.train), judges.decide.covered_decides
-            poses = scored_poses(cameras, options, bench.renderer, run.source, covered)
+            deciding = judges.decide.photos_that_decide(run.target)
+            poses = scored_poses(cameras, options, bench.renderer, run.source, covered, *deciding)
         with open_files(run, format, bench, judges) as files:
             if plan.target is not None:
                 LOG.info("searching for %s", plan.target.describe())

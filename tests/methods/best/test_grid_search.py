@@ -19,7 +19,7 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
-from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses, sampling_step
+from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses, sampling_steps
 from flexgs_edge.methods.best.grid_search import DISTILLED, GridSearch, rate_from
 from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.multiplier import EXTRA_STEPS
@@ -350,16 +350,28 @@ def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> Non
 @pytest.mark.parametrize(("count", "step"), [(10, LARGEST_STEP), (100, 3), (240, 2), (260, 1), (10**6, 1)])
 def test_poses_have_no_more_pixels_than_the_rows_need(count: int, step: int) -> None:
     cameras = [make_camera(64, 48) for _ in range(8)]
-    assert sampling_step(cameras, 24 * count) == step
-    assert sampling_step(cameras, 24 * count, 0.5) == sampling_step(cameras, 48 * count)
-    assert sampling_step(cameras, 24 * count, 0.0) == 1
-    sampled = sampled_poses(cameras, step)
+    assert sampling_steps(cameras, 24 * count) == [step] * 8
+    assert sampling_steps(cameras, 24 * count, 0.5) == sampling_steps(cameras, 48 * count)
+    assert sampling_steps(cameras, 24 * count, 0.0) == [1] * 8
+    sampled = sampled_poses(cameras, [step] * 8)
     assert {camera.width for camera in sampled} == {-(-64 // step)} | ({64 // step} if 64 % step else set())
     if 1 < step < LARGEST_STEP:
         pixels = sum(camera.width * camera.height for camera in sampled)
         assert pixels >= 24 * count
     # Not the same lattice in every view.
     assert len({(camera.cx, camera.cy) for camera in sampled}) == min(step**2, 8)
+
+
+def test_poses_get_pixels_by_their_weights() -> None:
+    """About in proportion, between all of them and one of the largest step; never fewer in all than the rows need."""
+    cameras = [make_camera(64, 48) for _ in range(4)]
+    weights = np.array([1.0, 0.25, 1 / 9, 1e-6])
+    assert sampling_steps(cameras, 1, weights=weights) == [4, 4, 4, 4]
+    assert sampling_steps(cameras, 4300, weights=weights) == [1, 2, 3, 4]
+    assert sampling_steps(cameras, 4 * 64 * 48, weights=weights) == [1, 1, 1, 1]
+    for pixels in range(800, 12_000, 700):
+        steps = sampling_steps(cameras, pixels, weights=weights)
+        assert steps == sorted(steps) and sum((64 // step) * (48 // step) for step in steps) >= pixels
 
 
 def test_large_scenes_are_scored_from_more_poses() -> None:

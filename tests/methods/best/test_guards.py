@@ -212,7 +212,7 @@ def test_margin_poses_see_what_no_pose_does() -> None:
     assert [camera.name for camera in scored] == [camera.name for camera in again]
     assert scored[:8] == cameras[:8] and len(scored) == 13
     near, far = f"at {NEARER:g}x", f"at {FARTHER:g}x"
-    expected = [f"c0 {near}", f"c2 {far}", f"c4 {near}", f"c6 {far}", "c7 to c6"]
+    expected = [f"c0 {near}", f"c2 {far}", f"c4 {near}", f"c6 {far}", "c7 to c8"]
     assert [camera.name for camera in scored[8:]] == expected
     assert not count(open_form("w16"), gaps, cameras).hits.any()
     assert count(open_form("w16"), gaps, scored).hits.any()

@@ -194,7 +194,7 @@ def test_nothing_is_left_behind(project: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the file exists"):
         compress(project / "point_cloud.ply", tmp_path / "a.spz", **PAPER)
 
-    words = {"force": True, "progress": Stopped(enabled=False), **PAPER}
+    words = {"force": True, "progress": Stopped(enabled=False), "promise": "mean", **PAPER}
     with pytest.raises(KeyboardInterrupt):
         compress(project / "point_cloud.ply", tmp_path / "a.spz", **words)
     assert [path.name for path in tmp_path.iterdir()] == ["a.spz"] and (tmp_path / "a.spz").read_text() == "earlier"

@@ -1,0 +1,89 @@
+"""How much an error counts in each scored pose, by how much error the original has near there itself.
+
+PSNR falls by 10 log10(1 + error / base error). Where the original is near to its photos, a small error costs many decibels;
+where it is far away, the same error hides. Equal errors everywhere would break the good views, so errors near these count
+more: by a power of 1 / (base error + allowed error), the slope of the drop at the target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.quality.psnr import mse
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.scene.source import SceneSource
+
+STEP = 4
+"""Every fourth pixel in both directions is compared."""
+POWER = 4.0
+"""Power of the slope. The slope alone would minimise the mean drop; a higher power lifts the worst view, as a soft maximum
+does: docs/results/tuning.md#view_weights"""
+
+
+def base_errors(
+    renderer: Renderer, source: SceneSource, cameras: Sequence[Camera], photo: Callable[[int], np.ndarray]
+) -> np.ndarray:
+    """[n] f64, mean squared error of the original against the photo of each view.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        With nothing loaded.
+    source : SceneSource
+        The original.
+    cameras : sequence of Camera
+        The views that decide.
+    photo : callable
+        The photo of a view by its place in `cameras`, [H, W, 3] f32 in [0, 1].
+    """
+    errors = []
+    with renderer.load(source) as scene:
+        coarse = [camera.every(STEP) for camera in cameras]
+        for place, camera in enumerate(renderer.in_turn(scene, coarse)):
+            image = np.clip(renderer.render(scene, camera), 0.0, 1.0)
+            errors.append(mse(image, np.ascontiguousarray(photo(place)[::STEP, ::STEP])))
+    renderer.release()
+    return np.array(errors)
+
+
+def view_weights(errors: np.ndarray, known: Sequence[Camera], cameras: Sequence[Camera], drop: float) -> np.ndarray:
+    """How much an error counts in each pose, relative to the largest weight.
+
+    Parameters
+    ----------
+    errors : np.ndarray
+        [m] f64, from `base_errors`.
+    known : sequence of Camera
+        The m views that the errors belong to.
+    cameras : sequence of Camera
+        The scored poses. Each takes the weight of the nearest known view.
+    drop : float
+        Allowed drop, dB.
+
+    Returns
+    -------
+    np.ndarray
+        [n] f64, above 0 to 1.
+    """
+    allowed = float(np.median(errors)) * (10 ** (drop / 10) - 1)
+    slopes = 1.0 / (errors + max(allowed, 1e-12))
+    weights = (slopes / slopes.max()) ** POWER
+    found: np.ndarray = weights[_nearest(known, cameras)]
+    found /= found.max()
+    return found
+
+
+def _nearest(known: Sequence[Camera], cameras: Sequence[Camera]) -> np.ndarray:
+    """[n] i64, the nearest known view of each camera: by place, in deviations of the known places, and by direction."""
+    centres = np.stack([camera.center for camera in known])
+    spread = float(np.sqrt(np.square(centres - centres.mean(axis=0)).sum(axis=1).mean())) or 1.0
+
+    def places(views: Sequence[Camera]) -> np.ndarray:
+        return np.stack([np.concatenate([camera.center / spread, camera.rotation[2]]) for camera in views])
+
+    away = np.square(places(cameras)[:, None] - places(known)[None]).sum(axis=2)
+    nearest: np.ndarray = away.argmin(axis=1)
+    return nearest
