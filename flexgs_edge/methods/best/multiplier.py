@@ -17,6 +17,7 @@ import numpy as np
 
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
+from flexgs_edge.goals.promise import mean_alone
 from flexgs_edge.goals.steps import better, obstacle
 from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.methods.best.allocation import BitModel, choose, drop_bands, keep_one
@@ -156,7 +157,7 @@ class MultiplierSearch(ABC, Generic[Product]):
                 if last.count * self.bits.base / 8 <= target.limit_bytes:
                     break
             elif len(self.rounds.snapshots) > 1:
-                excess = target.excess(0, self.measure(last.planes, estimate=True))
+                excess = mean_alone(target).excess(0, self.measure(last.planes, estimate=True))
                 if excess >= math.log(self.pruned_part):
                     break
             if last.count < 16:
