@@ -35,6 +35,7 @@ from flexgs_edge.render.fit import (
     saves_bytes,
 )
 from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.render.structure import add_structure
 from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
 from flexgs_edge.scene.source import SceneSource
 
@@ -137,7 +138,12 @@ class Renderer:
         return self._buffers.records
 
     def load(
-        self, source: SceneSource, sum_bytes: int = SUM_BYTES, references: bool = False, view_sums: int = MOST_SUMS
+        self,
+        source: SceneSource,
+        sum_bytes: int = SUM_BYTES,
+        references: bool = False,
+        structure: bool = False,
+        view_sums: int = MOST_SUMS,
     ) -> DeviceScene:
         """Bring a scene to the backend: all of it, or chunk by chunk for each view if it does not fit.
 
@@ -148,13 +154,15 @@ class Renderer:
             Bytes a row to leave free for sums over views.
         references : bool
             Leave room to compare views with targets.
+        structure : bool
+            Leave room for the structural term of `gradient_sums`.
         view_sums : int
             Most planes of sums that a view has.
         """
         self.release()
         planes = SourcePlanes(self.backend, source)
         return DeviceScene(
-            self.backend, planes, self.budget, self.antialiased, sum_bytes, references, view_sums, self.fit
+            self.backend, planes, self.budget, self.antialiased, sum_bytes, references, structure, view_sums, self.fit
         )
 
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
@@ -259,12 +267,20 @@ class Renderer:
         self._blend(view, "blend_both", (hits, sums, residual), again=True)
         return sums
 
-    def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
-        """Gradients of the squared error of one view against `target`, for each splat, summed over pixels.
+    def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray, structure: float = 0.0) -> Any:
+        """Gradients of the loss of one view against `target`, for each splat, summed over pixels.
 
-        Let r be the residual (target minus view), and e the light that a splat adds when its alpha grows by its own
-        size. The sums are sum(alpha T r) for red, green, blue, then sum(r e), then its moments about the splat's
-        centre: x, y, xx, xy, yy.
+        The loss is the squared error, plus `structure` times the sum of 1 - SSIM over windows and channels. Let r be
+        minus half its gradient by the view, which is target minus view if `structure` is 0. Let e be the light that a
+        splat adds when its alpha grows by its own size. The sums are sum(alpha T r) for red, green, blue, then
+        sum(r e), then its moments about the splat's centre: x, y, xx, xy, yy.
+
+        Parameters
+        ----------
+        target : np.ndarray
+            [3, H, W] f16, in the layout of `render_planes`.
+        structure : float
+            Weight of the structural term. Views with a side below the window's 11 pixels have none.
 
         Returns
         -------
@@ -276,6 +292,8 @@ class Renderer:
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, GRADIENT_SUMS)
         residual = self._residual(view, target)
+        if structure:
+            add_structure(self.backend, view.buffers, camera, structure)
         self._blend(view, "blend_backward", (hits, sums, residual), again=True)
         return sums
 

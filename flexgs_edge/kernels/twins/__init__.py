@@ -20,7 +20,14 @@ from flexgs_edge.kernels.twins.blend import (
 from flexgs_edge.kernels.twins.dequantize import dequantize
 from flexgs_edge.kernels.twins.project import project
 from flexgs_edge.kernels.twins.score import residual, sh_costs, sh_residual
-from flexgs_edge.kernels.twins.similarity import ssim_columns, ssim_rows
+from flexgs_edge.kernels.twins.similarity import (
+    dssim_columns,
+    dssim_columns_back,
+    dssim_residual,
+    dssim_slopes,
+    ssim_columns,
+    ssim_rows,
+)
 from flexgs_edge.kernels.twins.sort import (
     exclusive_scan,
     sort_count,
@@ -50,6 +57,10 @@ TWINS: dict[str, Callable[..., None]] = {
     "residual": residual,
     "ssim_columns": ssim_columns,
     "ssim_rows": ssim_rows,
+    "dssim_columns": dssim_columns,
+    "dssim_slopes": dssim_slopes,
+    "dssim_columns_back": dssim_columns_back,
+    "dssim_residual": dssim_residual,
     "sh_costs": sh_costs,
     "sh_residual": sh_residual,
     "project_backward": project_backward,
