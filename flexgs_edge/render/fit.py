@@ -230,12 +230,7 @@ def reference_bytes(size: ViewSize) -> int:
 
 
 def structure_shapes(size: ViewSize) -> Shapes:
-    """Buffers for the gradient of one channel's SSIM; nothing for a view that is smaller than its window.
-
-    Both end in rows that the sums of the last pixels read: docs in cl_kernels/similarity.cl.
-    """
-    if min(size.width, size.height) < SSIM_WINDOW:
-        return {}
+    """Buffers for the gradient of one channel's SSIM. They end in rows that the sums of the last pixels read."""
     stride = size.tiles_x * TILE
     return {
         "taps": ((SSIM_WINDOW,), np.float32),

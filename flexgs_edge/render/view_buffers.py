@@ -8,7 +8,6 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.kernels.backend import Backend
-from flexgs_edge.kernels.window import window
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import (
@@ -137,16 +136,10 @@ class ViewBuffers:
         return self._references
 
     def structure_arrays(self) -> tuple[Any, ...]:
-        """Taps of the window, moments and slopes, for the gradient of SSIM; allocated at the first call.
-
-        Empty for a view that is smaller than the window. The kernels rely on zeros around the slopes that they write.
-        """
+        """Taps of the window, moments and slopes, for the gradient of SSIM; allocated at the first call."""
         if self._structure is None:
             shapes = structure_shapes(self.size).values()
             self._structure = tuple(self._array(shape, dtype) for shape, dtype in shapes)
-            if self._structure:
-                self._backend.write(self._structure[0], window())
-                self._backend.fill(self._structure[2], 0)
         return self._structure
 
     def release(self) -> None:
