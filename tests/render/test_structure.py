@@ -78,11 +78,10 @@ def test_the_term_is_the_gradient_of_ssim(width: int, height: int, step: int) ->
             moved = a.copy()
             moved[row, column] += sign * CHANGE
             sums.append(similar(moved, b, step))
-        # Half of the weight of 2.
-        assert added[channel, row, column] == pytest.approx(
-            (sums[0] - sums[1]) / (2 * CHANGE), rel=1e-4, abs=1e-5 * largest
-        )
-    assert (image > 1).any() == bool(width > 3)
+        # Half of the weight of 2. Variances are rounded at 1e-7, about 1e-4 of SSIM's constant.
+        slope = (sums[0] - sums[1]) / (2 * CHANGE)
+        assert added[channel, row, column] == pytest.approx(slope, rel=1e-3, abs=1e-5 * largest)
+    assert (image > 1).any()
 
 
 @pytest.mark.parametrize(("width", "height", "step"), VIEWS)
