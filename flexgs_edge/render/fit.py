@@ -24,6 +24,8 @@ GUESS = 1.02
 """Room beyond the largest share of rows that a view has shown so far."""
 MOST_SUMS = 6
 """Largest number of sum planes of a view (`Renderer.residual_and_removal_sums`)."""
+GRADIENT_SUMS = 9
+"""Number of planes of `Renderer.gradient_sums`."""
 SORT_DIGIT_BITS = 11
 SORT_DIGITS = 1 << SORT_DIGIT_BITS
 REFERENCE_BYTES = 6

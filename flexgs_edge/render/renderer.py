@@ -24,6 +24,7 @@ from flexgs_edge.render.camera_record import camera_record
 from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import (
+    GRADIENT_SUMS,
     GROWTH,
     GUESS,
     MOST_SUMS,
@@ -34,15 +35,13 @@ from flexgs_edge.render.fit import (
     fits_whole,
     saves_bytes,
 )
+from flexgs_edge.render.residual import add_structure, target_residual
 from flexgs_edge.render.statistics import Statistics
-from flexgs_edge.render.structure import add_structure
 from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
 from flexgs_edge.scene.source import SceneSource
 
 SUM_ROWS = 1 << 18
 """Rows of sums that are copied to the host at a time."""
-GRADIENT_SUMS = 9
-"""Number of planes of `Renderer.gradient_sums`."""
 EXTENTS = ("exact", "inria")
 
 
@@ -248,7 +247,9 @@ class Renderer:
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, 4)
-        self._blend(view, "blend_residual", (hits, sums, self._residual(view, target)), again=True)
+        self._blend(
+            view, "blend_residual", (hits, sums, target_residual(self.backend, view.buffers, target)), again=True
+        )
         return sums
 
     def residual_and_removal_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
@@ -263,24 +264,17 @@ class Renderer:
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, 6)
-        residual = self._residual(view, target)
+        residual = target_residual(self.backend, view.buffers, target)
         self._blend(view, "blend_both", (hits, sums, residual), again=True)
         return sums
 
     def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray, structure: float = 0.0) -> Any:
         """Gradients of the loss of one view against `target`, for each splat, summed over pixels.
 
-        The loss is the squared error, plus `structure` times the sum of 1 - SSIM over windows and channels. Let r be
-        minus half its gradient by the view, which is target minus view if `structure` is 0. Let e be the light that a
-        splat adds when its alpha grows by its own size. The sums are sum(alpha T r) for red, green, blue, then
-        sum(r e), then its moments about the splat's centre: x, y, xx, xy, yy.
-
-        Parameters
-        ----------
-        target : np.ndarray
-            [3, H, W] f16, in the layout of `render_planes`.
-        structure : float
-            Weight of the structural term. Views with a side below the window's 11 pixels have none.
+        The loss is the squared error, plus `structure` times 1 - SSIM (`add_structure`). Let r be minus half of its
+        gradient by the view: target minus view, without structure. Let e be the light that a splat adds when its alpha
+        grows by its own size. The sums are sum(alpha T r) for red, green, blue, then sum(r e), then its moments about
+        the splat's centre: x, y, xx, xy, yy.
 
         Returns
         -------
@@ -291,17 +285,11 @@ class Renderer:
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, GRADIENT_SUMS)
-        residual = self._residual(view, target)
+        residual = target_residual(self.backend, view.buffers, target)
         if structure:
             add_structure(self.backend, view.buffers, camera, structure)
         self._blend(view, "blend_backward", (hits, sums, residual), again=True)
         return sums
-
-    def _residual(self, view: _View, target: np.ndarray) -> Any:
-        half, residual = view.buffers.reference_arrays()
-        self.backend.write(half, target.reshape(-1))
-        self.backend.launch("residual", (residual.shape[0],), residual.shape[0], half, view.buffers.image, residual)
-        return residual
 
     def read_sums(self, sums: Any, channels: int, count: int, first: int = 0, start: int = 0) -> np.ndarray:
         """Copy planes of sums to the host, from plane `first` and row `start` on: [channels, count] i64."""

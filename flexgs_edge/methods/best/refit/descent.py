@@ -13,8 +13,8 @@ from flexgs_edge.errors import BudgetError
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.render.fit import sum_bytes
-from flexgs_edge.render.renderer import GRADIENT_SUMS, Renderer
+from flexgs_edge.render.fit import GRADIENT_SUMS, sum_bytes
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_mib

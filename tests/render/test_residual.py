@@ -13,9 +13,9 @@ from flexgs_edge.kernels.backend import Backend, TwinBackend
 from flexgs_edge.kernels.window import window
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.refit.descent import Descent
-from flexgs_edge.render.fit import shapes_bytes, structure_shapes
-from flexgs_edge.render.renderer import GRADIENT_SUMS, Renderer
-from flexgs_edge.render.structure import add_structure
+from flexgs_edge.render.fit import GRADIENT_SUMS, shapes_bytes, structure_shapes
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.residual import add_structure, target_residual
 from flexgs_edge.render.view_buffers import view_size
 from flexgs_edge.scene.fields import FIELD
 from kernel_fixtures import ALL_FORMS, FORMS, PairedBackend, large_budget, open_form, same_bits
@@ -40,7 +40,7 @@ def term(backend: Backend, camera: Camera, weight: float = 2.0) -> tuple[np.ndar
         target = (image + np.random.default_rng(1).normal(0, 0.05, image.shape)).astype(np.float16)
         drawn = renderer._drawn
         assert drawn is not None
-        before = backend.read(renderer._residual(drawn, target)).copy()
+        before = backend.read(target_residual(backend, drawn.buffers, target)).copy()
         add_structure(backend, drawn.buffers, camera, weight)
         after = backend.read(drawn.buffers.reference_arrays()[1])
     renderer.release()
@@ -110,7 +110,7 @@ def test_numbers_beyond_a_pictures_range_add_nothing_wild() -> None:
         image = renderer.render_planes(scene, camera)
         target = np.random.default_rng(1).uniform(-1, 6e4, image.shape).astype(np.float16)
         assert renderer._drawn is not None
-        backend.fill(renderer._residual(renderer._drawn, target), 0)
+        backend.fill(target_residual(backend, renderer._drawn.buffers, target), 0)
         add_structure(backend, renderer._drawn.buffers, camera, 0.01)
         added = backend.read(renderer._drawn.buffers.reference_arrays()[1])
     renderer.release()

@@ -1,8 +1,11 @@
-"""The structural term of a descent's loss: the gradient of a view's SSIM, added to its residual."""
+"""What a view lacks of its target: the residual, and the structural term of a descent's loss in it."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
+
+import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import DILATION
@@ -10,6 +13,14 @@ from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.window import window
 from flexgs_edge.render.fit import padded
 from flexgs_edge.render.view_buffers import ViewBuffers
+
+
+def target_residual(backend: Backend, buffers: ViewBuffers, target: np.ndarray) -> Any:
+    """`target` ([3, H, W] f16, in the layout of `Renderer.render_planes`) minus the drawn view: [3 H W] f32 on the backend."""
+    half, residual = buffers.reference_arrays()
+    backend.write(half, target.reshape(-1))
+    backend.launch("residual", (residual.shape[0],), residual.shape[0], half, buffers.image, residual)
+    return residual
 
 
 def add_structure(backend: Backend, buffers: ViewBuffers, camera: Camera, weight: float) -> None:
