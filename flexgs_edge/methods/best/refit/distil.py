@@ -27,6 +27,8 @@ FIELD_RATES = {
 }
 """Largest changes of the other values in a step. Those of scales and rotations are three times the reference program's, the
 others are equal. That program takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
+STRUCTURE = 0.02
+"""Weight of 1 - SSIM in the loss, in units of a squared error: docs/results/tuning.md#structure"""
 LAST = 0.1
 """Rates at the end as a share of those at the beginning, once while geometry moves and once while it is held. They fall by the
 same factor at each step."""
@@ -120,7 +122,7 @@ def distil(
     ordered = {**planes, "quats": quats.astype(np.float32), "log_scales": log_scales}
     rows = np.argsort(degrees == 0, kind="stable")
     ordered = {name: np.ascontiguousarray(values[:, rows]) for name, values in ordered.items()}
-    with Descent(original.bench.renderer, ordered, degrees[rows], original.origin, largest) as descent:
+    with Descent(original.bench.renderer, ordered, degrees[rows], original.origin, largest, STRUCTURE) as descent:
         order = schedule.order(len(cameras))
         parts = schedule.parts(step_sizes is not None)
         for place, part in enumerate(parts):
