@@ -86,6 +86,7 @@ def distil(
     schedule: Schedule,
     step_sizes: StepSizes | None = None,
     rates: dict[str, float] | None = None,
+    structure: float = STRUCTURE,
 ) -> dict[str, np.ndarray]:
     """Move all values of a scene towards the original's renders.
 
@@ -103,6 +104,8 @@ def distil(
         Of the grid that the values will be put on. The last steps then compensate for its rounding.
     rates : dict, optional
         Rates by field, in place of those of `rates_for`.
+    structure : float
+        Weight of 1 - SSIM in the loss, beside the squared error.
 
     Returns
     -------
@@ -122,7 +125,7 @@ def distil(
     ordered = {**planes, "quats": quats.astype(np.float32), "log_scales": log_scales}
     rows = np.argsort(degrees == 0, kind="stable")
     ordered = {name: np.ascontiguousarray(values[:, rows]) for name, values in ordered.items()}
-    with Descent(original.bench.renderer, ordered, degrees[rows], original.origin, largest, STRUCTURE) as descent:
+    with Descent(original.bench.renderer, ordered, degrees[rows], original.origin, largest, structure) as descent:
         order = schedule.order(len(cameras))
         parts = schedule.parts(step_sizes is not None)
         for place, part in enumerate(parts):
