@@ -126,7 +126,7 @@ def test_rows_keep_their_places_and_degrees(workshop: Workshop) -> None:
         distance = abs(np.sort(moved[name], axis=0) - np.sort(workshop.kept[name], axis=0)).max()
         assert 0 < distance < 3 * RATES[name], name
     norms = np.square(moved["quats"]).sum(axis=0)
-    assert abs(norms - 1).max() < 0.01
+    assert abs(norms - 1).max() < 4 * RATES["quats"]
 
 
 def test_steps_on_the_grid_repair_it(workshop: Workshop) -> None:
