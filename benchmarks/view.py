@@ -19,7 +19,7 @@ from flexgs_edge.cameras.camera import Camera, split_views
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.methods.best.refit.descent import Descent
-from flexgs_edge.methods.best.refit.distil import rates_for
+from flexgs_edge.methods.best.refit.distil import STRUCTURE, rates_for
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
@@ -121,7 +121,8 @@ def bench_descent(timer: Timer, renderer: Renderer, source: PlySource, cameras: 
         drawn = [
             _processor_ms(chosen, lambda k: renderer.render_planes(scene, chosen[k])) for _ in range(timer.repeats)
         ]
-    with Descent(renderer, planes, np.full(source.count, source.sh_degree), source.origin, chosen[0]) as descent:
+    degrees = np.full(source.count, source.sh_degree)
+    with Descent(renderer, planes, degrees, source.origin, chosen[0], STRUCTURE) as descent:
         found: dict[str, list[float]] = {"gradients": [], "step": []}
         for _ in range(timer.repeats):
             found["gradients"].append(_processor_ms(chosen, lambda k: descent.differentiate(chosen[k], targets[k])))

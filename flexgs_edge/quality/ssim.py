@@ -6,19 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexgs_edge.constants import LANES, SSIM_SIGMA, SSIM_WINDOW
+from flexgs_edge.constants import LANES, SSIM_WINDOW
 from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.kernels.window import window
 
 LOST_SHARE = 0.7
 """SSIM lost against photos, as a share of what is lost against the original's renders."""
-
-
-def window() -> np.ndarray:
-    """[SSIM_WINDOW] f32, the weights of the Gaussian window, with the sum 1."""
-    away = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
-    taps = np.exp(-0.5 * np.square(away / SSIM_SIGMA))
-    window: np.ndarray = (taps / taps.sum()).astype(np.float32)
-    return window
 
 
 def modelled_ssim_drop(unlike: float) -> float:

@@ -48,6 +48,8 @@ class DeviceScene:
         Bytes a row that sums over views will take on the backend, to be left free.
     references : bool
         Views will be compared with targets on the backend; their room is taken with the view's buffers.
+    structure : bool
+        They will be compared by their structure, too (`Renderer.gradient_sums`).
     view_sums : int
         Most planes of sums that a view has.
     fit : Fit, optional
@@ -62,6 +64,7 @@ class DeviceScene:
         antialiased: bool = False,
         sum_bytes: int = SUM_BYTES,
         references: bool = False,
+        structure: bool = False,
         view_sums: int = MOST_SUMS,
         fit: Fit | None = None,
     ) -> None:
@@ -72,7 +75,7 @@ class DeviceScene:
         self.antialiased = antialiased
         self.statistics: list[Any] = []
         self.resident, self._streamed = False, False
-        self.references = references
+        self.references, self.structure = references, structure
         self.sum_bytes = sum_bytes
         self.view_sums = view_sums
         self.fit = fit or fit_module.DEFAULT

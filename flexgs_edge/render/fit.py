@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from flexgs_edge.constants import LANES, TILE
+from flexgs_edge.constants import LANES, SSIM_WINDOW, TILE
 from flexgs_edge.scene.fields import FIELD
 
 Shapes = dict[str, tuple[tuple[int, ...], Any]]
@@ -24,6 +24,8 @@ GUESS = 1.02
 """Room beyond the largest share of rows that a view has shown so far."""
 MOST_SUMS = 6
 """Largest number of sum planes of a view (`Renderer.residual_and_removal_sums`)."""
+GRADIENT_SUMS = 9
+"""Number of planes of `Renderer.gradient_sums`."""
 SORT_DIGIT_BITS = 11
 SORT_DIGITS = 1 << SORT_DIGIT_BITS
 REFERENCE_BYTES = 6
@@ -131,6 +133,7 @@ class SceneSize(Protocol):
     count: int
     sum_bytes: int
     references: bool
+    structure: bool
 
     @property
     def later_bytes(self) -> int:
@@ -228,6 +231,22 @@ def reference_bytes(size: ViewSize) -> int:
     return REFERENCE_BYTES * 3 * size.pixels
 
 
+def structure_shapes(size: ViewSize) -> Shapes:
+    """Buffers for the gradient of one channel's SSIM. They end in rows that the sums of the last pixels read."""
+    stride = size.tiles_x * TILE
+    return {
+        "taps": ((SSIM_WINDOW,), np.float32),
+        "moments": ((5, (size.height + 1) * stride), np.float32),
+        "slopes": ((3, (size.height + SSIM_WINDOW) * stride), np.float32),
+    }
+
+
+def target_bytes(scene: SceneSize, size: ViewSize) -> int:
+    """Bytes that a view of this scene takes to be compared with its target."""
+    structure = shapes_bytes(structure_shapes(size)) if scene.structure else 0
+    return scene.references * reference_bytes(size) + structure
+
+
 def saves_bytes(scene: SceneSize, size: ViewSize, shown: int) -> bool:
     """Whether a compact view of `shown` rows takes less memory than a view of all rows, if sums over views lie in memory.
 
@@ -244,7 +263,7 @@ def fits_whole(scene: SceneSize, size: ViewSize, free: int, spills: bool) -> boo
 
     If large arrays lie in files (`spills`), half of the memory is left for the kernel's cache of their pages.
     """
-    view = view_bytes(size, scene.count) + scene.references * reference_bytes(size) + scene.later_bytes
+    view = view_bytes(size, scene.count) + target_bytes(scene, size) + scene.later_bytes
     free += scene.held_bytes
     if spills:
         # Without cached pages, a run under a tight limit reads the same rows again and again.

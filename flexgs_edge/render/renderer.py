@@ -24,6 +24,7 @@ from flexgs_edge.render.camera_record import camera_record
 from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import (
+    GRADIENT_SUMS,
     GROWTH,
     GUESS,
     MOST_SUMS,
@@ -34,14 +35,13 @@ from flexgs_edge.render.fit import (
     fits_whole,
     saves_bytes,
 )
+from flexgs_edge.render.residual import add_structure, target_residual
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
 from flexgs_edge.scene.source import SceneSource
 
 SUM_ROWS = 1 << 18
 """Rows of sums that are copied to the host at a time."""
-GRADIENT_SUMS = 9
-"""Number of planes of `Renderer.gradient_sums`."""
 EXTENTS = ("exact", "inria")
 
 
@@ -137,7 +137,12 @@ class Renderer:
         return self._buffers.records
 
     def load(
-        self, source: SceneSource, sum_bytes: int = SUM_BYTES, references: bool = False, view_sums: int = MOST_SUMS
+        self,
+        source: SceneSource,
+        sum_bytes: int = SUM_BYTES,
+        references: bool = False,
+        structure: bool = False,
+        view_sums: int = MOST_SUMS,
     ) -> DeviceScene:
         """Bring a scene to the backend: all of it, or chunk by chunk for each view if it does not fit.
 
@@ -148,13 +153,15 @@ class Renderer:
             Bytes a row to leave free for sums over views.
         references : bool
             Leave room to compare views with targets.
+        structure : bool
+            Leave room for the structural term of `gradient_sums`.
         view_sums : int
             Most planes of sums that a view has.
         """
         self.release()
         planes = SourcePlanes(self.backend, source)
         return DeviceScene(
-            self.backend, planes, self.budget, self.antialiased, sum_bytes, references, view_sums, self.fit
+            self.backend, planes, self.budget, self.antialiased, sum_bytes, references, structure, view_sums, self.fit
         )
 
     def load_quantized(self, quantized: QuantizedScene) -> DeviceScene:
@@ -240,7 +247,9 @@ class Renderer:
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, 4)
-        self._blend(view, "blend_residual", (hits, sums, self._residual(view, target)), again=True)
+        self._blend(
+            view, "blend_residual", (hits, sums, target_residual(self.backend, view.buffers, target)), again=True
+        )
         return sums
 
     def residual_and_removal_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
@@ -255,16 +264,17 @@ class Renderer:
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, 6)
-        residual = self._residual(view, target)
+        residual = target_residual(self.backend, view.buffers, target)
         self._blend(view, "blend_both", (hits, sums, residual), again=True)
         return sums
 
-    def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
-        """Gradients of the squared error of one view against `target`, for each splat, summed over pixels.
+    def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray, structure: float = 0.0) -> Any:
+        """Gradients of the loss of one view against `target`, for each splat, summed over pixels.
 
-        Let r be the residual (target minus view), and e the light that a splat adds when its alpha grows by its own
-        size. The sums are sum(alpha T r) for red, green, blue, then sum(r e), then its moments about the splat's
-        centre: x, y, xx, xy, yy.
+        The loss is the squared error, plus `structure` times 1 - SSIM (`add_structure`). Let r be minus half of its
+        gradient by the view: target minus view, without structure. Let e be the light that a splat adds when its alpha
+        grows by its own size. The sums are sum(alpha T r) for red, green, blue, then sum(r e), then its moments about
+        the splat's centre: x, y, xx, xy, yy.
 
         Returns
         -------
@@ -275,15 +285,11 @@ class Renderer:
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, GRADIENT_SUMS)
-        residual = self._residual(view, target)
+        residual = target_residual(self.backend, view.buffers, target)
+        if structure:
+            add_structure(self.backend, view.buffers, camera, structure)
         self._blend(view, "blend_backward", (hits, sums, residual), again=True)
         return sums
-
-    def _residual(self, view: _View, target: np.ndarray) -> Any:
-        half, residual = view.buffers.reference_arrays()
-        self.backend.write(half, target.reshape(-1))
-        self.backend.launch("residual", (residual.shape[0],), residual.shape[0], half, view.buffers.image, residual)
-        return residual
 
     def read_sums(self, sums: Any, channels: int, count: int, first: int = 0, start: int = 0) -> np.ndarray:
         """Copy planes of sums to the host, from plane `first` and row `start` on: [channels, count] i64."""

@@ -16,8 +16,9 @@ from flexgs_edge.render.fit import (
     PAIR_SHARE,
     ViewSize,
     chunk_shapes,
-    reference_bytes,
     shapes_bytes,
+    structure_shapes,
+    target_bytes,
     view_shapes,
 )
 
@@ -53,16 +54,12 @@ class ViewBuffers:
         self.arrays: list[Any] = []
         self._backend = backend
         self._references: tuple[Any, Any] | None = None
+        self._structure: tuple[Any, ...] | None = None
         shapes = view_shapes(self.size, count)
         size = shapes_bytes(shapes)
         # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the
         # sums need is checked here too, so that one error message names a limit that is large enough.
-        later = (
-            PAIR_BYTES * self.tiles
-            + scene.later_bytes
-            + scene.least_bytes
-            + scene.references * reference_bytes(self.size)
-        )
+        later = PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + target_bytes(scene, self.size)
         what = (
             f"a view of {count} Gaussians" if rows is None else f"a view that shows {count} of {scene.count} Gaussians"
         )
@@ -75,7 +72,9 @@ class ViewBuffers:
             made = {name: self._array(shape, dtype) for name, (shape, dtype) in shapes.items()}
             if scene.references:
                 self.reference_arrays()
-                later -= reference_bytes(self.size)
+            if scene.structure:
+                self.structure_arrays()
+            later -= target_bytes(scene, self.size)
             share, most = PAIR_SHARE, max(scene.fit.pairs, self.tiles)
             if rows is not None:
                 share = COMPACT_PAIR_SHARE
@@ -131,9 +130,16 @@ class ViewBuffers:
             self._references = (self._array((pixels,), np.float16), self._array((pixels,), np.float32))
         return self._references
 
+    def structure_arrays(self) -> tuple[Any, ...]:
+        """Taps of the window, moments and slopes, for the gradient of SSIM; allocated at the first call."""
+        if self._structure is None:
+            shapes = structure_shapes(self.size).values()
+            self._structure = tuple(self._array(shape, dtype) for shape, dtype in shapes)
+        return self._structure
+
     def release(self) -> None:
         """Free all buffers."""
         for array in self.arrays:
             array.release()
         self.arrays = []
-        self._references = None
+        self._references = self._structure = None

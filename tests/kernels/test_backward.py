@@ -114,7 +114,7 @@ def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: 
     degrees = np.repeat([4, 1, 2, 3, 0], 13)
     planes["sh_rest"][:, degrees == 0] = 0
     renderer = Renderer(paired, large_budget(), background=BACKGROUND, antialiased=antialiased)
-    with Descent(renderer, planes, degrees, np.zeros(3), cameras[0]) as descent:
+    with Descent(renderer, planes, degrees, np.zeros(3), cameras[0], 0.01) as descent:
         for k, steps in enumerate((None, STEPS)):
             descent.put_on(steps)
             descent.step(cameras[k], padded_target(cameras[k], k), RATES)

@@ -119,7 +119,7 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
     )
     yield planes["sh_dc"]
     yield planes["sh_rest"]
-    with Descent(drawer, planes, np.full(source.count, 4), source.origin, camera) as descent:
+    with Descent(drawer, planes, np.full(source.count, 4), source.origin, camera, 0.01) as descent:
         descent.put_on(StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04,) * 4))
         descent.step(camera, references[0], {"means": 1e-2, **FIELD_RATES})
         yield from descent.planes().values()

@@ -21,7 +21,14 @@ from flexgs_edge.kernels.twins.dequantize import dequantize
 from flexgs_edge.kernels.twins.flip import flip_colours, flip_columns, flip_pair, flip_rows
 from flexgs_edge.kernels.twins.project import project
 from flexgs_edge.kernels.twins.score import residual, sh_costs, sh_residual
-from flexgs_edge.kernels.twins.similarity import ssim_columns, ssim_rows
+from flexgs_edge.kernels.twins.similarity import (
+    dssim_columns,
+    dssim_columns_back,
+    dssim_residual,
+    dssim_slopes,
+    ssim_columns,
+    ssim_rows,
+)
 from flexgs_edge.kernels.twins.sort import (
     exclusive_scan,
     sort_count,
@@ -55,6 +62,10 @@ TWINS: dict[str, Callable[..., None]] = {
     "flip_columns": flip_columns,
     "flip_rows": flip_rows,
     "flip_pair": flip_pair,
+    "dssim_columns": dssim_columns,
+    "dssim_slopes": dssim_slopes,
+    "dssim_columns_back": dssim_columns_back,
+    "dssim_residual": dssim_residual,
     "sh_costs": sh_costs,
     "sh_residual": sh_residual,
     "project_backward": project_backward,

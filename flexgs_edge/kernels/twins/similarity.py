@@ -8,6 +8,16 @@ from flexgs_edge.constants import SSIM_C1, SSIM_C2, SSIM_WINDOW
 from flexgs_edge.kernels.twins.arithmetic import f32
 
 
+def _columns(count: int, stride: int, taps: np.ndarray, a: np.ndarray, b: np.ndarray, moments: np.ndarray) -> None:
+    sums = moments[:, :count]
+    sums[:] = 0
+    for k, tap in enumerate(taps):
+        va, vb = (image[k * stride : k * stride + count] for image in (a, b))
+        ta, tb = tap * va, tap * vb
+        for moment, value in zip(sums, (ta, tb, ta * va, tb * vb, ta * vb), strict=True):
+            moment += value
+
+
 def ssim_columns(
     size: tuple[int, ...],
     count: int,
@@ -19,13 +29,7 @@ def ssim_columns(
     moments: np.ndarray,
 ) -> None:
     """Moments of a, b, a a, b b and a b, windowed along the columns ([5, plane])."""
-    sums = moments[:, :count]
-    sums[:] = 0
-    for k in range(SSIM_WINDOW):
-        va, vb = (image.reshape(-1)[k * stride : k * stride + count] for image in (a, b))
-        ta, tb = taps[k] * va, taps[k] * vb
-        for moment, value in zip(sums, (ta, tb, ta * va, tb * vb, ta * vb), strict=True):
-            moment += value
+    _columns(count, stride, taps, a.reshape(-1), b.reshape(-1), moments)
 
 
 def ssim_rows(
@@ -39,3 +43,98 @@ def ssim_rows(
     light = (f32(2) * ab + f32(SSIM_C1)) / (aa + bb + f32(SSIM_C1))
     both = (f32(2) * (m[4] - ab) + f32(SSIM_C2)) / ((m[2] - aa) + (m[3] - bb) + f32(SSIM_C2))
     similar[:] = light * both
+
+
+def _shown(values: np.ndarray) -> np.ndarray:
+    """Clamped to [0, 1]; NaN gives 0."""
+    above = np.where(values > 0, values, f32(0))
+    shown: np.ndarray = np.where(above < 1, above, f32(1))
+    return shown
+
+
+def dssim_columns(
+    launched: tuple[int, ...],
+    count: int,
+    first: int,
+    stride: int,
+    plane: int,
+    size: int,
+    taps: np.ndarray,
+    image: np.ndarray,
+    target: np.ndarray,
+    moments: np.ndarray,
+) -> None:
+    """Moments of a channel of `image` (a), of `target` (b), and of a a, b b and a b, windowed along the columns ([5, plane])."""
+    a = _shown(image.reshape(-1)[first:])
+    b = _shown(target.reshape(-1)[first:].astype(f32))
+    _columns(count, stride, taps[:size], a, b, moments)
+
+
+def dssim_slopes(
+    launched: tuple[int, ...],
+    count: int,
+    stride: int,
+    columns: int,
+    plane: int,
+    wide: int,
+    size: int,
+    taps: np.ndarray,
+    moments: np.ndarray,
+    slopes: np.ndarray,
+) -> None:
+    """What each window's SSIM gains by a change of its moments, named by the window's last pixel ([3, wide])."""
+    m = np.zeros((5, count), f32)
+    for k in range(size):
+        m += taps[k] * moments[:, k : k + count]
+    two, ab, aa, bb = f32(2), m[0] * m[1], m[0] * m[0], m[1] * m[1]
+    means, variances = aa + bb + f32(SSIM_C1), (m[2] - aa) + (m[3] - bb) + f32(SSIM_C2)
+    light = (two * ab + f32(SSIM_C1)) / means
+    both = (two * (m[4] - ab) + f32(SSIM_C2)) / variances
+    by_mean = both * (m[1] - light * m[0]) / means + light * (both * m[0] - m[1]) / variances
+    inside = np.arange(count) % stride < columns
+    at = (size - 1) * (stride + 1)
+    for plane_of, value in zip(
+        slopes, (two * by_mean, -(light * both / variances), two * light / variances), strict=True
+    ):
+        plane_of[at : at + count] = np.where(inside, value, f32(0))
+
+
+def dssim_columns_back(
+    launched: tuple[int, ...],
+    count: int,
+    stride: int,
+    plane: int,
+    wide: int,
+    size: int,
+    taps: np.ndarray,
+    slopes: np.ndarray,
+    sums: np.ndarray,
+) -> None:
+    """The slopes summed along the columns, over all windows that hold a pixel (the first three planes of `sums`)."""
+    back = sums[:3, :count]
+    back[:] = 0
+    for k in range(size):
+        back += taps[k] * slopes[:, k * stride : k * stride + count]
+
+
+def dssim_residual(
+    launched: tuple[int, ...],
+    count: int,
+    first: int,
+    plane: int,
+    factor: float,
+    size: int,
+    taps: np.ndarray,
+    sums: np.ndarray,
+    image: np.ndarray,
+    target: np.ndarray,
+    residual: np.ndarray,
+) -> None:
+    """Add the gradient of all windows' SSIM by `image`, times `factor`, to a channel of `residual`."""
+    by = np.zeros((3, count), f32)
+    for k in range(size):
+        by += taps[k] * sums[:3, k : k + count]
+    own = slice(first, first + count)
+    a, b = image.reshape(-1)[own], _shown(target.reshape(-1)[own].astype(f32))
+    slope = by[0] + f32(2) * a * by[1] + b * by[2]
+    residual.reshape(-1)[own] += np.where((a >= 0) & (a <= 1), f32(factor) * slope, f32(0))

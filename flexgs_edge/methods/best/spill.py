@@ -26,6 +26,7 @@ from flexgs_edge.render.fit import (
     reference_bytes,
     shapes_bytes,
     streamed_bytes,
+    structure_shapes,
     sum_bytes,
     view_bytes,
 )
@@ -118,11 +119,12 @@ def needed_bytes(
         source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep),
         sum_row_bytes(source.sh_degree),
     )
-    if distil_steps(options, len(scored)):
+    distils = distil_steps(options, len(scored))
+    if distils:
         # A descent holds all kept rows at once, with their gradients. That is the whole scene at most.
         sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))
         size += source.count * DESCENTS * stored_bytes(source.sh_degree)
-    return size, _least_bytes(renderer, source, largest_of(scored), sums)
+    return size, _least_bytes(renderer, source, largest_of(scored), sums, distils > 0)
 
 
 def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:
@@ -133,11 +135,12 @@ def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> i
     return view_bytes(size, shown) + reference_bytes(size) + sum_bytes(MOST_SUMS) * shown + chunk
 
 
-def _least_bytes(renderer: Renderer, source: SceneSource, camera: Camera, sum_bytes: int) -> int:
+def _least_bytes(renderer: Renderer, source: SceneSource, camera: Camera, sum_bytes: int, structure: bool) -> int:
     """Least bytes that a view of `source` needs, with its reference and sums of `sum_bytes` a row; nothing is loaded yet."""
     chunk = padded(min(renderer.fit.least_rows, source.count)) * streamed_bytes(source.sh_degree)
     size = view_size(renderer.backend, camera)
-    return view_bytes(size, source.count) + reference_bytes(size) + sum_bytes * source.count + chunk
+    target = reference_bytes(size) + (shapes_bytes(structure_shapes(size)) if structure else 0)
+    return view_bytes(size, source.count) + target + sum_bytes * source.count + chunk
 
 
 def stored_bytes(sh_degree: int) -> int:

@@ -20,7 +20,8 @@ from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.distil import FIELD_RATES, HELD, Schedule, distil
+from flexgs_edge.methods.best.refit.distil import FIELD_RATES, HELD, STRUCTURE, Schedule, distil
+from flexgs_edge.quality.ssim import ssims
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
@@ -74,7 +75,8 @@ class Workshop:
         return float(-10 * np.log10(np.mean(errors)))
 
     def distil(self, steps: int, grid: StepSizes | None = None, **words: Any) -> Planes:
-        return distil(self.kept, self.degrees, self.seen, Schedule(steps, **words), grid, rates=RATES)
+        structure = words.pop("structure", STRUCTURE)
+        return distil(self.kept, self.degrees, self.seen, Schedule(steps, **words), grid, RATES, structure)
 
     @property
     def seen(self) -> Original:
@@ -103,6 +105,18 @@ def test_a_descent_gets_closer_than_a_refit_of_colours(workshop: Workshop) -> No
     assert long > refit + 2 > before + 4 and long > short > before, (before, refit, short, long)
 
 
+def test_the_structural_term_keeps_structure(workshop: Workshop) -> None:
+    """A large one wins SSIM, and costs squared error."""
+    plain, structural = (workshop.distil(240, structure=weight) for weight in (0.0, 0.3))
+    assert workshop.fidelity(structural) < workshop.fidelity(plain)
+    found = []
+    for planes in (plain, structural):
+        with workshop.renderer.load(MemorySource(planes)) as scene:
+            images = [workshop.renderer.render(scene, camera) for camera in workshop.cameras]
+        found.append(np.mean(ssims(TwinBackend(large_budget()), list(zip(images, workshop.original, strict=True)))))
+    assert found[1] > found[0] + 0.003, found
+
+
 def test_rows_keep_their_places_and_degrees(workshop: Workshop) -> None:
     moved = workshop.distil(2)
     assert same_bits(moved["sh_rest"], workshop._without_higher(moved["sh_rest"]))
@@ -112,7 +126,7 @@ def test_rows_keep_their_places_and_degrees(workshop: Workshop) -> None:
         distance = abs(np.sort(moved[name], axis=0) - np.sort(workshop.kept[name], axis=0)).max()
         assert 0 < distance < 3 * RATES[name], name
     norms = np.square(moved["quats"]).sum(axis=0)
-    assert abs(norms - 1).max() < 0.01
+    assert abs(norms - 1).max() < 4 * RATES["quats"]
 
 
 def test_steps_on_the_grid_repair_it(workshop: Workshop) -> None:
@@ -201,7 +215,7 @@ def test_distilled_files_lose_less_in_the_same_bytes(project: Path, tmp_path: Pa
     plain = compress(project / "point_cloud.ply", tmp_path / "plain.fgs", distil=0, max_size=7500, **words)
     found = compress(project / "point_cloud.ply", tmp_path / "a.fgs", distil=60, max_size=7500, **words)
     again = compress(project / "point_cloud.ply", tmp_path / "b.fgs", distil=60, max_size=7500, **words)
-    assert found.size <= 7500 and abs(found.size - plain.size) < 0.01 * found.size
+    assert found.size <= 7500 and abs(found.size - plain.size) < 0.02 * found.size
     assert found.training_fidelity is not None and plain.training_fidelity is not None
     # Not of held-out views: of this scene they are worse at 8500 bytes than at 7500, whatever is done.
     assert found.training_fidelity > plain.training_fidelity + 0.5, (found.training_fidelity, plain.training_fidelity)

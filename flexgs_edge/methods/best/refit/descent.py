@@ -13,8 +13,8 @@ from flexgs_edge.errors import BudgetError
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.render.fit import sum_bytes
-from flexgs_edge.render.renderer import GRADIENT_SUMS, Renderer
+from flexgs_edge.render.fit import GRADIENT_SUMS, sum_bytes
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_mib
@@ -60,6 +60,8 @@ class Descent:
         [3] f64, as in `SceneSource`.
     camera : Camera
         The largest view, from which memory is planned.
+    structure : float
+        Weight of the structural term of the loss (`Renderer.gradient_sums`).
 
     Raises
     ------
@@ -74,15 +76,16 @@ class Descent:
         degrees: np.ndarray,
         origin: np.ndarray,
         camera: Camera,
+        structure: float = 0.0,
     ) -> None:
-        self.renderer, self.backend = renderer, renderer.backend
+        self.renderer, self.backend, self.structure = renderer, renderer.backend, structure
         source = MemorySource(planes, origin=origin, sh_count=int(np.flatnonzero(degrees).max(initial=-1)) + 1)
         self.count, self.widths = source.count, widths(source.sh_degree)
         self._parts: list[_Part] = []
         self._arrays: list[Any] = []
         # Planes of the last chunk with SH and of the last without are padded.
         size = descent_bytes(source.sh_degree) * (self.count + 2 * LANES)
-        self._scene = renderer.load(source, -(-size // max(self.count, 1)), references=True)
+        self._scene = renderer.load(source, -(-size // max(self.count, 1)), references=True, structure=structure > 0)
         try:
             renderer.render_planes(self._scene, camera)
             if not self._scene.resident:
@@ -109,8 +112,8 @@ class Descent:
             part.snap(self._steps)
 
     def differentiate(self, camera: Camera, target: np.ndarray) -> None:
-        """Compute gradients of the squared error of a view against `target` ([3, H, W] f16, as for `Renderer.residual_sums`)."""
-        sums = self.renderer.gradient_sums(self._scene, camera, target)
+        """Compute gradients of the loss of a view against `target` ([3, H, W] f16, as for `Renderer.residual_sums`)."""
+        sums = self.renderer.gradient_sums(self._scene, camera, target, self.structure)
         for part in self._parts:
             part.differentiate(self.renderer, sums)
 

@@ -16,20 +16,22 @@ from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.scene.rotations import canonical_axes
 from flexgs_edge.views.original import Original
 
-MEANS_RATE = 1.6e-4
-"""Largest change of a position in a step, as a share of the cameras' extent. The reference program begins with it too."""
+MEANS_RATE = 2.56e-4
+"""Largest change of a position in a step, as a share of the cameras' extent: 1.6 times the reference program's."""
 FIELD_RATES = {
-    "log_scales": 1.5e-2,
-    "quats": 3e-3,
-    "opacity_logits": 5e-2,
-    "sh_dc": 2.5e-3,
-    "sh_rest": 2.5e-3 / 20,
+    "log_scales": 2.4e-2,
+    "quats": 4.8e-3,
+    "opacity_logits": 8e-2,
+    "sh_dc": 8e-3,
+    "sh_rest": 1e-3,
 }
-"""Largest changes of the other values in a step. Those of scales and rotations are three times the reference program's, the
-others are equal. That program takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
-LAST = 0.1
-"""Rates at the end as a share of those at the beginning, once while geometry moves and once while it is held. They fall by the
-same factor at each step."""
+"""Largest changes of the other values in a step: 1.6 (opacities) to 8 times (SH) the reference program's. That program
+takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
+STRUCTURE = 0.02
+"""Weight of 1 - SSIM in the loss, in units of a squared error: docs/results/tuning.md#structure"""
+LAST, LAST_HELD = 0.06, 0.03
+"""Rates at the end as a share of those at the beginning, while geometry moves and while it is held. They fall by the same factor
+at each step. With more, the views that come last decide too much: docs/results/tuning.md#last"""
 ON_GRID, HOLDING = 0.5, 0.75
 """Share of the steps before views are drawn from values on their grids, and share before geometry is held there."""
 HELD = ("means", "log_scales", "quats")
@@ -84,6 +86,7 @@ def distil(
     schedule: Schedule,
     step_sizes: StepSizes | None = None,
     rates: dict[str, float] | None = None,
+    structure: float = STRUCTURE,
 ) -> dict[str, np.ndarray]:
     """Move all values of a scene towards the original's renders.
 
@@ -101,6 +104,8 @@ def distil(
         Of the grid that the values will be put on. The last steps then compensate for its rounding.
     rates : dict, optional
         Rates by field, in place of those of `rates_for`.
+    structure : float
+        Weight of 1 - SSIM in the loss, beside the squared error.
 
     Returns
     -------
@@ -120,17 +125,17 @@ def distil(
     ordered = {**planes, "quats": quats.astype(np.float32), "log_scales": log_scales}
     rows = np.argsort(degrees == 0, kind="stable")
     ordered = {name: np.ascontiguousarray(values[:, rows]) for name, values in ordered.items()}
-    with Descent(original.bench.renderer, ordered, degrees[rows], original.origin, largest) as descent:
+    with Descent(original.bench.renderer, ordered, degrees[rows], original.origin, largest, structure) as descent:
         order = schedule.order(len(cameras))
         parts = schedule.parts(step_sizes is not None)
         for place, part in enumerate(parts):
             held = HELD if place == 2 else ()
             # Rates fall while geometry moves, and fall again while it is held.
-            falling = part if held else range(parts[1].stop)
+            falling, last = (part, LAST_HELD) if held else (range(parts[1].stop), LAST)
             if place and len(part):
                 descent.put_on(step_sizes)
             for k in original.progress.track(part, f"distilling{' on the grid' if place else ''}", len(part)):
-                now = schedule.rate * LAST ** ((k - falling.start) / len(falling))
+                now = schedule.rate * last ** ((k - falling.start) / len(falling))
                 moving = {name: 0.0 if name in held else now * rate for name, rate in rates.items()}
                 descent.step(cameras[order[k]], original.references[order[k]], moving)
         moved = descent.planes()
