@@ -188,13 +188,6 @@ def mean_alone(target: Target) -> Target:
     return target.target if isinstance(target, Promised) else target
 
 
-def structure_alone(target: Target, measurement: Measurement) -> float:
-    """Excess of the bound on SSIM alone; minus infinity without one."""
-    parts = target.parts if isinstance(target, Promised) else ()
-    found = (part.excess(measurement) for part in parts if isinstance(part, MeanSsim))
-    return max((excess for excess in found if excess is not None), default=-math.inf)
-
-
 def in_the_way(target: Target, size: int, measurement: Measurement | None) -> str:
     """A sentence on the part of the promise that a point misses by most, and what would lift it; empty if there is none."""
     if not isinstance(target, Promised) or measurement is None:

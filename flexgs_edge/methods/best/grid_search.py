@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.goals.line import AIM, next_point
-from flexgs_edge.goals.promise import mean_alone, structure_alone
+from flexgs_edge.goals.promise import mean_alone
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.on_grid import lowered
@@ -141,20 +141,11 @@ class GridSearch(MultiplierSearch[GridScene]):
             return target.excess(self.size_of(grid), None)
         return mean_alone(target).excess(0, self.measure(values_of(grid, self.rounds.storage), estimate=True))
 
-    def _stricter(self, target: Target) -> float:
-        """How much more the bound on SSIM asks than the mean, judged by what pruning alone has done so far."""
-        if mean_alone(target) is target:
-            return 0.0
-        found = self.measure(self.rounds.snapshots[-1].planes)
-        return max(structure_alone(target, found) - mean_alone(target).excess(0, found), 0.0)
-
     def _aim(self, multiplier: float, steps: Sequence[Candidate], target: Target) -> float:
         """Probe for the multiplier whose candidate should be just below the target. A refit changes the excess alike nearby."""
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
         offset = math.log(self._refitted_part()) if self.refit and not by_size else 0.0
-        if not steps and not by_size:
-            offset += self._stricter(target)
         if steps:
             offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
             if self.refit and not by_size:
