@@ -1,4 +1,4 @@
-// Projects a chunk of Gaussians for one view: splat records, depth keys, and the number of tiles that each splat may touch.
+// Projects the blocks of a chunk that a view may show: splat records, depth keys, and the number of tiles that each splat may touch.
 // Twin: flexgs_edge.kernels.twins.project
 
 // The camera, 32 floats (see also sh.clh): R row-major 0-8, t 9-11, fx fy cx cy 12-15, near 16, Jacobian clamp x lo hi, y lo hi 17-20,
@@ -6,12 +6,14 @@
 #define CAM(k) ((FW)camera[k])
 
 __kernel void project(
-    const uint count,                       // rows of this chunk
+    const uint count,                       // rows of this part of the view
     const uint stride,                      // elements of a plane, a multiple of 16
-    const uint base,                        // row of the scene that the chunk starts at
+    const uint base,                        // row of the view that the part starts at
+    const uint first,                       // place of its first block in `blocks`
     const int degree,                       // SH degree of the chunk
     const int inria_extent,                 // 1: tiles of ceil(3 sigma), 0: the exact ellipse of alpha >= ALPHA_MIN
     const int antialiased,                  // 1: opacity times sqrt(det before / det after the dilation)
+    __global const uint *blocks,            // blocks of the chunk, ascending
     __global const float *camera,           // [32]
     __global const float *means,            // [3, stride] scene units, relative to the origin
     __global const float *cov,              // [6, stride] the covariance; antialiased: its factor (activate.cl)
@@ -22,15 +24,15 @@ __kernel void project(
     __global uint *keys,                    // [N] depth bits, CULLED where not shown
     __global uint *bounds)                  // [N] tiles of the splat's bounding box
 {
-  const size_t i = get_global_id(0) * W;
-  if (i >= count) return;
-  const size_t s = stride;
+  const size_t n = get_global_id(0) * W;
+  if (n >= count) return;
+  const size_t s = stride, i = row_of(blocks, first, n);
 
   FW px = LOADF(means, i), py = LOADF(means, s + i), pz = LOADF(means, 2 * s + i);
   FW z = fma(CAM(8), pz, fma(CAM(6), px, CAM(7) * py)) + CAM(11);
   FW level = LOADF(log2_opacity, i);
   IW shown = MASK(z > CAM(16)) & MASK(level > (FW)-1e30f);
-  shown &= MASK((LANE_INDEX + (IW)(int)i) < (IW)(int)count);
+  shown &= MASK((LANE_INDEX + (IW)(int)n) < (IW)(int)count);
 
   FW x = fma(CAM(2), pz, fma(CAM(0), px, CAM(1) * py)) + CAM(9);
   FW y = fma(CAM(5), pz, fma(CAM(3), px, CAM(4) * py)) + CAM(10);
@@ -159,8 +161,8 @@ __kernel void project(
   STOREF(z, key_lanes, 0);
   STOREF(tiles, bound_lanes, 0);
   STOREI(shown, shown_lanes, 0);
-  for (int l = 0; l < W && i + l < count; ++l) {
-    const size_t row = base + i + l;
+  for (int l = 0; l < W && n + l < count; ++l) {
+    const size_t row = base + n + l;
     keys[row] = shown_lanes[l] ? as_uint(key_lanes[l]) : (uint)CULLED;
     bounds[row] = shown_lanes[l] ? (uint)bound_lanes[l] : 0u;
     if (shown_lanes[l])

@@ -44,7 +44,7 @@ _BLEND = "uuiiii" + "fff" + "bbbbb"
 
 KERNELS: dict[str, KernelSpec] = {
     "activate": KernelSpec("activate.cl", "uibbbbb", "rows"),
-    "project": KernelSpec("project.cl", "uuuiiibbbbbbbbb", "rows"),
+    "project": KernelSpec("project.cl", "uuuuiiibbbbbbbbbb", "rows"),
     "sort_count_first": KernelSpec("sort.cl", "ubbbb"),
     "sort_scatter_first": KernelSpec("sort.cl", "ubbbb"),
     "sort_count": KernelSpec("sort.cl", "uubb"),
@@ -61,8 +61,8 @@ KERNELS: dict[str, KernelSpec] = {
     "blend_both": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", stats=4),
     "blend_backward": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", stats=5),
     "residual": KernelSpec("score.cl", "ubbb", "rows"),
-    "sh_costs": KernelSpec("score.cl", "uuuuuubbbbb", "rows"),
-    "sh_residual": KernelSpec("score.cl", "uuuuubbbb", "rows"),
+    "add_costs": KernelSpec("score.cl", "uuuuuuubbbbbb", "rows"),
+    "sh_residual": KernelSpec("score.cl", "uuuuuubbbbb", "rows"),
     "ssim_columns": KernelSpec("similarity.cl", "uuubbbb", "rows"),
     "ssim_rows": KernelSpec("similarity.cl", "uubbb", "rows"),
     "project_backward": KernelSpec("backward.cl", "uuuuibbbbbbbbbbb", "rows"),
@@ -129,8 +129,8 @@ class Backend(Protocol):
     def read(self, array: Any, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
         """Copy an array to the host, from the flat element `offset` on."""
 
-    def fill(self, array: Any, value: int) -> None:
-        """Set every element of an array."""
+    def fill(self, array: Any, value: int, count: int | None = None) -> None:
+        """Set every element of an array, or the first `count` of its rows."""
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
         """Run the kernel `name` over `size` rows, items or tiles."""
@@ -204,9 +204,9 @@ class TwinBackend:
         out.reshape(-1)[:] = array.data.reshape(-1)[offset : offset + out.size]
         return out
 
-    def fill(self, array: HostArray, value: int) -> None:
-        """Set every element of an array."""
-        array.data.fill(value)
+    def fill(self, array: HostArray, value: int, count: int | None = None) -> None:
+        """Set every element of an array, or the first `count` of its rows."""
+        array.data[:count].fill(value)
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
         """Run the twin `name`."""

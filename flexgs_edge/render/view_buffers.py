@@ -53,6 +53,7 @@ class ViewBuffers:
         self.arrays: list[Any] = []
         self._backend = backend
         self._references: tuple[Any, Any] | None = None
+        self._blocks: Any = None
         shapes = view_shapes(self.size, count)
         size = shapes_bytes(shapes)
         # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the
@@ -124,6 +125,15 @@ class ViewBuffers:
         _, width, height = self.key
         return covered / (width * height)
 
+    def blocks(self, count: int) -> Any:
+        """An array for the numbers of `count` blocks ([.] u32); kept until more are asked for."""
+        if self._blocks is None or self._blocks.shape[0] < count:
+            if self._blocks is not None:
+                self.arrays.remove(self._blocks)
+                self._blocks.release()
+            self._blocks = self._array((count,), np.uint32)
+        return self._blocks
+
     def reference_arrays(self) -> tuple[Any, Any]:
         """The target image (f16) and the residual against it (f32), allocated at the first call."""
         if self._references is None:
@@ -136,4 +146,4 @@ class ViewBuffers:
         for array in self.arrays:
             array.release()
         self.arrays = []
-        self._references = None
+        self._references = self._blocks = None

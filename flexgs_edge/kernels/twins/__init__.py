@@ -19,7 +19,7 @@ from flexgs_edge.kernels.twins.blend import (
 )
 from flexgs_edge.kernels.twins.dequantize import dequantize
 from flexgs_edge.kernels.twins.project import project
-from flexgs_edge.kernels.twins.score import residual, sh_costs, sh_residual
+from flexgs_edge.kernels.twins.score import add_costs, residual, sh_residual
 from flexgs_edge.kernels.twins.similarity import ssim_columns, ssim_rows
 from flexgs_edge.kernels.twins.sort import (
     exclusive_scan,
@@ -50,7 +50,7 @@ TWINS: dict[str, Callable[..., None]] = {
     "residual": residual,
     "ssim_columns": ssim_columns,
     "ssim_rows": ssim_rows,
-    "sh_costs": sh_costs,
+    "add_costs": add_costs,
     "sh_residual": sh_residual,
     "project_backward": project_backward,
     "adam": adam,

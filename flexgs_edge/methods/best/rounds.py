@@ -20,7 +20,7 @@ from flexgs_edge.methods.best.costs import (
     RemovalCosts,
     cost_parts,
     cost_sums,
-    moment_bytes,
+    cost_bytes,
     put_costs,
 )
 from flexgs_edge.methods.best.effort import LEAST_VIEWS
@@ -128,7 +128,7 @@ class PruneRounds:
         original, renderer, storage = self.original, self.original.bench.renderer, self.storage
         start = take_rows(planes, self.rows, storage)
         source = MemorySource(start, origin=original.origin)
-        sum_bytes_a_row = sum_bytes(2) + moment_bytes(source.sh_degree)
+        sum_bytes_a_row = sum_bytes(2) + cost_bytes(source.sh_degree)
         with renderer.load(source, sum_bytes_a_row, view_sums=2) as scene:
             self._parts = [self._measure(scene, some, keep=True) for some in self._views]
             in_turn = renderer.in_turn(scene, original.between)
@@ -245,7 +245,7 @@ class PruneRounds:
 
 def sum_row_bytes(sh_degree: int) -> int:
     """Bytes a row that one pass takes on the backend to measure costs and to refit colours."""
-    return sum_bytes(6) + moment_bytes(sh_degree) + normal_bytes(sh_degree)
+    return sum_bytes(6) + cost_bytes(sh_degree) + normal_bytes(sh_degree)
 
 
 def _hidden(planes: dict[str, np.ndarray], weight2: np.ndarray, share: float) -> np.ndarray:

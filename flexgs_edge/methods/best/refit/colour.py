@@ -10,16 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.constants import SH_C0
+from flexgs_edge.constants import SH_C0, SUM_LANES
 from flexgs_edge.memory.rows import copy_rows, put_rows, read_rows
-from flexgs_edge.render.chunks import Chunk
-from flexgs_edge.render.fit import sum_bytes
+from flexgs_edge.render.chunks import Chunk, ViewPart
+from flexgs_edge.render.fit import padded, sum_bytes
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.sums import Maker, ViewSums
 
+READ_ROWS = 1 << 16
+"""Rows of sums that are read from the backend at a time, a multiple of `SUM_LANES`."""
 RELAX_DC = 1.0
 RELAX_SH = 0.25
 """Steps of the constant and of SH, as shares of the SIRT step of the constant alone. All bands move at once. So a pixel seen
@@ -99,19 +101,26 @@ class _ChunkNormal:
 
     def __init__(self, renderer: Renderer, chunk: Chunk) -> None:
         self._renderer, self._count = renderer, chunk.count
-        self._array = renderer.backend.array(((chunk.degree + 1) ** 2, 4, chunk.stride), np.float32)
+        groups, functions = -(-chunk.stride // SUM_LANES), (chunk.degree + 1) ** 2
+        self._array = renderer.backend.array((groups, functions, 4, SUM_LANES), np.float32)
         renderer.backend.fill(self._array, 0)
 
-    def add(self, chunk: Chunk, sums: Any, base: int) -> None:
+    def add(self, chunk: Chunk, sums: Any, part: ViewPart) -> None:
         renderer = self._renderer
         renderer.backend.launch(
-            "sh_residual", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, sums.shape[1],
-            renderer.camera_array, chunk.means, sums, self._array,
+            "sh_residual", (padded(part.count),), part.count, chunk.stride, part.base, part.first, chunk.degree,
+            sums.shape[1], part.blocks, renderer.camera_array, chunk.means, sums, self._array,
         )  # fmt: skip
 
     def values(self) -> np.ndarray:
         """[K + 1, 4, n] f32 sums for each basis function: residuals of three channels, and weight."""
-        values: np.ndarray = self._renderer.backend.read(self._array)[:, :, : self._count]
+        _, functions, channels, _ = self._array.shape
+        values = np.empty((functions, channels, self._count), np.float32)
+        for at in range(0, self._count, READ_ROWS):
+            size = min(READ_ROWS, self._count - at)
+            held = np.empty((-(-size // SUM_LANES), functions, channels, SUM_LANES), np.float32)
+            self._renderer.backend.read(self._array, held, at * functions * channels)
+            values[..., at : at + size] = np.moveaxis(held, 0, 2).reshape(functions, channels, -1)[..., :size]
         return values
 
     def release(self) -> None:
