@@ -25,11 +25,20 @@ inline FW sum_value(__global const long *sums, uint planes, uint plane, size_t r
 
 // acc[i] += value in fixed point. Sums over views have the same bits in any order, unless they reach the 64-bit limits: they stay there.
 inline void add_long(__global long *acc, size_t i, FW value) {
-  value = fmin(fmax(value * (FW)FIXED_WEIGHT, (FW)-FIXED_LARGEST), (FW)FIXED_LARGEST);
+  value = smaller(larger(value * (FW)FIXED_WEIGHT, (FW)-FIXED_LARGEST), (FW)FIXED_LARGEST);
 #if W == 1
   acc[i] = add_sat(acc[i], convert_long_rtz(value));
 #else
-  CAT(vstore, W)(add_sat(CAT(vload, W)(0, acc + i), CAT(CAT(convert_long, W), _rtz)(value)), 0, acc + i);
+  // The built-in `add_sat` and conversions of wide vectors are slow: a call for each lane.
+  typedef CAT(long, W) LW;
+#ifdef HAS_CONVERT
+  const LW more = __builtin_convertvector(value, LW);
+#else
+  const LW more = CAT(CAT(convert_long, W), _rtz)(value);
+#endif
+  const LW old = CAT(vload, W)(0, acc + i), sum = CAT(as_long, W)(CAT(as_ulong, W)(old) + CAT(as_ulong, W)(more));
+  const LW most = (old >> 63) ^ (LW)LONG_MAX, beyond = ((old ^ sum) & (more ^ sum)) >> 63;
+  CAT(vstore, W)((sum & ~beyond) | (most & beyond), 0, acc + i);
 #endif
 }
 
