@@ -27,19 +27,16 @@ from flexgs_edge.render.fit import (
     GROWTH,
     GUESS,
     MOST_SUMS,
-    SORT_DIGIT_BITS,
-    SORT_DIGITS,
     SUM_BYTES,
     Fit,
     fits_whole,
     saves_bytes,
 )
-from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.render.statistics import Statistics, SumReader
+from flexgs_edge.render.tile_lists import list_tiles, sort_splats
 from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
 from flexgs_edge.scene.source import SceneSource
 
-SUM_ROWS = 1 << 18
-"""Rows of sums that are copied to the host at a time."""
 GRADIENT_SUMS = 9
 """Number of planes of `Renderer.gradient_sums`."""
 EXTENTS = ("exact", "inria")
@@ -117,8 +114,8 @@ class Renderer:
         self._buffers: ViewBuffers | None = None
         self._drawn: _View | None = None
         self._aimed: Any = None
-        self._words = np.empty(0, np.uint32)
         self._scene_rows = 0
+        self._reader = SumReader(backend)
 
     def aim(self, camera: Camera, origin: np.ndarray) -> None:
         """Write a camera's record into `camera_array` without drawing."""
@@ -227,7 +224,7 @@ class Renderer:
         found = self.view_rows
         rows = slice(None) if found is None else found
         statistics.hits[rows] += self.backend.read(hits, np.empty(view.count, np.uint32))
-        statistics.weights[rows] += self._read_view(sums, 1)[0].view(np.uint64)
+        statistics.weights[rows] += self._reader.planes(sums, view.count, 1)[0].view(np.uint64)
 
     def removal_sums(self, scene: DeviceScene, camera: Camera) -> Any:
         """Squared error of removing each row alone, and the sum of its squared weights, in one view.
@@ -308,29 +305,14 @@ class Renderer:
         return residual
 
     def read_sums(self, sums: Any, channels: int, count: int, first: int = 0) -> np.ndarray:
-        """Copy planes of the last view's sums to the host, from plane `first` on: [channels, count] i64, all rows of the scene."""
-        values, rows = self._read_view(sums, channels, first), self.view_rows
+        """[channels, count] i64, planes of the last view's sums from plane `first` on, for all rows of the scene."""
+        assert self._drawn is not None
+        values, rows = self._reader.planes(sums, self._drawn.count, channels, first), self.view_rows
         if rows is None:
             return values
         whole = np.zeros((channels, count), np.int64)
         whole[:, rows] = values
         return whole
-
-    def _read_view(self, sums: Any, channels: int, first: int = 0) -> np.ndarray:
-        """[channels, m] i64, planes of sums of the rows of the last view."""
-        assert self._drawn is not None
-        count, planes = self._drawn.count, sums.shape[1]
-        values = np.empty((channels, count), np.int64)
-        size = min(SUM_ROWS, count) * planes * 2
-        if self._words.size < size:
-            # Kept from view to view: fresh pages for each one take as long as the copy.
-            self._words = np.empty(size, np.uint32)
-        for base in range(0, count, SUM_ROWS):
-            rows = min(SUM_ROWS, count - base)
-            words = self._words[: rows * planes * 2].reshape(rows, planes, 2)
-            self.backend.read(sums, words, 2 * planes * base)
-            values[:, base : base + rows] = words.view(np.int64)[:, first : first + channels, 0].T
-        return values
 
     def _sum_arrays(self, scene: DeviceScene, view: _View, channels: int) -> tuple[Any, Any]:
         held, count = scene.statistics, view.buffers.rows or scene.count
@@ -358,15 +340,13 @@ class Renderer:
         else:
             parts = self._project(scene, camera, buffers, whole)
             count = sum(part.count for part in parts.values())
-        shown, pairs = self._sort(count, buffers)
+        shown, pairs = sort_splats(self.backend, buffers, count)
         self.splats_shown = shown
         batches = [(0, shown)] if pairs <= buffers.capacity else buffers.batches(shown)
         self._drawn = _View(buffers, camera, batches, count, parts)
         return self._drawn
 
-    def _project(
-        self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers, whole: bool
-    ) -> dict[int, ViewPart]:
+    def _project(self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers, whole: bool) -> dict[int, ViewPart]:
         """Project the blocks that the view may show, or all with `whole`, one after the other without gaps."""
         record = camera_record(camera, scene.origin, self.near)
         self.backend.write(buffers.camera, record)
@@ -413,7 +393,7 @@ class Renderer:
         backend, buffers, camera = self.backend, view.buffers, view.camera
         for index, (start, stop) in enumerate(view.batches):
             if not (again and len(view.batches) == 1):
-                self._list_tiles(buffers, camera, start, stop - start)
+                list_tiles(backend, buffers, camera, start, stop - start, self.inria_extent)
             backend.launch(
                 blend, (buffers.tiles,), buffers.tiles_x, backend.tile_blocks, camera.width, camera.height,
                 int(index > 0), int(finish and index == len(view.batches) - 1), *self.background,
@@ -449,41 +429,9 @@ class Renderer:
         size = view_size(self.backend, camera)
         return self.fit.whole_views and fits_whole(scene, size, self.budget.free, self.storage.spills)
 
-    def _sort(self, count: int, buffers: ViewBuffers) -> tuple[int, int]:
-        """Sort the shown splats by depth into `buffers.sorted[0]`; return their number and a bound on their pairs."""
-        backend, blocks = self.backend, self.backend.sort_blocks
-        (keys_a, ids_a), (keys_b, ids_b) = buffers.sorted
-        cells = SORT_DIGITS * blocks
-        backend.launch(
-            "sort_count_first", (blocks,), count, buffers.keys, buffers.bounds, buffers.digits, buffers.block_pairs
-        )
-        backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
-        backend.launch("sort_scatter_first", (blocks,), count, buffers.keys, buffers.digits, keys_a, ids_a)
-        shown = int(backend.read(buffers.digits, np.empty(1, np.uint32), cells)[0])
-        pairs = int(backend.read(buffers.block_pairs).sum())
-        for shift in (SORT_DIGIT_BITS, 2 * SORT_DIGIT_BITS):
-            backend.launch("sort_count", (blocks,), shown, shift, keys_a, buffers.digits)
-            backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
-            backend.launch("sort_scatter", (blocks,), shown, shift, keys_a, ids_a, buffers.digits, keys_b, ids_b)
-            (keys_a, ids_a), (keys_b, ids_b) = (keys_b, ids_b), (keys_a, ids_a)
-        return shown, pairs
-
-    def _list_tiles(self, buffers: ViewBuffers, camera: Camera, start: int, count: int) -> None:
-        backend, blocks = self.backend, self.backend.tile_blocks
-        ids = buffers.sorted[0][1]
-        backend.launch("tile_room", (blocks,), start, count, ids, buffers.bounds, buffers.pair_room)
-        backend.launch(
-            "tile_count", (blocks,), start, count, camera.width, camera.height, self.inria_extent, ids, buffers.records,
-            buffers.pair_room, buffers.drafts, buffers.ends,
-        )  # fmt: skip
-        backend.launch("exclusive_scan", (1,), buffers.tiles, blocks, buffers.ends)
-        backend.launch(
-            "tile_scatter", (blocks,), buffers.tiles, buffers.pair_room, buffers.drafts, buffers.ends, buffers.pairs
-        )
-
     def release(self) -> None:
         """Free the view's buffers; the next view allocates them again."""
-        self._words = np.empty(0, np.uint32)
+        self._reader.release()
         if self._buffers is not None:
             self._buffers.release()
             self._buffers = self._drawn = None

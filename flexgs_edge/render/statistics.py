@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from flexgs_edge.constants import FIXED_WEIGHT
+from flexgs_edge.kernels.backend import Backend
+
+SUM_ROWS = 1 << 18
+"""Rows of sums that are copied to the host at a time."""
 
 
 @dataclass
@@ -34,3 +39,29 @@ class Statistics:
     def weight_sums(self) -> np.ndarray:
         """[N] f64, sum of alpha T over pixels."""
         return self.weights / FIXED_WEIGHT
+
+
+class SumReader:
+    """Copies sums of views to the host."""
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend = backend
+        self._words = np.empty(0, np.uint32)
+        """Kept from view to view: fresh pages for each one take as long as the copy."""
+
+    def planes(self, sums: Any, count: int, channels: int, first: int = 0) -> np.ndarray:
+        """Planes of the first `count` rows of `sums` ([., planes, 2] u32), from plane `first` on: [channels, count] i64."""
+        planes, values = sums.shape[1], np.empty((channels, count), np.int64)
+        size = min(SUM_ROWS, count) * planes * 2
+        if self._words.size < size:
+            self._words = np.empty(size, np.uint32)
+        for base in range(0, count, SUM_ROWS):
+            rows = min(SUM_ROWS, count - base)
+            words = self._words[: rows * planes * 2].reshape(rows, planes, 2)
+            self._backend.read(sums, words, 2 * planes * base)
+            values[:, base : base + rows] = words.view(np.int64)[:, first : first + channels, 0].T
+        return values
+
+    def release(self) -> None:
+        """Free the memory that is kept."""
+        self._words = np.empty(0, np.uint32)

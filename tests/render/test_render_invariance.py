@@ -18,7 +18,7 @@ from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import Backend, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.methods.best.costs import measure_costs, cost_bytes
+from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
 from flexgs_edge.packed.quantize import QuantizedScene
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.render.renderer import Renderer

@@ -180,9 +180,7 @@ class _ChunkCosts:
     def __init__(self, renderer: Renderer, degree: int, first: int, chunk: Chunk) -> None:
         self._renderer, self._first, self._count = renderer, first, chunk.count
         self._degree = min(degree, chunk.degree)
-        self._array = renderer.backend.array(
-            (-(-chunk.stride // SUM_LANES), 4 + 4 * self._degree, SUM_LANES), np.int64
-        )
+        self._array = renderer.backend.array((-(-chunk.stride // SUM_LANES), 4 + 4 * self._degree, SUM_LANES), np.int64)
         renderer.backend.fill(self._array, 0)
 
     def add(self, chunk: Chunk, sums: Any, part: ViewPart) -> None:

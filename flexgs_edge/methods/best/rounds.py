@@ -18,9 +18,9 @@ from flexgs_edge.methods.best.costs import (
     PART_NAMES,
     CostParts,
     RemovalCosts,
+    cost_bytes,
     cost_parts,
     cost_sums,
-    cost_bytes,
     put_costs,
 )
 from flexgs_edge.methods.best.effort import LEAST_VIEWS

@@ -9,7 +9,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.order import covering_order, farthest_order
-from flexgs_edge.methods.best.costs import measure_costs, cost_bytes
+from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
 from flexgs_edge.methods.best.poses import some_positions
 from flexgs_edge.methods.paper.evaluator import SceneEvaluator
 from flexgs_edge.methods.paper.prune import order_from_scores
