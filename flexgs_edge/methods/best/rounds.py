@@ -35,6 +35,14 @@ from flexgs_edge.views.sums import ViewSums
 PARTS = 2
 """Each pruning round measures one of this many interleaved sets of cameras and reuses the sums of the others. One set
 is slower, four make files larger: docs/results/tuning.md#parts"""
+MOST_PARTS = 4
+PART_VIEWS = 48
+"""Many cameras make up to `MOST_PARTS` sets, if each has this many: docs/results/tuning.md#part_views"""
+
+
+def parts_of(views: int) -> int:
+    """How many interleaved sets so many scored poses make."""
+    return max(min(PARTS, views // LEAST_VIEWS), min(MOST_PARTS, views // PART_VIEWS), 1)
 
 
 @dataclass
@@ -113,7 +121,7 @@ class PruneRounds:
         self.original, self.rows, self.refit, self.checkpoint = original, rows, refit, checkpoint
         self.storage = original.bench.renderer.storage
         cameras = original.cameras
-        count = max(min(PARTS, len(cameras) // LEAST_VIEWS), 1)
+        count = parts_of(len(cameras))
         self._views = [range(first, len(cameras), count) for first in range(count)]
         self._parts: list[CostParts] = []
         self.snapshots: list[Snapshot] = []

@@ -22,6 +22,8 @@ from flexgs_edge.views.sums import Maker, ViewSums
 
 READ_ROWS = 1 << 16
 """Rows of sums that are read from the backend at a time, a multiple of `SUM_LANES`."""
+ROUND_VIEWS = 96
+"""Least poses of a round: docs/results/tuning.md#round_views"""
 RELAX_DC = 1.0
 RELAX_SH = 0.25
 """Steps of the constant and of SH, as shares of the SIRT step of the constant alone. All bands move at once. So a pixel seen
@@ -51,7 +53,8 @@ def refit_colours(
     original : Original
         The scored poses and the original's renders.
     rounds : int
-        How often we look at every pose. Each round takes about as long as rendering all poses.
+        How often we look at every pose. Each round takes about as long as rendering all poses. With many poses, each round
+        looks at an interleaved set of them: as many sets as have `ROUND_VIEWS` each.
     bands : bool
         Refit the SH above degree 0 too (default). Otherwise only the constant moves.
     subsets : int
@@ -65,8 +68,12 @@ def refit_colours(
     bench, cameras = original.bench, original.cameras
     renderer, storage = bench.renderer, bench.renderer.storage
     planes = {**planes, "sh_dc": storage.copy(planes["sh_dc"]), "sh_rest": storage.copy(planes["sh_rest"])}
-    subsets = max(min(subsets, len(cameras)), 1)
-    parts = [range(first, len(cameras), subsets) for _ in range(rounds) for first in range(subsets)]
+    thinned = max(len(cameras) // ROUND_VIEWS, 1)
+    parts = []
+    for turn in range(rounds):
+        seen = range(turn % thinned, len(cameras), thinned)
+        steps = max(min(subsets, len(seen)), 1)
+        parts += [seen[first::steps] for first in range(steps)]
     source = MemorySource(planes, origin=original.origin)
     sum_bytes_a_row = sum_bytes(4) + normal_bytes(source.sh_degree)
     with renderer.load(source, sum_bytes_a_row, references=True, view_sums=4) as scene:
