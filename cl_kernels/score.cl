@@ -81,7 +81,6 @@ __kernel void add_costs(
   for (uint k = 0; k < 2; ++k)
     for (int l = 0; l < there; ++l) {
       const ulong value = (ulong)sums[(base + n + l) * planes + plane + k];
-      if (value == 0) continue;
       __global ulong *low = (__global ulong *)costs + SUM_AT(all_planes, 2 * k, i + l);
       const ulong sum = *low + value;
       *low = sum;

@@ -84,6 +84,7 @@ class Array(Protocol):
     """An array in the backend's memory."""
 
     shape: tuple[int, ...]
+    dtype: np.dtype[Any]
     nbytes: int
 
     def release(self) -> None:
@@ -144,7 +145,8 @@ class HostArray:
 
     def __init__(self, budget: MemoryBudget, shape: tuple[int, ...], dtype: Any) -> None:
         self.shape = shape
-        self.nbytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        self.dtype = np.dtype(dtype)
+        self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
         self._budget = budget
         budget.take("an array", self.nbytes)
         self.data = np.zeros(shape, dtype)

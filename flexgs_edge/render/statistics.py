@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from flexgs_edge.constants import FIXED_WEIGHT
+from flexgs_edge.constants import FIXED_WEIGHT, SUM_LANES
 from flexgs_edge.kernels.backend import Backend
 
 SUM_ROWS = 1 << 18
 """Rows of sums that are copied to the host at a time."""
+GROUP_ROWS = 1 << 12
+"""Rows of sums over views that are copied at a time, a multiple of `SUM_LANES`: few enough for a core's cache."""
 
 
 @dataclass
@@ -39,6 +42,35 @@ class Statistics:
     def weight_sums(self) -> np.ndarray:
         """[N] f64, sum of alpha T over pixels."""
         return self.weights / FIXED_WEIGHT
+
+
+def planes_of(backend: Backend, sums: Any, count: int) -> Iterator[tuple[slice, np.ndarray]]:
+    """Read sums over views, which lie in groups, part by part.
+
+    Parameters
+    ----------
+    sums : array of the backend
+        [groups, ..., SUM_LANES], sums of a group of rows for each plane.
+    count : int
+        How many rows to read.
+
+    Yields
+    ------
+    rows : slice
+    planes : np.ndarray
+        [planes, rows], valid until the next step.
+    """
+    planes = int(np.prod(sums.shape[1:-1]))
+    lanes = np.dtype((np.void, SUM_LANES * np.dtype(sums.dtype).itemsize))
+    groups = min(GROUP_ROWS // SUM_LANES, sums.shape[0])
+    held, turned = np.empty((groups, planes, SUM_LANES), sums.dtype), np.empty((planes, groups, SUM_LANES), sums.dtype)
+    for first in range(0, count, GROUP_ROWS):
+        rows = slice(first, min(first + GROUP_ROWS, count))
+        some = -(-(rows.stop - first) // SUM_LANES)
+        backend.read(sums, held[:some], first * planes)
+        # Lanes that are copied as one element are copied much faster.
+        turned.view(lanes)[:, :some, 0] = held.view(lanes)[:some, :, 0].T
+        yield rows, turned.reshape(planes, -1)[:, : rows.stop - first]
 
 
 class SumReader:

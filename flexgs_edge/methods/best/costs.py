@@ -22,13 +22,12 @@ from flexgs_edge.render.chunks import Chunk, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import padded
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.statistics import planes_of
 from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.sums import Maker, ViewSums
 
 MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
 """Sums of moments saturate here. Only colours of some thousands in every view reach it."""
-READ_ROWS = 1 << 16
-"""Rows of sums that are read from the backend at a time, a multiple of `SUM_LANES`."""
 
 
 @dataclass
@@ -130,8 +129,8 @@ def cost_parts(levels: int, count: int, storage: Storage) -> CostParts:
 
 def put_costs(parts: CostParts, rows: slice, sums: Any) -> None:
     """Put the finished sums of a chunk (from `cost_sums`) into their rows."""
-    for at, values in sums.values():
-        some = slice(rows.start + at, rows.start + at + values.shape[1])
+    for part, values in sums.values():
+        some = slice(rows.start + part.start, rows.start + part.stop)
         wide = values[:4].view(np.uint64)
         for own, low, high in ((parts.removal, wide[0], wide[1]), (parts.weight2, wide[2], wide[3])):
             put_rows(own, some, (high * 2.0**64 + low) / FIXED_ERROR)
@@ -190,14 +189,9 @@ class _ChunkCosts:
             self._array,
         )  # fmt: skip
 
-    def values(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield the sums part by part: the first row of a part within the chunk, and its planes ([4 + 4 degree, n] i64)."""
-        planes = self._array.shape[1]
-        for at in range(0, self._count, READ_ROWS):
-            size = min(READ_ROWS, self._count - at)
-            held = np.empty((-(-size // SUM_LANES), planes, SUM_LANES), np.int64)
-            self._renderer.backend.read(self._array, held, at * planes)
-            yield at, np.moveaxis(held, 1, 0).reshape(planes, -1)[:, :size]
+    def values(self) -> Iterator[tuple[slice, np.ndarray]]:
+        """Yield rows of the chunk and their sums ([4 + 4 degree, rows] i64), valid until the next step."""
+        return planes_of(self._renderer.backend, self._array, self._count)
 
     def release(self) -> None:
         if self._array is not None:

@@ -15,13 +15,12 @@ from flexgs_edge.memory.rows import copy_rows, put_rows, read_rows
 from flexgs_edge.render.chunks import Chunk, ViewPart
 from flexgs_edge.render.fit import padded, sum_bytes
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.statistics import planes_of
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.sums import Maker, ViewSums
 
-READ_ROWS = 1 << 16
-"""Rows of sums that are read from the backend at a time, a multiple of `SUM_LANES`."""
 ROUND_VIEWS = 96
 """Least poses of a round: docs/results/tuning.md#round_views"""
 RELAX_DC = 1.0
@@ -121,13 +120,9 @@ class _ChunkNormal:
 
     def values(self) -> np.ndarray:
         """[K + 1, 4, n] f32 sums for each basis function: residuals of three channels, and weight."""
-        _, functions, channels, _ = self._array.shape
-        values = np.empty((functions, channels, self._count), np.float32)
-        for at in range(0, self._count, READ_ROWS):
-            size = min(READ_ROWS, self._count - at)
-            held = np.empty((-(-size // SUM_LANES), functions, channels, SUM_LANES), np.float32)
-            self._renderer.backend.read(self._array, held, at * functions * channels)
-            values[..., at : at + size] = np.moveaxis(held, 0, 2).reshape(functions, channels, -1)[..., :size]
+        values = np.empty((*self._array.shape[1:3], self._count), np.float32)
+        for rows, planes in planes_of(self._renderer.backend, self._array, self._count):
+            values[..., rows] = planes.reshape(*values.shape[:2], -1)
         return values
 
     def release(self) -> None:
