@@ -53,7 +53,6 @@ class ViewBuffers:
         self.arrays: list[Any] = []
         self._backend = backend
         self._references: tuple[Any, Any] | None = None
-        self._blocks: Any = None
         shapes = view_shapes(self.size, count)
         size = shapes_bytes(shapes)
         # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the
@@ -90,6 +89,7 @@ class ViewBuffers:
             self.release()
             raise
         self.camera, self.records, self.keys, self.bounds = (made[n] for n in ("camera", "records", "keys", "bounds"))
+        self._blocks: Any = made["blocks"]
         self.sorted = [(made["keys_a"], made["ids_a"]), (made["keys_b"], made["ids_b"])]
         self.digits, self.block_pairs = made["digits"], made["block_pairs"]
         self.pair_room, self.ends = made["pair_room"], made["ends"]
@@ -127,10 +127,9 @@ class ViewBuffers:
 
     def blocks(self, count: int) -> Any:
         """An array for the numbers of `count` blocks ([.] u32); kept until more are asked for."""
-        if self._blocks is None or self._blocks.shape[0] < count:
-            if self._blocks is not None:
-                self.arrays.remove(self._blocks)
-                self._blocks.release()
+        if self._blocks.shape[0] < count:
+            self.arrays.remove(self._blocks)
+            self._blocks.release()
             self._blocks = self._array((count,), np.uint32)
         return self._blocks
 
@@ -146,4 +145,4 @@ class ViewBuffers:
         for array in self.arrays:
             array.release()
         self.arrays = []
-        self._references = self._blocks = None
+        self._references = None
