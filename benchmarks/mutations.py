@@ -122,9 +122,11 @@ MUTATIONS = (
     constant("EXTENT_SLACK", "-0.01f", "ellipse too small"),
     constant("EXP2_POLY_5", "0.0f", "exp2 of degree 4"),
     constant("SIGMA_RADIUS_INRIA", "2.5f", "2.5 sigma for --extent inria"),
-    Mutation("no Jacobian clamp in x", "project.cl", "uc = fmin(fmax(u, CAM(17)), CAM(18))", "uc = u"),
-    Mutation("no Jacobian clamp in y", "project.cl", "vc = fmin(fmax(v, CAM(19)), CAM(20))", "vc = v"),
-    Mutation("clamp moved by half a pixel", "project.cl", "fmax(u, CAM(17))", "fmax(u, CAM(17) + (FW)0.5f / CAM(12))"),
+    Mutation("no Jacobian clamp in x", "project.cl", "uc = smaller(larger(u, CAM(17)), CAM(18))", "uc = u"),
+    Mutation("no Jacobian clamp in y", "project.cl", "vc = smaller(larger(v, CAM(19)), CAM(20))", "vc = v"),
+    Mutation(
+        "clamp moved by half a pixel", "project.cl", "larger(u, CAM(17))", "larger(u, CAM(17) + (FW)0.5f / CAM(12))"
+    ),
     Mutation("principal point off by half a pixel", "project.cl", "u, CAM(14))", "u, CAM(14) + (FW)0.5f)"),
     Mutation("focal length of x used for y", "project.cl", "fma(CAM(13), v", "fma(CAM(12), v"),
     Mutation("sign in SH of degree 1", "sh.clh", "BAND(0, (FW)-SH_C1 * y)", "BAND(0, (FW)SH_C1 * y)"),
@@ -132,7 +134,7 @@ MUTATIONS = (
     Mutation(
         "SH looked up in the opposite direction", "sh.clh", "dx = px - (FW)camera[21]", "dx = (FW)camera[21] - px"
     ),
-    Mutation("colours below 0 kept", "project.cl", "= fmax(colour + (FW)0.5f, (FW)0.0f)", "= colour + (FW)0.5f"),
+    Mutation("colours below 0 kept", "project.cl", "= larger(colour + (FW)0.5f, (FW)0.0f)", "= colour + (FW)0.5f"),
     Mutation("depth order reversed", "project.cl", "as_uint(key_lanes[l]) :", "~as_uint(key_lanes[l]) :"),
     Mutation(
         "ties of depth in reversed order",

@@ -1,17 +1,22 @@
-// Projects a chunk of Gaussians for one view: splat records, depth keys, and the number of tiles that each splat may touch.
+// Projects the blocks of a chunk that a view may show: splat records, depth keys, and the number of tiles that each splat may touch.
 // Twin: flexgs_edge.kernels.twins.project
 
 // The camera, 32 floats (see also sh.clh): R row-major 0-8, t 9-11, fx fy cx cy 12-15, near 16, Jacobian clamp x lo hi, y lo hi 17-20,
 // position 21-23, width height 24-25, dilation 26.
 #define CAM(k) ((FW)camera[k])
 
+// A pixel position clamped to a little beyond the picture, so that `round_up` and `round_down` are exact. Tiles are clamped later.
+inline FW near_image(FW at, FW size) { return smaller(larger(at, (FW)(-2.0f * TILE)), size + (FW)(2.0f * TILE)); }
+
 __kernel void project(
-    const uint count,                       // rows of this chunk
+    const uint count,                       // rows of this part of the view
     const uint stride,                      // elements of a plane, a multiple of 16
-    const uint base,                        // row of the scene that the chunk starts at
+    const uint base,                        // row of the view that the part starts at
+    const uint first,                       // place of its first block in `blocks`
     const int degree,                       // SH degree of the chunk
     const int inria_extent,                 // 1: tiles of ceil(3 sigma), 0: the exact ellipse of alpha >= ALPHA_MIN
     const int antialiased,                  // 1: opacity times sqrt(det before / det after the dilation)
+    __global const uint *blocks,            // blocks of the chunk, ascending
     __global const float *camera,           // [32]
     __global const float *means,            // [3, stride] scene units, relative to the origin
     __global const float *cov,              // [6, stride] the covariance; antialiased: its factor (activate.cl)
@@ -22,22 +27,22 @@ __kernel void project(
     __global uint *keys,                    // [N] depth bits, CULLED where not shown
     __global uint *bounds)                  // [N] tiles of the splat's bounding box
 {
-  const size_t i = get_global_id(0) * W;
-  if (i >= count) return;
-  const size_t s = stride;
+  const size_t n = get_global_id(0) * W;
+  if (n >= count) return;
+  const size_t s = stride, i = row_of(blocks, first, n);
 
   FW px = LOADF(means, i), py = LOADF(means, s + i), pz = LOADF(means, 2 * s + i);
   FW z = fma(CAM(8), pz, fma(CAM(6), px, CAM(7) * py)) + CAM(11);
   FW level = LOADF(log2_opacity, i);
   IW shown = MASK(z > CAM(16)) & MASK(level > (FW)-1e30f);
-  shown &= MASK((LANE_INDEX + (IW)(int)i) < (IW)(int)count);
+  shown &= MASK((LANE_INDEX + (IW)(int)n) < (IW)(int)count);
 
   FW x = fma(CAM(2), pz, fma(CAM(0), px, CAM(1) * py)) + CAM(9);
   FW y = fma(CAM(5), pz, fma(CAM(3), px, CAM(4) * py)) + CAM(10);
   FW iz = (FW)1.0f / z;
   FW u = x * iz, v = y * iz;
   FW mx = fma(CAM(12), u, CAM(14)), my = fma(CAM(13), v, CAM(15));
-  FW uc = fmin(fmax(u, CAM(17)), CAM(18)), vc = fmin(fmax(v, CAM(19)), CAM(20));
+  FW uc = smaller(larger(u, CAM(17)), CAM(18)), vc = smaller(larger(v, CAM(19)), CAM(20));
   FW j00 = CAM(12) * iz, j02 = -(j00 * uc);
   FW j11 = CAM(13) * iz, j12 = -(j11 * vc);
   FW t00 = fma(j02, CAM(6), j00 * CAM(0)), t01 = fma(j02, CAM(7), j00 * CAM(1)), t02 = fma(j02, CAM(8), j00 * CAM(2));
@@ -79,7 +84,7 @@ __kernel void project(
   }
 
   FW level2 = (level + (FW)(LOG2_255 + EXTENT_SLACK)) * (FW)(2.0f / LOG2_E);  // the ellipse's q, natural units
-  FW t2 = fmax(level2, (FW)0.0f);
+  FW t2 = larger(level2, (FW)0.0f);
   FW half_width = sqrt(t2 * a), half_height = sqrt(t2 * c);
   FW width = CAM(24), height = CAM(25);
   FW reach_x = half_width, reach_y = half_height, radius = (FW)0.0f;
@@ -124,16 +129,16 @@ __kernel void project(
     // Twice the slack of the spans in tiles.cl, since this bound sets the size of the pair buffer.
     FW sx = (FW)2.0f * fma(half_width, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
     FW sy = fma(half_height, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
-    x0 = floor(ceil(mx - half_width - sx) * (FW)(1.0f / TILE));
-    x1 = floor(floor(mx + half_width + sx) * (FW)(1.0f / TILE));
-    y0 = floor(ceil(my - half_height - sy) * (FW)(1.0f / TILE));
-    y1 = floor(floor(my + half_height + sy) * (FW)(1.0f / TILE));
+    x0 = round_down(round_up(near_image(mx - half_width - sx, width)) * (FW)(1.0f / TILE));
+    x1 = round_down(round_down(near_image(mx + half_width + sx, width)) * (FW)(1.0f / TILE));
+    y0 = round_down(round_up(near_image(my - half_height - sy, height)) * (FW)(1.0f / TILE));
+    y1 = round_down(round_down(near_image(my + half_height + sy, height)) * (FW)(1.0f / TILE));
   }
-  FW last_x = floor((width - (FW)1.0f) * (FW)(1.0f / TILE)), last_y = floor((height - (FW)1.0f) * (FW)(1.0f / TILE));
-  x0 = fmax(x0, (FW)0.0f);
-  y0 = fmax(y0, (FW)0.0f);
-  x1 = fmin(x1, last_x);
-  y1 = fmin(y1, last_y);
+  FW last_x = round_down((width - (FW)1.0f) * (FW)(1.0f / TILE)), last_y = round_down((height - (FW)1.0f) * (FW)(1.0f / TILE));
+  x0 = larger(x0, (FW)0.0f);
+  y0 = larger(y0, (FW)0.0f);
+  x1 = smaller(x1, last_x);
+  y1 = smaller(y1, last_y);
   shown &= MASK(x1 >= x0) & MASK(y1 >= y0);
   FW tiles = (x1 - x0 + (FW)1.0f) * (y1 - y0 + (FW)1.0f);
 
@@ -146,7 +151,7 @@ __kernel void project(
     for (int channel = 0; channel < 3; ++channel) {
       FW colour = (FW)SH_C0 * LOADF(sh_dc, channel * s + i);
       for (int k = 0; k < all; ++k) colour = fma(basis[k], LOADF(sh_rest, (size_t)(channel * all + k) * s + i), colour);
-      out[6 + channel] = fmax(colour + (FW)0.5f, (FW)0.0f);
+      out[6 + channel] = larger(colour + (FW)0.5f, (FW)0.0f);
     }
   } else {
     out[6] = out[7] = out[8] = (FW)0.0f;
@@ -159,8 +164,8 @@ __kernel void project(
   STOREF(z, key_lanes, 0);
   STOREF(tiles, bound_lanes, 0);
   STOREI(shown, shown_lanes, 0);
-  for (int l = 0; l < W && i + l < count; ++l) {
-    const size_t row = base + i + l;
+  for (int l = 0; l < W && n + l < count; ++l) {
+    const size_t row = base + n + l;
     keys[row] = shown_lanes[l] ? as_uint(key_lanes[l]) : (uint)CULLED;
     bounds[row] = shown_lanes[l] ? (uint)bound_lanes[l] : 0u;
     if (shown_lanes[l])

@@ -18,6 +18,12 @@ lanes draws one block: small splats leave fewer lanes idle than rows of 16 pixel
 LANES: Final = 64
 """Planes on the device are padded to a multiple of this many elements. Vectors then never read past the end, and
 work-groups of 64 fit a GPU."""
+ROW_BLOCK: Final = 256
+"""Rows of a block. A view skips the blocks that it cannot show, with all that is done for each row: a multiple of LANES,
+so that vectors and work-groups stay within a block: docs/results/tuning.md#row_block"""
+SUM_LANES: Final = 16
+"""Sums over views lie in groups of so many rows, all planes of a group side by side. Planes of all rows would be more
+streams than a processor fetches ahead: docs/results/tuning.md#sum_lanes"""
 
 # --- projection (reference rasteriser) --------------------------------------------------------
 DEFAULT_NEAR: Final = 0.2

@@ -44,7 +44,7 @@ _BLEND = "uuiiii" + "fff" + "bbbbb"
 
 KERNELS: dict[str, KernelSpec] = {
     "activate": KernelSpec("activate.cl", "uibbbbb", "rows"),
-    "project": KernelSpec("project.cl", "uuuiiibbbbbbbbb", "rows"),
+    "project": KernelSpec("project.cl", "uuuuiiibbbbbbbbbb", "rows"),
     "sort_count_first": KernelSpec("sort.cl", "ubbbb"),
     "sort_scatter_first": KernelSpec("sort.cl", "ubbbb"),
     "sort_count": KernelSpec("sort.cl", "uubb"),
@@ -61,8 +61,8 @@ KERNELS: dict[str, KernelSpec] = {
     "blend_both": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", stats=4),
     "blend_backward": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", stats=5),
     "residual": KernelSpec("score.cl", "ubbb", "rows"),
-    "sh_costs": KernelSpec("score.cl", "uuuuuubbbbb", "rows"),
-    "sh_residual": KernelSpec("score.cl", "uuuuubbbb", "rows"),
+    "add_costs": KernelSpec("score.cl", "uuuuuuubbbbbb", "rows"),
+    "sh_residual": KernelSpec("score.cl", "uuuuuubbbbb", "rows"),
     "ssim_columns": KernelSpec("similarity.cl", "uuubbbb", "rows"),
     "ssim_rows": KernelSpec("similarity.cl", "uubbb", "rows"),
     "flip_colours": KernelSpec("flip.cl", "uub", "rows"),
@@ -92,6 +92,7 @@ class Array(Protocol):
     """An array in the backend's memory."""
 
     shape: tuple[int, ...]
+    dtype: np.dtype[Any]
     nbytes: int
 
     def release(self) -> None:
@@ -137,8 +138,8 @@ class Backend(Protocol):
     def read(self, array: Any, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
         """Copy an array to the host, from the flat element `offset` on."""
 
-    def fill(self, array: Any, value: int) -> None:
-        """Set every element of an array."""
+    def fill(self, array: Any, value: int, count: int | None = None) -> None:
+        """Set every element of an array, or the first `count` of its rows."""
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
         """Run the kernel `name` over `size` rows, items or tiles."""
@@ -152,7 +153,8 @@ class HostArray:
 
     def __init__(self, budget: MemoryBudget, shape: tuple[int, ...], dtype: Any) -> None:
         self.shape = shape
-        self.nbytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        self.dtype = np.dtype(dtype)
+        self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
         self._budget = budget
         budget.take("an array", self.nbytes)
         self.data = np.zeros(shape, dtype)
@@ -212,9 +214,9 @@ class TwinBackend:
         out.reshape(-1)[:] = array.data.reshape(-1)[offset : offset + out.size]
         return out
 
-    def fill(self, array: HostArray, value: int) -> None:
-        """Set every element of an array."""
-        array.data.fill(value)
+    def fill(self, array: HostArray, value: int, count: int | None = None) -> None:
+        """Set every element of an array, or the first `count` of its rows."""
+        array.data[:count].fill(value)
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
         """Run the twin `name`."""

@@ -99,9 +99,9 @@ class OpenCLBackend:
         """Copy `array` to the host, from the flat element `offset` on."""
         return self.session.read(array, out, offset)
 
-    def fill(self, array: DeviceArray, value: int) -> None:
-        """Set every element of `array`."""
-        self.session.fill(array, value)
+    def fill(self, array: DeviceArray, value: int, count: int | None = None) -> None:
+        """Set every element of `array`, or the first `count` of its rows."""
+        self.session.fill(array, value, count)
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
         """Enqueue the kernel `name` over `size` rows, items or tiles."""

@@ -18,6 +18,9 @@ from flexgs_edge.memory.budget import MemoryBudget
 
 SCALARS = {"u": np.uint32, "i": np.int32, "f": np.float32, "b": None}
 
+FILLED_TOGETHER = (16, 8, 4, 2)
+"""Elements of a pattern that fills an array, where its size allows. Patterns have at most 128 bytes."""
+
 
 class DeviceArray:
     """A buffer on the device, with the shape and dtype of its array."""
@@ -140,11 +143,13 @@ class Session:
             cl.enqueue_copy(self.queue, out, array.buffer, src_offset=offset * array.dtype.itemsize, is_blocking=True)
         return out
 
-    def fill(self, array: DeviceArray, value: int) -> None:
-        """Set every element of `array` to `value`."""
-        cl.enqueue_fill_buffer(
-            self.queue, array.buffer, np.array(value, array.dtype), 0, max(array.nbytes, array.dtype.itemsize)
-        )
+    def fill(self, array: DeviceArray, value: int, count: int | None = None) -> None:
+        """Set every element of `array` to `value`, or those of its first `count` rows."""
+        size = array.nbytes if count is None else array.nbytes // max(array.shape[0], 1) * count
+        # A runtime copies the pattern again and again, so a long one is faster.
+        repeats = next((n for n in FILLED_TOGETHER if size % (n * array.dtype.itemsize) == 0), 1)
+        if size:
+            cl.enqueue_fill_buffer(self.queue, array.buffer, np.full(repeats, value, array.dtype), 0, size)
 
     def finish(self) -> None:
         """Wait for everything that is enqueued."""

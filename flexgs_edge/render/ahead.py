@@ -139,7 +139,7 @@ class ViewsAhead:
         assert buffers.rows is not None
         record = camera_record(camera, scene.origin, near)
         self._backend.write(buffers.camera, record)
-        project = partial(fill_compact, self._backend, scene, buffers.chunk, inria_extent=inria_extent)
+        project = partial(fill_compact, self._backend, scene, buffers, inria_extent=inria_extent)
         in_turn = self._scene == (scene, scene.changes)
         waiting = next((view for view in self._waiting if view.of is camera), None) if in_turn else None
         if waiting is None:

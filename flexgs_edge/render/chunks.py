@@ -8,12 +8,56 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.constants import DEQUANTIZE_ROWS
+from flexgs_edge.constants import DEQUANTIZE_ROWS, ROW_BLOCK
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.packed.quantize import QuantizedArray, QuantizedScene
 from flexgs_edge.render.chunk_bounds import ChunkBounds
+from flexgs_edge.render.fit import padded
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
+
+
+@dataclass(frozen=True)
+class ViewPart:
+    """The rows of a chunk that a view may show: whole blocks, in row order, side by side in the arrays of the view.
+
+    Parameters
+    ----------
+    chunk_base : int
+        The chunk's first row in the scene.
+    count : int
+        Rows of the part.
+    base : int
+        Its first row in the view's arrays.
+    first : int
+        Place of its first block in `blocks`.
+    blocks : array of the backend
+        [.] u32, blocks of this chunk and of others, by their numbers within their chunks.
+    seen : np.ndarray
+        [.] u32, the blocks of this part.
+    """
+
+    chunk_base: int
+    count: int
+    base: int
+    first: int
+    blocks: Any
+    seen: np.ndarray
+
+    @classmethod
+    def of(cls, chunk: Chunk, seen: np.ndarray, base: int, first: int, blocks: Any) -> ViewPart:
+        """The part of the blocks `seen` ([.] u32, ascending) of a chunk."""
+        count = len(seen) * ROW_BLOCK
+        if len(seen) and seen[-1] == chunk.blocks - 1:
+            count -= chunk.blocks * ROW_BLOCK - chunk.count
+        return cls(chunk.base, count, base, first, blocks, seen)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """[count] u32, the rows of the scene."""
+        rows = self.seen[:, None] * np.uint32(ROW_BLOCK) + np.arange(ROW_BLOCK, dtype=np.uint32)
+        found: np.ndarray = np.uint32(self.chunk_base) + rows.reshape(-1)[: self.count]
+        return found
 
 
 @dataclass
@@ -35,16 +79,18 @@ class Chunk:
         """All planes."""
         return self.means, self.cov, self.log2_opacity, self.sh_dc, self.sh_rest
 
-    def project(
-        self, backend: Backend, camera: Any, base: int, inria_extent: int, antialiased: bool, out: tuple[Any, ...]
-    ) -> None:
-        """Project the rows to splat records, depth keys and bounds of tiles.
+    @property
+    def blocks(self) -> int:
+        """Blocks of ROW_BLOCK rows."""
+        return -(-self.count // ROW_BLOCK)
 
-        `base` is their first row in the arrays `out`.
-        """
+    def project(
+        self, backend: Backend, camera: Any, part: ViewPart, inria_extent: int, antialiased: bool, out: tuple[Any, ...]
+    ) -> None:
+        """Project the rows of a part to splat records, depth keys and bounds of tiles."""
         backend.launch(
-            "project", (self.stride,), self.count, self.stride, base, self.degree, inria_extent, int(antialiased), camera,
-            *self.arrays, *out,
+            "project", (padded(part.count),), part.count, self.stride, part.base, part.first, self.degree, inria_extent,
+            int(antialiased), part.blocks, camera, *self.arrays, *out,
         )  # fmt: skip
 
     def release(self) -> None:

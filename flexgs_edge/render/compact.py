@@ -7,9 +7,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from flexgs_edge.constants import CULLED
+from flexgs_edge.constants import CULLED, ROW_BLOCK
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.render.chunk_bounds import ChunkBounds
+from flexgs_edge.render.chunks import ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import chunk_shapes
 from flexgs_edge.render.view_buffers import ViewBuffers
@@ -62,14 +63,14 @@ class ShownView:
 
 
 def fill_compact(
-    backend: Backend, scene: DeviceScene, out: tuple[Any, ...], views: Sequence[CompactView], inria_extent: int
+    backend: Backend, scene: DeviceScene, buffers: ViewBuffers, views: Sequence[CompactView], inria_extent: int
 ) -> int:
     """Project the scene chunk by chunk, and give each view the splats that it shows, in row order.
 
     Parameters
     ----------
-    out : tuple
-        `ViewBuffers.chunk`: a chunk is projected into it for one view after the other.
+    buffers : ViewBuffers
+        A chunk is projected into its `chunk` for one view after the other.
 
     Returns
     -------
@@ -78,16 +79,20 @@ def fill_compact(
     """
 
     def wanted(bounds: ChunkBounds) -> bool:
-        return any(bounds.seen(view.record, bool(inria_extent)) for view in views)
+        return any(bounds.seen(view.record, bool(inria_extent)).any() for view in views)
 
+    out, blocks = buffers.chunk, buffers.blocks(-(-scene.compact_rows // ROW_BLOCK))
     # Kept for all chunks: fresh pages for each one take longer than the copies.
     on_host = [np.empty(shape, dtype) for shape, dtype in chunk_shapes(out[0].shape[0]).values()]
     for chunk in scene.chunks(wanted):
         for view in views:
-            chunk.project(backend, view.camera, 0, inria_extent, scene.antialiased, out)
-            records, keys, bounds = map(backend.read, out, (values[: chunk.count] for values in on_host))
+            seen = scene.blocks_seen(chunk, view.record, inria_extent)
+            part = ViewPart.of(chunk, seen, 0, 0, blocks)
+            backend.write(blocks, seen)
+            chunk.project(backend, view.camera, part, inria_extent, scene.antialiased, out)
+            records, keys, bounds = map(backend.read, out, (values[: part.count] for values in on_host))
             shown = np.flatnonzero(keys != CULLED)
-            rows = (chunk.base + shown).astype(np.uint32)
+            rows = part.rows.take(shown)
             # `take` is much faster than `records[shown]`.
             if not view.put((records.take(shown, axis=0), keys.take(shown), bounds.take(shown), rows)):
                 return chunk.base + chunk.count

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.constants import LANES
+from flexgs_edge.constants import LANES, ROW_BLOCK
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render import fit as fit_module
@@ -237,6 +237,18 @@ class DeviceScene:
         for first, last, degree in parts:
             for start in range(first, last, self._rows):
                 yield start, min(start + self._rows, last), degree
+
+    def blocks_seen(self, chunk: Chunk, record: np.ndarray | None, inria_extent: int) -> np.ndarray:
+        """[.] u32, the blocks of a chunk that a view may show, by its `camera_record`; all of them for None."""
+        bounds = self._planes.bounds.get(chunk.base)
+        if record is None or bounds is None:
+            return np.arange(chunk.blocks, dtype=np.uint32)
+        return np.flatnonzero(bounds.seen(record, bool(inria_extent))).astype(np.uint32)
+
+    @property
+    def blocks(self) -> int:
+        """Blocks of all chunks."""
+        return int((-(-np.diff(self.starts) // ROW_BLOCK)).sum())
 
     @property
     def starts(self) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from flexgs_edge.constants import LANES, SSIM_WINDOW, TILE
+from flexgs_edge.constants import LANES, ROW_BLOCK, SSIM_WINDOW, TILE
 from flexgs_edge.scene.fields import FIELD
 
 Shapes = dict[str, tuple[tuple[int, ...], Any]]
@@ -191,6 +191,8 @@ def view_shapes(size: ViewSize, count: int) -> Shapes:
     """Buffers of a view of `count` rows, without the tile lists: they take a part of the memory that is left."""
     return {
         "camera": ((32,), np.float32),
+        # Chunks of the usual sizes; `ViewBuffers.blocks` makes room for more.
+        "blocks": ((count // ROW_BLOCK + count // 512 + 2,), np.uint32),
         "records": ((count, 16), np.float32),
         "keys": ((count,), np.uint32),
         "bounds": ((count,), np.uint32),

@@ -21,27 +21,24 @@ from flexgs_edge.packed.quantize import QuantizedScene
 from flexgs_edge.render import fit as fit_module
 from flexgs_edge.render.ahead import ViewsAhead
 from flexgs_edge.render.camera_record import camera_record
-from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes
+from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import (
     GRADIENT_SUMS,
     GROWTH,
     GUESS,
     MOST_SUMS,
-    SORT_DIGIT_BITS,
-    SORT_DIGITS,
     SUM_BYTES,
     Fit,
     fits_whole,
     saves_bytes,
 )
 from flexgs_edge.render.residual import add_structure, target_residual
-from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.render.statistics import Statistics, SumReader
+from flexgs_edge.render.tile_lists import list_tiles, sort_splats
 from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
 from flexgs_edge.scene.source import SceneSource
 
-SUM_ROWS = 1 << 18
-"""Rows of sums that are copied to the host at a time."""
 EXTENTS = ("exact", "inria")
 
 
@@ -54,6 +51,8 @@ class _View:
     batches: list[tuple[int, int]]
     count: int
     """Rows of the view's sums."""
+    parts: dict[int, ViewPart] | None
+    """The rows of each chunk, by the chunk's first row; None in a compact view."""
 
 
 class Renderer:
@@ -107,15 +106,16 @@ class Renderer:
         self.storage: Storage = IN_MEMORY
         self.largest: Camera | None = None
         self.splats_shown = 0
-        self.view_rows: np.ndarray | None = None
-        """[m] u32, the rows of the scene that the last view's sums belong to; None if they are all rows."""
+        self._shown_rows: np.ndarray | None = None
+        """[m] u32, the rows of the scene that the last view shows, if it was compact."""
         self._share = 0.0
         """Largest share of its rows that a scene has shown in a compact view so far."""
         self._ahead = ViewsAhead(backend, self.fit.ahead)
         self._buffers: ViewBuffers | None = None
         self._drawn: _View | None = None
         self._aimed: Any = None
-        self._words = np.empty(0, np.uint32)
+        self._scene_rows = 0
+        self._reader = SumReader(backend)
 
     def aim(self, camera: Camera, origin: np.ndarray) -> None:
         """Write a camera's record into `camera_array` without drawing."""
@@ -131,8 +131,24 @@ class Renderer:
         return self._aimed
 
     @property
+    def parts(self) -> dict[int, ViewPart] | None:
+        """Where the last view has the rows of each chunk, by the chunk's first row; None if it was compact."""
+        assert self._drawn is not None
+        return self._drawn.parts
+
+    @property
+    def view_rows(self) -> np.ndarray | None:
+        """[m] u32, the rows of the scene that the last view's sums belong to; None if they are all rows."""
+        if self._drawn is None or self._drawn.parts is None:
+            return self._shown_rows
+        parts = self._drawn.parts.values()
+        if self._drawn.count == self._scene_rows:
+            return None
+        return np.concatenate([part.rows for part in parts])
+
+    @property
     def records_array(self) -> Any:
-        """[N, 16], the splat records of the last view, on the backend; rows that it does not show are undefined."""
+        """[N, 16], the splat records of the last `gradient_sums`, on the backend; rows not shown are undefined."""
         assert self._buffers is not None
         return self._buffers.records
 
@@ -212,9 +228,10 @@ class Renderer:
         view = self._prepare(scene, camera)
         hits, sums = self._sum_arrays(scene, view, 1)
         self._blend(view, "blend_stats", (hits, sums))
-        rows = slice(None) if self.view_rows is None else self.view_rows
-        statistics.hits[rows] += self.backend.read(hits)[: view.count]
-        statistics.weights[rows] += self.read_sums(sums, 1, view.count)[0].view(np.uint64)
+        found = self.view_rows
+        rows = slice(None) if found is None else found
+        statistics.hits[rows] += self.backend.read(hits, np.empty(view.count, np.uint32))
+        statistics.weights[rows] += self._reader.planes(sums, view.count, 1)[0].view(np.uint64)
 
     def removal_sums(self, scene: DeviceScene, camera: Camera) -> Any:
         """Squared error of removing each row alone, and the sum of its squared weights, in one view.
@@ -222,7 +239,8 @@ class Renderer:
         Returns
         -------
         array of the backend
-            [N, 2, 2] u32, low and high words in units of 1 / `FIXED_ERROR`; valid until the next sums are drawn.
+            [m, 2, 2] u32 for the rows of `parts` or `view_rows`, low and high words in units of 1 / `FIXED_ERROR`; valid
+            until the next sums are drawn.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
@@ -241,7 +259,7 @@ class Renderer:
         Returns
         -------
         array of the backend
-            [N, 4, 2] u32, low and high words of sum(alpha T) and sum(alpha T r) for red, green, blue, in units of
+            [m, 4, 2] u32, low and high words of sum(alpha T) and sum(alpha T r) for red, green, blue, in units of
             1 / `FIXED_WEIGHT`; valid until the next sums are drawn.
         """
         view = self._prepare(scene, camera)
@@ -258,7 +276,7 @@ class Renderer:
         Returns
         -------
         array of the backend
-            [N, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums are
+            [m, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums are
             drawn.
         """
         view = self._prepare(scene, camera)
@@ -279,10 +297,11 @@ class Renderer:
         Returns
         -------
         array of the backend
-            [N, 9, 2] u32, low and high words in units of 1 / `FIXED_WEIGHT`, the moments in units of 1 /
+            [N, 9, 2] u32 for all rows, low and high words in units of 1 / `FIXED_WEIGHT`, the moments in units of 1 /
             `FIXED_MOMENT`; valid until the next sums are drawn.
         """
-        view = self._prepare(scene, camera)
+        # A descent moves means and scales, so the bounds of the blocks say nothing here.
+        view = self._prepare(scene, camera, whole=True)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, GRADIENT_SUMS)
         residual = target_residual(self.backend, view.buffers, target)
@@ -291,20 +310,15 @@ class Renderer:
         self._blend(view, "blend_backward", (hits, sums, residual), again=True)
         return sums
 
-    def read_sums(self, sums: Any, channels: int, count: int, first: int = 0, start: int = 0) -> np.ndarray:
-        """Copy planes of sums to the host, from plane `first` and row `start` on: [channels, count] i64."""
-        values = np.empty((channels, count), np.int64)
-        planes = sums.shape[1]
-        size = min(SUM_ROWS, count) * planes * 2
-        if self._words.size < size:
-            # Kept from view to view: fresh pages for each one take as long as the copy.
-            self._words = np.empty(size, np.uint32)
-        for base in range(0, count, SUM_ROWS):
-            rows = min(SUM_ROWS, count - base)
-            words = self._words[: rows * planes * 2].reshape(rows, planes, 2)
-            self.backend.read(sums, words, 2 * planes * (start + base))
-            values[:, base : base + rows] = words.view(np.int64)[:, first : first + channels, 0].T
-        return values
+    def read_sums(self, sums: Any, channels: int, count: int, first: int = 0) -> np.ndarray:
+        """[channels, count] i64, planes of the last view's sums from plane `first` on, for all rows of the scene."""
+        assert self._drawn is not None
+        values, rows = self._reader.planes(sums, self._drawn.count, channels, first), self.view_rows
+        if rows is None:
+            return values
+        whole = np.zeros((channels, count), np.int64)
+        whole[:, rows] = values
+        return whole
 
     def _sum_arrays(self, scene: DeviceScene, view: _View, channels: int) -> tuple[Any, Any]:
         held, count = scene.statistics, view.buffers.rows or scene.count
@@ -316,31 +330,45 @@ class Renderer:
             shapes = (((count if channels == 1 else 1,), np.uint32), ((count, channels, 2), np.uint32))
             held = scene.statistics = [self.backend.array(shape, dtype) for shape, dtype in shapes]
         for array in held:
-            self.backend.fill(array, 0)
+            self.backend.fill(array, 0, min(view.count, array.shape[0]))
         return held[0], held[1]
 
-    def _prepare(self, scene: DeviceScene, camera: Camera) -> _View:
-        """Project the splats of a view, sort them by depth, and split them into batches whose pairs fit."""
+    def _prepare(self, scene: DeviceScene, camera: Camera, whole: bool = False) -> _View:
+        """Project the splats of a view, sort them by depth, and split them into batches whose pairs fit.
+
+        With `whole`, no block is left out.
+        """
         buffers = self._view_buffers(scene, camera)
-        self.view_rows = None
+        parts, self._shown_rows, self._scene_rows = None, None, scene.count
         if buffers.rows is not None:
-            buffers, self.view_rows = self._project_compact(scene, camera, buffers)
+            buffers, self._shown_rows = self._project_compact(scene, camera, buffers)
+            count = len(self._shown_rows)
         else:
-            self._project(scene, camera, buffers)
-        count = scene.count if self.view_rows is None else len(self.view_rows)
-        shown, pairs = self._sort(count, buffers)
+            parts = self._project(scene, camera, buffers, whole)
+            count = sum(part.count for part in parts.values())
+        shown, pairs = sort_splats(self.backend, buffers, count)
         self.splats_shown = shown
         batches = [(0, shown)] if pairs <= buffers.capacity else buffers.batches(shown)
-        self._drawn = _View(buffers, camera, batches, count)
+        self._drawn = _View(buffers, camera, batches, count, parts)
         return self._drawn
 
-    def _project(self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers) -> None:
-        self.backend.write(buffers.camera, camera_record(camera, scene.origin, self.near))
+    def _project(self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers, whole: bool) -> dict[int, ViewPart]:
+        """Project the blocks that the view may show, or all with `whole`, one after the other without gaps."""
+        record = camera_record(camera, scene.origin, self.near)
+        self.backend.write(buffers.camera, record)
+        blocks, parts = buffers.blocks(scene.blocks), {}
+        base = first = 0
         for chunk in scene.chunks():
-            chunk.project(
-                self.backend, buffers.camera, chunk.base, self.inria_extent, scene.antialiased,
-                (buffers.records, buffers.keys, buffers.bounds),
-            )  # fmt: skip
+            seen = scene.blocks_seen(chunk, None if whole else record, self.inria_extent)
+            part = parts[chunk.base] = ViewPart.of(chunk, seen, base, first, blocks)
+            base, first = base + part.count, first + len(seen)
+            if part.count:
+                self.backend.write(blocks, seen, part.first)
+                chunk.project(
+                    self.backend, buffers.camera, part, self.inria_extent, scene.antialiased,
+                    (buffers.records, buffers.keys, buffers.bounds),
+                )  # fmt: skip
+        return parts
 
     def _project_compact(
         self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers
@@ -371,7 +399,7 @@ class Renderer:
         backend, buffers, camera = self.backend, view.buffers, view.camera
         for index, (start, stop) in enumerate(view.batches):
             if not (again and len(view.batches) == 1):
-                self._list_tiles(buffers, camera, start, stop - start)
+                list_tiles(backend, buffers, camera, start, stop - start, self.inria_extent)
             backend.launch(
                 blend, (buffers.tiles,), buffers.tiles_x, backend.tile_blocks, camera.width, camera.height,
                 int(index > 0), int(finish and index == len(view.batches) - 1), *self.background,
@@ -407,41 +435,9 @@ class Renderer:
         size = view_size(self.backend, camera)
         return self.fit.whole_views and fits_whole(scene, size, self.budget.free, self.storage.spills)
 
-    def _sort(self, count: int, buffers: ViewBuffers) -> tuple[int, int]:
-        """Sort the shown splats by depth into `buffers.sorted[0]`; return their number and a bound on their pairs."""
-        backend, blocks = self.backend, self.backend.sort_blocks
-        (keys_a, ids_a), (keys_b, ids_b) = buffers.sorted
-        cells = SORT_DIGITS * blocks
-        backend.launch(
-            "sort_count_first", (blocks,), count, buffers.keys, buffers.bounds, buffers.digits, buffers.block_pairs
-        )
-        backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
-        backend.launch("sort_scatter_first", (blocks,), count, buffers.keys, buffers.digits, keys_a, ids_a)
-        shown = int(backend.read(buffers.digits, np.empty(1, np.uint32), cells)[0])
-        pairs = int(backend.read(buffers.block_pairs).sum())
-        for shift in (SORT_DIGIT_BITS, 2 * SORT_DIGIT_BITS):
-            backend.launch("sort_count", (blocks,), shown, shift, keys_a, buffers.digits)
-            backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
-            backend.launch("sort_scatter", (blocks,), shown, shift, keys_a, ids_a, buffers.digits, keys_b, ids_b)
-            (keys_a, ids_a), (keys_b, ids_b) = (keys_b, ids_b), (keys_a, ids_a)
-        return shown, pairs
-
-    def _list_tiles(self, buffers: ViewBuffers, camera: Camera, start: int, count: int) -> None:
-        backend, blocks = self.backend, self.backend.tile_blocks
-        ids = buffers.sorted[0][1]
-        backend.launch("tile_room", (blocks,), start, count, ids, buffers.bounds, buffers.pair_room)
-        backend.launch(
-            "tile_count", (blocks,), start, count, camera.width, camera.height, self.inria_extent, ids, buffers.records,
-            buffers.pair_room, buffers.drafts, buffers.ends,
-        )  # fmt: skip
-        backend.launch("exclusive_scan", (1,), buffers.tiles, blocks, buffers.ends)
-        backend.launch(
-            "tile_scatter", (blocks,), buffers.tiles, buffers.pair_room, buffers.drafts, buffers.ends, buffers.pairs
-        )
-
     def release(self) -> None:
         """Free the view's buffers; the next view allocates them again."""
-        self._words = np.empty(0, np.uint32)
+        self._reader.release()
         if self._buffers is not None:
             self._buffers.release()
             self._buffers = self._drawn = None

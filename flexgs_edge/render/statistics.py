@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from flexgs_edge.constants import FIXED_WEIGHT
+from flexgs_edge.constants import FIXED_WEIGHT, SUM_LANES
+from flexgs_edge.kernels.backend import Backend
+
+SUM_ROWS = 1 << 18
+"""Rows of sums that are copied to the host at a time."""
+GROUP_ROWS = 1 << 12
+"""Rows of sums over views that are copied at a time, a multiple of `SUM_LANES`: few enough for a core's cache."""
 
 
 @dataclass
@@ -34,3 +42,58 @@ class Statistics:
     def weight_sums(self) -> np.ndarray:
         """[N] f64, sum of alpha T over pixels."""
         return self.weights / FIXED_WEIGHT
+
+
+def planes_of(backend: Backend, sums: Any, count: int) -> Iterator[tuple[slice, np.ndarray]]:
+    """Read sums over views, which lie in groups, part by part.
+
+    Parameters
+    ----------
+    sums : array of the backend
+        [groups, ..., SUM_LANES], sums of a group of rows for each plane.
+    count : int
+        How many rows to read.
+
+    Yields
+    ------
+    rows : slice
+    planes : np.ndarray
+        [planes, rows], valid until the next step.
+    """
+    planes = int(np.prod(sums.shape[1:-1]))
+    lanes = np.dtype((np.void, SUM_LANES * np.dtype(sums.dtype).itemsize))
+    groups = min(GROUP_ROWS // SUM_LANES, sums.shape[0])
+    held, turned = np.empty((groups, planes, SUM_LANES), sums.dtype), np.empty((planes, groups, SUM_LANES), sums.dtype)
+    for first in range(0, count, GROUP_ROWS):
+        rows = slice(first, min(first + GROUP_ROWS, count))
+        some = -(-(rows.stop - first) // SUM_LANES)
+        backend.read(sums, held[:some], first * planes)
+        # Lanes that are copied as one element are copied much faster.
+        turned.view(lanes)[:, :some, 0] = held.view(lanes)[:some, :, 0].T
+        yield rows, turned.reshape(planes, -1)[:, : rows.stop - first]
+
+
+class SumReader:
+    """Copies sums of views to the host."""
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend = backend
+        self._words = np.empty(0, np.uint32)
+        """Kept from view to view: fresh pages for each one take as long as the copy."""
+
+    def planes(self, sums: Any, count: int, channels: int, first: int = 0) -> np.ndarray:
+        """Planes of the first `count` rows of `sums` ([., planes, 2] u32), from plane `first` on: [channels, count] i64."""
+        planes, values = sums.shape[1], np.empty((channels, count), np.int64)
+        size = min(SUM_ROWS, count) * planes * 2
+        if self._words.size < size:
+            self._words = np.empty(size, np.uint32)
+        for base in range(0, count, SUM_ROWS):
+            rows = min(SUM_ROWS, count - base)
+            words = self._words[: rows * planes * 2].reshape(rows, planes, 2)
+            self._backend.read(sums, words, 2 * planes * base)
+            values[:, base : base + rows] = words.view(np.int64)[:, first : first + channels, 0].T
+        return values
+
+    def release(self) -> None:
+        """Free the memory that is kept."""
+        self._words = np.empty(0, np.uint32)

@@ -88,6 +88,7 @@ class ViewBuffers:
             self.release()
             raise
         self.camera, self.records, self.keys, self.bounds = (made[n] for n in ("camera", "records", "keys", "bounds"))
+        self._blocks: Any = made["blocks"]
         self.sorted = [(made["keys_a"], made["ids_a"]), (made["keys_b"], made["ids_b"])]
         self.digits, self.block_pairs = made["digits"], made["block_pairs"]
         self.pair_room, self.ends = made["pair_room"], made["ends"]
@@ -122,6 +123,14 @@ class ViewBuffers:
             covered += float(np.sum(1.0 - np.abs(part[:, 3]).astype(np.float64)))
         _, width, height = self.key
         return covered / (width * height)
+
+    def blocks(self, count: int) -> Any:
+        """An array for the numbers of `count` blocks ([.] u32); kept until more are asked for."""
+        if self._blocks.shape[0] < count:
+            self.arrays.remove(self._blocks)
+            self._blocks.release()
+            self._blocks = self._array((count,), np.uint32)
+        return self._blocks
 
     def reference_arrays(self) -> tuple[Any, Any]:
         """The target image (f16) and the residual against it (f32), allocated at the first call."""

@@ -9,9 +9,10 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.constants import ROW_BLOCK
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.storage import Storage
-from flexgs_edge.render.chunks import Chunk
+from flexgs_edge.render.chunks import Chunk, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.views.one_view import Part
@@ -23,6 +24,13 @@ class DenseSums:
     def __init__(self, backend: Backend, shape: tuple[int, ...]) -> None:
         self._backend, self.shape = backend, shape
         self._array = backend.array((*shape, 2), np.uint32)
+        self._all = np.arange(-(-shape[0] // ROW_BLOCK), dtype=np.uint32)
+        self._blocks = backend.array(self._all.shape, np.uint32)
+        backend.write(self._blocks, self._all)
+
+    def part(self, chunk: Chunk) -> ViewPart:
+        """All rows of the chunk, as a part of a view."""
+        return ViewPart.of(chunk, self._all[: chunk.blocks], 0, 0, self._blocks)
 
     def of(self, parts: Iterable[Part], base: int) -> Any:
         """Spread listed sums over all rows of the chunk that begins at row `base`; rows not listed get zero.
@@ -43,8 +51,9 @@ class DenseSums:
         return self._array
 
     def release(self) -> None:
-        """Free the array."""
+        """Free the arrays."""
         self._array.release()
+        self._blocks.release()
 
 
 class Spool:
@@ -81,8 +90,8 @@ class Spool:
         self._counted = self._end
         self._views.append((camera, start, before))
 
-    def replay(self, renderer: Renderer, scene: DeviceScene, chunk: Chunk) -> Iterator[Any]:
-        """Yield the sums of each view that shows a row of the chunk: [stride, planes, 2] u32 on the backend."""
+    def replay(self, renderer: Renderer, scene: DeviceScene, chunk: Chunk) -> Iterator[tuple[Any, ViewPart]]:
+        """Yield the sums of each view that shows a row of the chunk ([stride, planes, 2] u32 on the backend), and their rows."""
         backend, place = renderer.backend, int(np.searchsorted(self._starts, chunk.base))
         if self._record is None:  # no view showed anything
             return
@@ -101,7 +110,7 @@ class Spool:
                 if number < len(pieces):
                     coming = self._disk.submit(self._read, *pieces[number][1:])
                 renderer.aim(camera, scene.origin)
-                yield dense.of([(block["row"], block["sums"])], chunk.base)
+                yield dense.of([(block["row"], block["sums"])], chunk.base), dense.part(chunk)
         finally:
             dense.release()
 

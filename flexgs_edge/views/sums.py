@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.render.chunks import Chunk
+from flexgs_edge.render.chunks import Chunk, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import padded
 from flexgs_edge.views.bench import Bench
@@ -25,8 +25,8 @@ from flexgs_edge.views.spool import DenseSums, Spool
 class ChunkSums(Protocol):
     """Sums over views for the rows of one chunk."""
 
-    def add(self, chunk: Chunk, sums: Any, base: int) -> None:
-        """Add the view of `Renderer.camera_array`; the chunk's rows begin at row `base` of its `sums`."""
+    def add(self, chunk: Chunk, sums: Any, part: ViewPart) -> None:
+        """Add the view of `Renderer.camera_array`; `part` tells which of its `sums` are of the chunk."""
 
     def release(self) -> None:
         """Free the arrays on the backend."""
@@ -89,12 +89,14 @@ class ViewSums:
 
     def add_view(self, sums: Any, camera: Camera) -> None:
         """Add the sums of the last view, from `camera`. The order of views is part of the result."""
-        if self._renderer.view_rows is not None:
+        parts = self._renderer.parts
+        if parts is None:
             self._add_parts(view_parts(self._renderer, self._scene, sums), camera)
             return
         for chunk, held in self._chunks():
-            for part in held:
-                part.add(chunk, sums, chunk.base)
+            if parts[chunk.base].count:
+                for kind in held:
+                    kind.add(chunk, sums, parts[chunk.base])
 
     def _chunks(self) -> Iterator[tuple[Chunk, list[ChunkSums]]]:
         """Yield each chunk of the scene with its sums in memory, allocated at the first call."""
@@ -120,8 +122,8 @@ class ViewSums:
                 self._dense = DenseSums(renderer.backend, shape)
             inside = [(rows[at], values[at]) for (rows, values), at in zip(parts, some, strict=True)]
             sums = self._dense.of(inside, chunk.base)
-            for part in held:
-                part.add(chunk, sums, 0)
+            for kind in held:
+                kind.add(chunk, sums, self._dense.part(chunk))
 
     def _drop_dense(self) -> None:
         if self._dense is not None:
@@ -147,9 +149,9 @@ class ViewSums:
             parts = [make(chunk) for make in self._makers]
             try:
                 # No spool means that no view was added: the sums stay zero.
-                for sums in self._spool.replay(self._renderer, self._scene, chunk) if self._spool else ():
+                for sums, rows in self._spool.replay(self._renderer, self._scene, chunk) if self._spool else ():
                     for part in parts:
-                        part.add(chunk, sums, 0)
+                        part.add(chunk, sums, rows)
                 yield slice(chunk.base, chunk.base + chunk.count), parts
             finally:
                 for part in parts:

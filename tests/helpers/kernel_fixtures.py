@@ -200,10 +200,10 @@ class PairedBackend:
         """Read the device's."""
         return self.device.read(array.device, out, offset)
 
-    def fill(self, array: _PairedArray, value: int) -> None:
+    def fill(self, array: _PairedArray, value: int, count: int | None = None) -> None:
         """Fill both."""
-        self.device.fill(array.device, value)
-        self.twin.fill(array.host, value)
+        self.device.fill(array.device, value, count)
+        self.twin.fill(array.host, value, count)
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
         """Launch on both and compare."""

@@ -203,7 +203,7 @@ def test_moments_of_sh(form: str, degree: int, rows: int, monkeypatch: pytest.Mo
     original = Original(Bench(renderer), np.zeros(3), views, references)  # type: ignore[arg-type]
     refit_colours(planes, np.full(rows, degree), original, rounds=1)
     renderer.release()
-    assert paired.launched["sh_costs"] and paired.launched["sh_residual"]
+    assert paired.launched["add_costs"] and paired.launched["sh_residual"]
 
 
 @pytest.mark.parametrize("form", FORMS)

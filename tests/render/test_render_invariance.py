@@ -18,7 +18,7 @@ from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import Backend, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.methods.best.costs import measure_costs, moment_bytes
+from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
 from flexgs_edge.packed.quantize import QuantizedScene
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.render.renderer import Renderer
@@ -171,10 +171,10 @@ def test_the_smallest_limit_is_named(numpy: bool) -> None:
 def test_costs_of_a_streamed_scene() -> None:
     """Measured costs hold sums for every chunk: the same bits resident, streamed, and in chunks of any size."""
     found = {}
-    for limit in (1 << 32, 1_900_000, 2_200_000, 3_000_000):
+    for limit in (1 << 32, 2_060_000, 2_360_000, 3_160_000):
         budget = MemoryBudget(limit)
         renderer = Renderer(OpenCLBackend(default_device(), budget, width=8), budget)
-        with renderer.load(SCENE, sum_bytes(2) + moment_bytes(SCENE.sh_degree)) as scene:
+        with renderer.load(SCENE, sum_bytes(2) + cost_bytes(SCENE.sh_degree)) as scene:
             costs = measure_costs(Bench(renderer), scene, cameras())
             found[limit] = scene.resident, (costs.removal.tobytes(), costs.sh.tobytes(), costs.sh_mean.tobytes())
         renderer.release()

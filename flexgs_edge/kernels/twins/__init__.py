@@ -20,7 +20,7 @@ from flexgs_edge.kernels.twins.blend import (
 from flexgs_edge.kernels.twins.dequantize import dequantize
 from flexgs_edge.kernels.twins.flip import flip_colours, flip_columns, flip_pair, flip_rows
 from flexgs_edge.kernels.twins.project import project
-from flexgs_edge.kernels.twins.score import residual, sh_costs, sh_residual
+from flexgs_edge.kernels.twins.score import add_costs, residual, sh_residual
 from flexgs_edge.kernels.twins.similarity import (
     dssim_columns,
     dssim_columns_back,
@@ -66,7 +66,7 @@ TWINS: dict[str, Callable[..., None]] = {
     "dssim_slopes": dssim_slopes,
     "dssim_columns_back": dssim_columns_back,
     "dssim_residual": dssim_residual,
-    "sh_costs": sh_costs,
+    "add_costs": add_costs,
     "sh_residual": sh_residual,
     "project_backward": project_backward,
     "adam": adam,

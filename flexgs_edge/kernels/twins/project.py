@@ -9,6 +9,7 @@ from flexgs_edge.constants import (
     EXTENT_SLACK,
     LOG2_255,
     LOG2_E,
+    ROW_BLOCK,
     SH_C0,
     SH_C1,
     SH_C2,
@@ -62,6 +63,13 @@ def sh_basis(degree: int, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[n
             c4[8] * (xx * (xx - three * yy) - yy * (three * xx - yy)),
         ]
     return basis
+
+
+def block_rows(blocks: np.ndarray, first: int, count: int) -> np.ndarray:
+    """[count] i64, the rows of a chunk in its part of a view: those of `blocks` from place `first` on."""
+    some = blocks[first : first - (-count // ROW_BLOCK)].astype(np.int64)
+    rows: np.ndarray = (some[:, None] * ROW_BLOCK + np.arange(ROW_BLOCK)).reshape(-1)[:count]
+    return rows
 
 
 def _bounds(
@@ -123,9 +131,11 @@ def project(
     count: int,
     stride: int,
     base: int,
+    first: int,
     degree: int,
     inria_extent: int,
     antialiased: int,
+    blocks: np.ndarray,
     camera: np.ndarray,
     means: np.ndarray,
     cov: np.ndarray,
@@ -136,11 +146,11 @@ def project(
     keys: np.ndarray,
     bounds: np.ndarray,
 ) -> None:
-    """Project rows [base, base + count) to splat records ([N, 16]), depth keys and bounds ([N])."""
-    cam = camera
-    px, py, pz = means[:, :count]
+    """Project the rows of some blocks to splat records ([N, 16]), depth keys and bounds ([N]) from row `base` on."""
+    cam, own = camera, block_rows(blocks, first, count)
+    px, py, pz = means[:, own]
     z = fma(cam[8], pz, fma(cam[6], px, cam[7] * py)) + cam[11]
-    level = log2_opacity[:count]
+    level = log2_opacity[own]
     shown = (z > cam[16]) & (level > f32(-1e30))
 
     x = fma(cam[2], pz, fma(cam[0], px, cam[1] * py)) + cam[9]
@@ -155,12 +165,12 @@ def project(
     t1 = tuple(fma(j12, cam[6 + k], j11 * cam[3 + k]) for k in range(3))
 
     if antialiased:
-        a, b, c, det, share = _from_factor(cov[:, :count], t0, t1, cam[26])
+        a, b, c, det, share = _from_factor(cov[:, own], t0, t1, cam[26])
         shown &= share >= f32(SHARE_MIN)
         level = fma(f32(0.5), flog2(np.where(share > f32(SHARE_MIN), share, f32(SHARE_MIN))), level)
         shown &= level >= -(f32(LOG2_255) + f32(EXTENT_SLACK))
     else:
-        a, b, c, det = _from_covariance(cov[:, :count], t0, t1, cam[26])
+        a, b, c, det = _from_covariance(cov[:, own], t0, t1, cam[26])
     t2 = np.fmax((level + (f32(LOG2_255) + f32(EXTENT_SLACK))) * (f32(2) / _LOG2_E), f32(0))
     half = (np.sqrt(t2 * a), np.sqrt(t2 * c))
     reach, radius = half, np.zeros_like(a)
@@ -179,7 +189,7 @@ def project(
     shown &= some
 
     rows = np.flatnonzero(shown)
-    colours = _colours(rows, degree, cam, (px, py, pz), sh_dc, sh_rest)
+    colours = _colours(rows, degree, cam, (px, py, pz), sh_dc[:, own], sh_rest[:, own])
     out = [mx, my, c * k, -(b + b) * k, a * k, level, *colours]
     out += [(b / a) * half[0], half[1], b * ic, ic, det * ic, t2, radius]
     for field, values in enumerate(out):

@@ -1,4 +1,4 @@
-"""Twins of `cl_kernels/score.cl`: residual images, moments of dropped SH degrees, and sums of the colour refit."""
+"""Twins of `cl_kernels/score.cl`: residual images, costs of removal and of dropped SH degrees, and sums of the colour refit."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from flexgs_edge.constants import FIXED_ERROR, FIXED_LARGEST, FIXED_WEIGHT, SH_C0
 from flexgs_edge.kernels.twins.arithmetic import dot3, f32, fma
-from flexgs_edge.kernels.twins.project import sh_basis
+from flexgs_edge.kernels.twins.project import block_rows, sh_basis
 
 
 def residual(size: tuple[int, ...], count: int, target: np.ndarray, image: np.ndarray, out: np.ndarray) -> None:
@@ -31,23 +31,48 @@ def _add_long(acc: np.ndarray, value: np.ndarray) -> None:
     acc += np.maximum(value, most.min - np.minimum(acc, 0))
 
 
-def sh_costs(
+def _planes_first(sums: np.ndarray) -> np.ndarray:
+    """Sums over views as [planes, stride], a copy; from [stride / SUM_LANES, planes, SUM_LANES]."""
+    groups, *_, lanes = sums.shape
+    return np.moveaxis(sums.reshape(groups, -1, lanes), 1, 0).reshape(-1, groups * lanes)
+
+
+def _put_back(sums: np.ndarray, planes: np.ndarray) -> None:
+    groups, *_, lanes = sums.shape
+    sums[...] = np.moveaxis(planes.reshape(-1, groups, lanes), 0, 1).reshape(sums.shape)
+
+
+def add_costs(
     size: tuple[int, ...],
     count: int,
     stride: int,
     base: int,
+    first: int,
     degree: int,
     planes: int,
     plane: int,
+    blocks: np.ndarray,
     camera: np.ndarray,
     means: np.ndarray,
     sh_rest: np.ndarray,
     sums: np.ndarray,
-    moments: np.ndarray,
+    costs: np.ndarray,
 ) -> None:
-    """Add the moments w2 d and w2 |d|^2, with d the colour of the SH above each lower degree ([degree, 4, stride] i64)."""
-    w2 = _sum_values(sums[base : base + count, plane], 1.0 / FIXED_ERROR)
-    some = np.flatnonzero(w2 > 0)
+    """Add squared errors and squared weights of a view to 128-bit sums, and the moments w2 d and w2 |d|^2.
+
+    d is the colour of the SH above each lower degree; `costs` is [stride / SUM_LANES, 4 + 4 * degree, SUM_LANES] i64.
+    """
+    own, span = block_rows(blocks, first, count), slice(base, base + count)
+    whole = _planes_first(costs)
+    for k in range(2):
+        value = np.ascontiguousarray(sums[span, plane + k]).view(np.uint64)[:, 0]
+        low = whole[2 * k].view(np.uint64)
+        low[own] += value
+        whole[2 * k + 1, own] += low[own] < value
+    moments = whole[4:].reshape(degree, 4, stride)
+    w2 = _sum_values(sums[span, plane + 1], 1.0 / FIXED_ERROR)
+    seen = np.flatnonzero(w2 > 0)
+    some, w2 = own[seen], w2[seen]
     basis = sh_basis(degree, *_directions(camera, means[:, some]))
     d = [np.zeros(len(some), f32) for _ in range(3)]
     for level in range(degree - 1, -1, -1):
@@ -57,11 +82,12 @@ def sh_costs(
                 d[c] = fma(basis[k], sh_rest[c * len(basis) + k, some], d[c])
             square = fma(d[c], d[c], square)
             part = moments[level, c, some]
-            _add_long(part, w2[some] * d[c])
+            _add_long(part, w2 * d[c])
             moments[level, c, some] = part
         part = moments[level, 3, some]
-        _add_long(part, w2[some] * square)
+        _add_long(part, w2 * square)
         moments[level, 3, some] = part
+    _put_back(costs, whole)
 
 
 def sh_residual(
@@ -69,19 +95,23 @@ def sh_residual(
     count: int,
     stride: int,
     base: int,
+    first: int,
     degree: int,
     planes: int,
+    blocks: np.ndarray,
     camera: np.ndarray,
     means: np.ndarray,
     sums: np.ndarray,
     normal: np.ndarray,
 ) -> None:
-    """Add Y_k sum(alpha T r) and |Y_k| sum(alpha T) of one view to `normal` ([K + 1, 4, stride])."""
-    span = slice(base, base + count)
+    """Add Y_k sum(alpha T r) and |Y_k| sum(alpha T) of one view to `normal` ([stride / SUM_LANES, K + 1, 4, SUM_LANES])."""
+    own, span = block_rows(blocks, first, count), slice(base, base + count)
     weight, *seen = (_sum_values(sums[span, c], 1.0 / FIXED_WEIGHT) for c in range(4))
-    some = np.flatnonzero(weight > 0)
+    places = np.flatnonzero(weight > 0)
+    some, whole = own[places], _planes_first(normal)
     basis = sh_basis(degree, *_directions(camera, means[:, some]))
     for k, function in enumerate([np.full(len(some), SH_C0, f32), *basis]):
         for c in range(3):
-            normal[k, c, some] = fma(function, seen[c][some], normal[k, c, some])
-        normal[k, 3, some] = fma(np.abs(function), weight[some], normal[k, 3, some])
+            whole[4 * k + c, some] = fma(function, seen[c][places], whole[4 * k + c, some])
+        whole[4 * k + 3, some] = fma(np.abs(function), weight[places], whole[4 * k + 3, some])
+    _put_back(normal, whole)

@@ -6,7 +6,7 @@ Errors of Gaussians that were removed together show only in the next pass.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,13 +14,15 @@ from typing import Any
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.constants import FIXED_ERROR, FIXED_WEIGHT
+from flexgs_edge.constants import FIXED_ERROR, FIXED_WEIGHT, SUM_LANES
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.render.chunks import Chunk
+from flexgs_edge.render.chunks import Chunk, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.fit import padded
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.statistics import planes_of
 from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.sums import Maker, ViewSums
 
@@ -97,28 +99,13 @@ class CostParts:
         return CostParts(*(storage.take(values, rows) for values in (self.removal, self.weight2, self.moments)))
 
 
-def moment_bytes(sh_degree: int) -> int:
-    """Bytes a row that the moments of `cost_sums` take on the backend."""
-    return 32 * sh_degree
+def cost_bytes(sh_degree: int) -> int:
+    """Bytes a row that `cost_sums` take on the backend."""
+    return 32 * (1 + sh_degree)
 
 
 PART_NAMES = ("removal", "weight2", "moments")
 """Arrays of `CostParts`."""
-
-
-class _Wide:
-    """Sums of 64-bit fixed-point values beyond 64 bits: adding is exact, so any order gives the same bits."""
-
-    def __init__(self, count: int) -> None:
-        self.low = np.zeros(count, np.uint64)
-        self.high = np.zeros(count, np.uint32)
-
-    def add(self, values: np.ndarray) -> None:
-        self.low += values.view(np.uint64)
-        self.high += self.low < values.view(np.uint64)
-
-    def value(self, unit: float) -> np.ndarray:
-        return (self.high * 2.0**64 + self.low) / unit
 
 
 def cost_sums(renderer: Renderer, degree: int, first: int = 0) -> Maker:
@@ -142,9 +129,13 @@ def cost_parts(levels: int, count: int, storage: Storage) -> CostParts:
 
 def put_costs(parts: CostParts, rows: slice, sums: Any) -> None:
     """Put the finished sums of a chunk (from `cost_sums`) into their rows."""
-    put_rows(parts.removal, rows, sums.removal.value(FIXED_ERROR))
-    put_rows(parts.weight2, rows, sums.weight2.value(FIXED_ERROR))
-    put_rows(parts.moments, rows, sums.moments())
+    for part, values in sums.values():
+        some = slice(rows.start + part.start, rows.start + part.stop)
+        wide = values[:4].view(np.uint64)
+        for own, low, high in ((parts.removal, wide[0], wide[1]), (parts.weight2, wide[2], wide[3])):
+            put_rows(own, some, (high * 2.0**64 + low) / FIXED_ERROR)
+        moments = values[4:].reshape(-1, 4, values.shape[1]) / FIXED_WEIGHT
+        put_rows(parts.moments, some, moments if len(moments) else np.zeros((len(parts.moments), *moments.shape[1:])))
 
 
 def measure_costs(
@@ -183,35 +174,26 @@ def measure_costs(
 
 
 class _ChunkCosts:
-    """Sums of one chunk: squared errors and weights on the host, weighted moments of the colour on the backend."""
+    """Sums of one chunk, on the backend: squared errors, squared weights, and weighted moments of the colour."""
 
     def __init__(self, renderer: Renderer, degree: int, first: int, chunk: Chunk) -> None:
-        self._renderer, self._degree, self._first, self._count = renderer, degree, first, chunk.count
-        self.removal, self.weight2 = _Wide(chunk.count), _Wide(chunk.count)
-        self._moments: Any = None
-        if degree and chunk.degree:
-            self._moments = renderer.backend.array((degree, 4, chunk.stride), np.int64)
-            renderer.backend.fill(self._moments, 0)
+        self._renderer, self._first, self._count = renderer, first, chunk.count
+        self._degree = min(degree, chunk.degree)
+        self._array = renderer.backend.array((-(-chunk.stride // SUM_LANES), 4 + 4 * self._degree, SUM_LANES), np.int64)
+        renderer.backend.fill(self._array, 0)
 
-    def add(self, chunk: Chunk, sums: Any, base: int) -> None:
-        renderer = self._renderer
-        if self._moments is not None:
-            renderer.backend.launch(
-                "sh_costs", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, sums.shape[1],
-                self._first + 1, renderer.camera_array, chunk.means, chunk.sh_rest, sums, self._moments,
-            )  # fmt: skip
-        errors, weights = renderer.read_sums(sums, 2, chunk.count, self._first, base)
-        self.removal.add(errors)
-        self.weight2.add(weights)
+    def add(self, chunk: Chunk, sums: Any, part: ViewPart) -> None:
+        self._renderer.backend.launch(
+            "add_costs", (padded(part.count),), part.count, chunk.stride, part.base, part.first, self._degree,
+            sums.shape[1], self._first, part.blocks, self._renderer.camera_array, chunk.means, chunk.sh_rest, sums,
+            self._array,
+        )  # fmt: skip
 
-    def moments(self) -> np.ndarray:
-        """[D, 4, n] f64."""
-        if self._moments is None:
-            return np.zeros((self._degree, 4, self._count))
-        moments: np.ndarray = self._renderer.backend.read(self._moments)[:, :, : self._count] / FIXED_WEIGHT
-        return moments
+    def values(self) -> Iterator[tuple[slice, np.ndarray]]:
+        """Yield rows of the chunk and their sums ([4 + 4 degree, rows] i64), valid until the next step."""
+        return planes_of(self._renderer.backend, self._array, self._count)
 
     def release(self) -> None:
-        if self._moments is not None:
-            self._moments.release()
-            self._moments = None
+        if self._array is not None:
+            self._array.release()
+            self._array = None

@@ -14,7 +14,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import values_of
 from flexgs_edge.methods.best.allocation import BitModel
-from flexgs_edge.methods.best.costs import measure_costs
+from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
 from flexgs_edge.methods.best.rounds import take_rows
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.fit import sum_bytes
@@ -70,7 +70,7 @@ def assign_layers(
         end = HALF * spent[left].sum()
         while len(left) > 1 and spent[left].sum() > end:  # the first layer is never empty
             kept = take_rows(planes, left, storage)
-            with renderer.load(MemorySource(kept, origin=grid.origin), sum_bytes(2)) as scene:
+            with renderer.load(MemorySource(kept, origin=grid.origin), sum_bytes(2) + cost_bytes(0)) as scene:
                 costs = measure_costs(bench, scene, cameras, sh_costs=False, progress=progress)
             worth = np.where(costs.weight2 > 0, costs.removal / spent[left], -1.0)
             order = np.argsort(worth, kind="stable")

@@ -18,9 +18,9 @@ from flexgs_edge.methods.best.costs import (
     PART_NAMES,
     CostParts,
     RemovalCosts,
+    cost_bytes,
     cost_parts,
     cost_sums,
-    moment_bytes,
     put_costs,
 )
 from flexgs_edge.methods.best.effort import LEAST_VIEWS
@@ -35,6 +35,14 @@ from flexgs_edge.views.sums import ViewSums
 PARTS = 2
 """Each pruning round measures one of this many interleaved sets of cameras and reuses the sums of the others. One set
 is slower, four make files larger: docs/results/tuning.md#parts"""
+MOST_PARTS = 4
+PART_VIEWS = 48
+"""Many cameras make up to `MOST_PARTS` sets, if each has this many: docs/results/tuning.md#part_views"""
+
+
+def parts_of(views: int) -> int:
+    """How many interleaved sets so many scored poses make."""
+    return max(min(PARTS, views // LEAST_VIEWS), min(MOST_PARTS, views // PART_VIEWS), 1)
 
 
 @dataclass
@@ -113,7 +121,7 @@ class PruneRounds:
         self.original, self.rows, self.refit, self.checkpoint = original, rows, refit, checkpoint
         self.storage = original.bench.renderer.storage
         cameras = original.cameras
-        count = max(min(PARTS, len(cameras) // LEAST_VIEWS), 1)
+        count = parts_of(len(cameras))
         self._views = [range(first, len(cameras), count) for first in range(count)]
         self._parts: list[CostParts] = []
         self.snapshots: list[Snapshot] = []
@@ -128,7 +136,7 @@ class PruneRounds:
         original, renderer, storage = self.original, self.original.bench.renderer, self.storage
         start = take_rows(planes, self.rows, storage)
         source = MemorySource(start, origin=original.origin)
-        sum_bytes_a_row = sum_bytes(2) + moment_bytes(source.sh_degree)
+        sum_bytes_a_row = sum_bytes(2) + cost_bytes(source.sh_degree)
         with renderer.load(source, sum_bytes_a_row, view_sums=2) as scene:
             self._parts = [self._measure(scene, some, keep=True) for some in self._views]
             in_turn = renderer.in_turn(scene, original.between)
@@ -245,7 +253,7 @@ class PruneRounds:
 
 def sum_row_bytes(sh_degree: int) -> int:
     """Bytes a row that one pass takes on the backend to measure costs and to refit colours."""
-    return sum_bytes(6) + moment_bytes(sh_degree) + normal_bytes(sh_degree)
+    return sum_bytes(6) + cost_bytes(sh_degree) + normal_bytes(sh_degree)
 
 
 def _hidden(planes: dict[str, np.ndarray], weight2: np.ndarray, share: float) -> np.ndarray:

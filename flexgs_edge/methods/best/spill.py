@@ -16,7 +16,7 @@ from flexgs_edge.memory.rows import READING_BYTES
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
 from flexgs_edge.methods.best.refit.descent import descent_bytes
-from flexgs_edge.methods.best.rounds import PARTS, sum_row_bytes
+from flexgs_edge.methods.best.rounds import PARTS, parts_of, sum_row_bytes
 from flexgs_edge.render.ahead import AHEAD_ROW_BYTES
 from flexgs_edge.render.fit import (
     MOST_SUMS,
@@ -87,7 +87,7 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
     source, options, budget = run.source, run.options, run.budget
     largest = largest_of(scored)
     rows, keep = source.count, EFFORTS[options.effort].keep
-    whole = rows * row_bytes(source.sh_degree, keep)
+    whole = rows * row_bytes(source.sh_degree, keep, parts_of(len(scored)))
     size, least = needed_bytes(renderer, source, scored, options)
     if size + least <= budget.free:
         return IN_MEMORY
@@ -116,7 +116,7 @@ def needed_bytes(
 ) -> tuple[int, int]:
     """Bytes that a search in memory holds, and the least bytes that drawing needs beside them."""
     size, sums = (
-        source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep),
+        source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep, parts_of(len(scored))),
         sum_row_bytes(source.sh_degree),
     )
     distils = distil_steps(options, len(scored))
@@ -148,13 +148,14 @@ def stored_bytes(sh_degree: int) -> int:
     return sum(4 * field.width(sh_degree) for field in FIELD.values())
 
 
-def row_bytes(sh_degree: int, keep: float) -> int:
+def row_bytes(sh_degree: int, keep: float, parts: int = PARTS) -> int:
     """Most bytes that a search holds for each row of its scene, beside those that the renderer counts.
 
     The larger of two extremes counts. Either the rounds go down to nothing, each keeping `keep` of the one before. Or
-    nearly all rows stay: then there is one snapshot, and a candidate made of it. All other searches need less.
+    nearly all rows stay: then there is one snapshot, and a candidate made of it. All other searches need less. The sums of
+    `parts` sets of poses come on top.
     """
     planes = stored_bytes(sh_degree)
     snapshot = planes + COST_BYTES + BAND_BYTES * sh_degree
-    parts = PARTS * 8 * (2 + 4 * sh_degree)
-    return round(max(snapshot / (1 - keep), snapshot + WORK_PLANES * planes)) + parts
+    sums = max(parts, PARTS) * 8 * (2 + 4 * sh_degree)
+    return round(max(snapshot / (1 - keep), snapshot + WORK_PLANES * planes)) + sums

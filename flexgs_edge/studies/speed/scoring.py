@@ -9,7 +9,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.order import covering_order, farthest_order
-from flexgs_edge.methods.best.costs import measure_costs, moment_bytes
+from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
 from flexgs_edge.methods.best.poses import some_positions
 from flexgs_edge.methods.paper.evaluator import SceneEvaluator
 from flexgs_edge.methods.paper.prune import order_from_scores
@@ -133,7 +133,7 @@ def _scores(
 ) -> list[tuple[np.ndarray, float]]:
     """Scores ([N] f64) and seconds of each set of poses."""
     source, renderer = studied.run.source, studied.bench.renderer
-    storage = sum_bytes(2) + moment_bytes(source.sh_degree)
+    storage = sum_bytes(2) + cost_bytes(source.sh_degree)
     found = []
     with renderer.load(source, storage) as scene:
         make: dict[str, Callable[[list[Camera]], np.ndarray]] = {

@@ -10,16 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.constants import SH_C0
+from flexgs_edge.constants import SH_C0, SUM_LANES
 from flexgs_edge.memory.rows import copy_rows, put_rows, read_rows
-from flexgs_edge.render.chunks import Chunk
-from flexgs_edge.render.fit import sum_bytes
+from flexgs_edge.render.chunks import Chunk, ViewPart
+from flexgs_edge.render.fit import padded, sum_bytes
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.statistics import planes_of
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.sums import Maker, ViewSums
 
+ROUND_VIEWS = 96
+"""Least poses of a round: docs/results/tuning.md#round_views"""
 RELAX_DC = 1.0
 RELAX_SH = 0.25
 """Steps of the constant and of SH, as shares of the SIRT step of the constant alone. All bands move at once. So a pixel seen
@@ -49,7 +52,8 @@ def refit_colours(
     original : Original
         The scored poses and the original's renders.
     rounds : int
-        How often we look at every pose. Each round takes about as long as rendering all poses.
+        How often we look at every pose. Each round takes about as long as rendering all poses. With many poses, each round
+        looks at an interleaved set of them: as many sets as have `ROUND_VIEWS` each.
     bands : bool
         Refit the SH above degree 0 too (default). Otherwise only the constant moves.
     subsets : int
@@ -63,8 +67,12 @@ def refit_colours(
     bench, cameras = original.bench, original.cameras
     renderer, storage = bench.renderer, bench.renderer.storage
     planes = {**planes, "sh_dc": storage.copy(planes["sh_dc"]), "sh_rest": storage.copy(planes["sh_rest"])}
-    subsets = max(min(subsets, len(cameras)), 1)
-    parts = [range(first, len(cameras), subsets) for _ in range(rounds) for first in range(subsets)]
+    thinned = max(len(cameras) // ROUND_VIEWS, 1)
+    parts = []
+    for turn in range(rounds):
+        seen = range(turn % thinned, len(cameras), thinned)
+        steps = max(min(subsets, len(seen)), 1)
+        parts += [seen[first::steps] for first in range(steps)]
     source = MemorySource(planes, origin=original.origin)
     sum_bytes_a_row = sum_bytes(4) + normal_bytes(source.sh_degree)
     with renderer.load(source, sum_bytes_a_row, references=True, view_sums=4) as scene:
@@ -99,19 +107,22 @@ class _ChunkNormal:
 
     def __init__(self, renderer: Renderer, chunk: Chunk) -> None:
         self._renderer, self._count = renderer, chunk.count
-        self._array = renderer.backend.array(((chunk.degree + 1) ** 2, 4, chunk.stride), np.float32)
+        groups, functions = -(-chunk.stride // SUM_LANES), (chunk.degree + 1) ** 2
+        self._array = renderer.backend.array((groups, functions, 4, SUM_LANES), np.float32)
         renderer.backend.fill(self._array, 0)
 
-    def add(self, chunk: Chunk, sums: Any, base: int) -> None:
+    def add(self, chunk: Chunk, sums: Any, part: ViewPart) -> None:
         renderer = self._renderer
         renderer.backend.launch(
-            "sh_residual", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, sums.shape[1],
-            renderer.camera_array, chunk.means, sums, self._array,
+            "sh_residual", (padded(part.count),), part.count, chunk.stride, part.base, part.first, chunk.degree,
+            sums.shape[1], part.blocks, renderer.camera_array, chunk.means, sums, self._array,
         )  # fmt: skip
 
     def values(self) -> np.ndarray:
         """[K + 1, 4, n] f32 sums for each basis function: residuals of three channels, and weight."""
-        values: np.ndarray = self._renderer.backend.read(self._array)[:, :, : self._count]
+        values = np.empty((*self._array.shape[1:3], self._count), np.float32)
+        for rows, planes in planes_of(self._renderer.backend, self._array, self._count):
+            values[..., rows] = planes.reshape(*values.shape[:2], -1)
         return values
 
     def release(self) -> None:

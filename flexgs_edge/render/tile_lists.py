@@ -1,0 +1,47 @@
+"""Sort the splats of a view by depth, and list them tile by tile."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.render.fit import SORT_DIGIT_BITS, SORT_DIGITS
+from flexgs_edge.render.view_buffers import ViewBuffers
+
+
+def sort_splats(backend: Backend, buffers: ViewBuffers, count: int) -> tuple[int, int]:
+    """Sort the shown ones of `count` splats by depth into `buffers.sorted[0]`; return their number and a bound on their pairs."""
+    blocks = backend.sort_blocks
+    (keys_a, ids_a), (keys_b, ids_b) = buffers.sorted
+    cells = SORT_DIGITS * blocks
+    backend.launch(
+        "sort_count_first", (blocks,), count, buffers.keys, buffers.bounds, buffers.digits, buffers.block_pairs
+    )
+    backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
+    backend.launch("sort_scatter_first", (blocks,), count, buffers.keys, buffers.digits, keys_a, ids_a)
+    shown = int(backend.read(buffers.digits, np.empty(1, np.uint32), cells)[0])
+    pairs = int(backend.read(buffers.block_pairs).sum())
+    for shift in (SORT_DIGIT_BITS, 2 * SORT_DIGIT_BITS):
+        backend.launch("sort_count", (blocks,), shown, shift, keys_a, buffers.digits)
+        backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
+        backend.launch("sort_scatter", (blocks,), shown, shift, keys_a, ids_a, buffers.digits, keys_b, ids_b)
+        (keys_a, ids_a), (keys_b, ids_b) = (keys_b, ids_b), (keys_a, ids_a)
+    return shown, pairs
+
+
+def list_tiles(
+    backend: Backend, buffers: ViewBuffers, camera: Camera, start: int, count: int, inria_extent: int
+) -> None:
+    """List the pairs of `count` splats, from place `start` of the depth order on, tile by tile."""
+    blocks = backend.tile_blocks
+    ids = buffers.sorted[0][1]
+    backend.launch("tile_room", (blocks,), start, count, ids, buffers.bounds, buffers.pair_room)
+    backend.launch(
+        "tile_count", (blocks,), start, count, camera.width, camera.height, inria_extent, ids, buffers.records,
+        buffers.pair_room, buffers.drafts, buffers.ends,
+    )  # fmt: skip
+    backend.launch("exclusive_scan", (1,), buffers.tiles, blocks, buffers.ends)
+    backend.launch(
+        "tile_scatter", (blocks,), buffers.tiles, buffers.pair_room, buffers.drafts, buffers.ends, buffers.pairs
+    )
