@@ -31,16 +31,25 @@ from benchmarks.harness import ROOT, CheckFailed, check, revision
 
 CSV, MEMORY_CSV = ROOT / "docs" / "results" / "figures.csv", ROOT / "docs" / "results" / "memory.csv"
 COLUMNS = (
-    "scene", "command", "bytes", "ratio", "drop_db", "fidelity_db", "seconds", "cpu_seconds", "peak_mib", "machine", "commit",
+    "scene", "command", "bytes", "ratio", "drop_db", "fidelity_db", "worst_db", "worst_allowed_db", "ssim_lost", "flip",
+    "decided", "seconds", "cpu_seconds", "peak_mib", "machine", "commit",
 )  # fmt: skip
 Row = dict[str, str]
 SCENES_DIR = Path(os.environ.get("FLEXGS_SCENES", ROOT.parent / "shared" / "scenes"))
-SCENES = {
-    "still_life": ROOT / "samples" / "still_life",
-    "fox": SCENES_DIR / "fox",
-    "figure": SCENES_DIR / "figure",
-}
-"""The bundled scene, and two others that the repository lacks."""
+SHOWN = ("still_life", "fox", "figure")
+"""The bundled scene, and two others that the repository lacks. Pages show these."""
+
+
+def found_scenes() -> dict[str, Path]:
+    """Scenes by name: those of `SHOWN`, and every other folder of FLEXGS_SCENES that has a scene, cameras and photos."""
+    scenes = {name: SCENES_DIR / name for name in SHOWN}
+    scenes["still_life"] = ROOT / "samples" / "still_life"
+    others = sorted(SCENES_DIR.iterdir()) if SCENES_DIR.is_dir() else []
+    needed = ("point_cloud.ply", "cameras.json", "images")
+    return scenes | {p.name: p for p in others if p.name not in scenes and all((p / name).exists() for name in needed)}
+
+
+SCENES = found_scenes()
 DEFAULT = "compress"
 EFFORTS = {
     DEFAULT: "default",
@@ -50,7 +59,12 @@ EFFORTS = {
     "compress --method paper": "`--method paper`",
 }
 FORMATS = ("compress -o X.spz", "compress -o X.sog", "compress -o X.compressed.ply")
-COMMANDS = {**{command: tuple(SCENES) for command in EFFORTS}, **dict.fromkeys(FORMATS, ("still_life",))}
+MEAN = ("compress --promise mean", "compress --effort max --promise mean", "compress --method paper --promise mean")
+COMMANDS = {
+    **{command: tuple(SCENES) for command in EFFORTS},
+    **dict.fromkeys(MEAN, tuple(SCENES)),
+    **dict.fromkeys(FORMATS, ("still_life",)),
+}
 """Commands to run, and the scenes of each."""
 PICTURE, VIEW, LABEL = ROOT / "docs" / "images" / "still_life.jpg", "24", 26
 NONE = "\u2013"
@@ -101,6 +115,7 @@ def check_result(taken: Taken, output: Path) -> None:
     record = taken.record
     check(record["size"] == len(taken.file), f"{output.name}: the record says {record['size']} bytes")
     check(record["reached"] is True, f"{output.name}: the target is not met")
+    check(record["promise"] is None or record["promise"]["held"], f"{output.name}: the promise is not kept")
 
 
 def measure(name: str, command: str, repeats: int) -> Row:
@@ -122,6 +137,7 @@ def measure(name: str, command: str, repeats: int) -> Row:
         f"{record['ratio']:.1f}",
         f"{record['quality']['drop']:.3f}",
         f"{record['quality']['fidelity']:.2f}",
+        *promise_figures(record),
         f"{middle['seconds']:.1f}",
         f"{middle['cpu_seconds']:.1f}",
         f"{middle['peak_mib']:.0f}",
@@ -129,6 +145,20 @@ def measure(name: str, command: str, repeats: int) -> Row:
         revision(),
     )
     return dict(zip(COLUMNS, map(str, values)))
+
+
+def promise_figures(record: dict[str, Any]) -> tuple[str, ...]:
+    """Worst view and what it may lose, SSIM lost, FLIP, and what decided, from the record of a run against photos."""
+    quality, promise = record["quality"], record["promise"]
+    parts = {part["name"]: part for part in promise["parts"]} if promise else {}
+    worst = parts.get("worst view")
+    return (
+        f"{quality['worst']['drop']:.3f}",
+        f"{worst['allowed']:.3f}" if worst else "",
+        f"{quality['original_ssim'] - quality['ssim']:.4f}",
+        f"{quality['flip']:.4f}",
+        promise["decided"] if promise else "target",
+    )
 
 
 def read_rows(place: Path = CSV) -> list[Row]:
@@ -203,8 +233,32 @@ def scenes_table(rows: Sequence[Row]) -> str:
         return f"{megabytes(size)} MB, {ratio:.1f}x, {cpu:.0f} s"
 
     return table(
-        ("command", *SCENES), ((f"`{command}`", *(cell(name, command) for name in SCENES)) for command in EFFORTS)
+        ("command", *SHOWN),
+        ((f"`{command}`", *(cell(name, command) for name in SHOWN)) for command in (*EFFORTS, *MEAN)),
     )
+
+
+def promise_table(rows: Sequence[Row]) -> str:
+    """Every command on every scene: what it lost by each measure, and which bound decided."""
+    head = ("scene", "command", "MB", "ratio", "drop, dB", "worst view (allowed), dB", "SSIM lost", "FLIP", "decided")
+    lines = []
+    for row in rows:
+        if row["command"] in (*EFFORTS, *MEAN):
+            allowed = f" ({float(row['worst_allowed_db']):.2f})" if row["worst_allowed_db"] else ""
+            lines.append(
+                (
+                    row["scene"],
+                    f"`{row['command']}`",
+                    megabytes(float(row["bytes"])),
+                    f"{row['ratio']}x",
+                    f"{float(row['drop_db']):.2f}",
+                    f"{float(row['worst_db']):.2f}{allowed}",
+                    row["ssim_lost"],
+                    row["flip"],
+                    row["decided"],
+                )
+            )
+    return table(head, lines)
 
 
 def span(values: Iterable[float]) -> str:
@@ -218,7 +272,7 @@ def effort_table(rows: Sequence[Row]) -> str:
     """Each effort compared with the default: factors of processor time and of bytes over all scenes."""
 
     def factors(command: str, column: str) -> str:
-        scenes = COMMANDS[command]
+        scenes = [name for name in COMMANDS[command] if name in SHOWN]
         return span(figure(rows, s, command, column) / figure(rows, s, DEFAULT, column) for s in scenes)
 
     lines = [(name, factors(command, "cpu_seconds"), factors(command, "bytes")) for command, name in EFFORTS.items()]
@@ -250,6 +304,7 @@ def capped_table(_: Sequence[Row]) -> str:
 TABLES: dict[str, Callable[[Sequence[Row]], str]] = {
     "scenes": scenes_table,
     "effort": effort_table,
+    "promise": promise_table,
     "capped": capped_table,
 }
 BLOCK = re.compile(r"(<!-- figures: ([^>]*?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)

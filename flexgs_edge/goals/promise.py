@@ -72,8 +72,9 @@ class WorstView:
         found = self.found(measurement)
         if found is None or self.limit is not None:
             return None if found is None else log_loss(found, self.limit or 0.0)
-        # Worst view over bound would hardly change with compression. What it loses beyond the mean's share does.
-        return log_loss(found - WORST_TIMES * (measurement.usual or 0.0), WORST_MORE)
+        # Worst view over bound would hardly change with compression. What it loses beyond the mean's share changes as the
+        # mean does, but varies by itself too: half of it keeps a search from overshooting.
+        return log_loss(found - WORST_TIMES * (measurement.usual or 0.0), WORST_MORE) / 2
 
     def report(self, measurement: Measurement) -> str:
         found = self.found(measurement)

@@ -105,7 +105,7 @@ def sampling_steps(
     steps = np.ones(len(cameras), np.int64)
     for factor in changes:
         farther = np.clip(np.floor(factor * spread * (1 + 1e-9)), 1, LARGEST_STEP).astype(np.int64)
-        if coverage * sum(_lattice(*pair) for pair in zip(cameras, farther.tolist(), strict=True)) < pixels:
+        if coverage * pixels_of(cameras, farther.tolist()) < pixels:
             break
         steps = farther
     return [int(step) for step in steps]
@@ -124,9 +124,9 @@ def sampled_poses(cameras: Sequence[Camera], steps: Sequence[int]) -> list[Camer
     ]
 
 
-def _lattice(camera: Camera, step: int) -> int:
-    """Pixels of `camera` at every `step`-th one."""
-    return (camera.width // step) * (camera.height // step)
+def pixels_of(cameras: Sequence[Camera], steps: Sequence[int]) -> int:
+    """Pixels of all views, each at every k-th one; `steps` has the k of each."""
+    return sum((camera.width // step) * (camera.height // step) for camera, step in zip(cameras, steps, strict=True))
 
 
 EFFORTS = {

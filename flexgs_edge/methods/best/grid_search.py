@@ -112,8 +112,8 @@ class GridSearch(MultiplierSearch[GridScene]):
         self._drift = DRIFT_DISTILLED if steps else DRIFT if effort.refit_rounds else 0.0
         self._expected = 0.0
 
-    def _before_refit(self, multiplier: float) -> GridScene:
-        kept, step_sizes = self._choice(multiplier)
+    def _before_refit(self, multiplier: float, anew: bool = False) -> GridScene:
+        kept, step_sizes = self._choice(multiplier, anew)
         return self._to_grid(kept.planes, kept.degrees, step_sizes, self.rounds.storage)[0]
 
     def _to_grid(
@@ -134,9 +134,9 @@ class GridSearch(MultiplierSearch[GridScene]):
         subsets = self.effort.subsets_of(len(original.cameras))
         return refit_colours(planes, degrees, original, rounds=times, bands=bands, subsets=subsets)
 
-    def _probe(self, multiplier: float, target: Target) -> float:
-        """Excess of a probe: the grid of a multiplier, without a refit of its own."""
-        grid = self._before_refit(multiplier)
+    def _probe(self, multiplier: float, target: Target, anew: bool = False) -> float:
+        """Excess of a probe: the grid of a multiplier, without a refit of its own; `anew` is as for `_choice`."""
+        grid = self._before_refit(multiplier, anew)
         if target.limit_bytes is not None:
             return target.excess(self.size_of(grid), None)
         return mean_alone(target).excess(0, self.measure(values_of(grid, self.rounds.storage), estimate=True))
@@ -146,9 +146,11 @@ class GridSearch(MultiplierSearch[GridScene]):
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
         offset = math.log(self._refitted_part()) if self.refit and not by_size else 0.0
+        # A candidate that keeps more than the last descent does not go on from it: it needs a descent of its own.
+        anew = bool(self.steps and steps and not steps[-1].holds and not by_size)
         if steps:
-            offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
-            if self.refit and not by_size:
+            offset = steps[-1].excess - self._probe(steps[-1].multiplier, target, anew)
+            if self.refit and not by_size and not anew:
                 # Probes have the colours of the last refit, and the next refit goes on from these.
                 if len(steps) > 1:
                     self._drift = DECAY * (self._drift + steps[-1].excess - self._expected)
@@ -165,7 +167,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         seen: list[tuple[float, float]] = []
         self._expected = AIM
         for _ in range(PROBES):
-            excess = self._probe(math.exp(place), target) + offset
+            excess = self._probe(math.exp(place), target, anew) + offset
             if abs(excess - AIM) < -AIM:
                 self._expected = excess
                 break
@@ -181,10 +183,10 @@ class GridSearch(MultiplierSearch[GridScene]):
             return DISTILLED
         return self.effort.refitted * FURTHER ** (self.effort.refit_rounds - 1)
 
-    def _choice(self, multiplier: float) -> tuple[Kept, StepSizes]:
-        """The rows that a multiplier keeps, with the colours of the last refit, and the step sizes of the grid."""
+    def _choice(self, multiplier: float, anew: bool = False) -> tuple[Kept, StepSizes]:
+        """The rows that a multiplier keeps, with the colours of the last refit unless `anew`, and the grid's step sizes."""
         kept = self.kept(multiplier)
-        refitted = self._descended(multiplier) if self.steps else self._refitted
+        refitted = None if anew else self._descended(multiplier) if self.steps else self._refitted
         if refitted is not None:
             kept.planes = refitted.apply(kept.rows, kept.degrees, kept.planes, self.rounds.storage)
         snapshot = self.rounds.snapshots[kept.snapshot]

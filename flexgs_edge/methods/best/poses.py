@@ -10,7 +10,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.order import covering_order
 from flexgs_edge.io.ply import inria_dtype
-from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, sampled_poses, sampling_steps
+from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, pixels_of, sampled_poses, sampling_steps
 from flexgs_edge.methods.best.margin import with_margin
 from flexgs_edge.methods.best.view_weights import base_errors, view_weights
 from flexgs_edge.render.renderer import Renderer
@@ -84,11 +84,12 @@ def scored_poses(
     given = {id(camera) for camera in cameras}
     drawn = chosen
     if not fine:
-        weights = None
+        steps = sampling_steps(chosen, source.count * plan.pixels)
         if photo is not None:
             errors = base_errors(renderer, source, known, photo)
             weights = view_weights(errors, known, chosen, options.max_drop or DEFAULT_MAX_DROP)
-        steps = sampling_steps(chosen, source.count * plan.pixels, weights=weights)
+            # As many pixels as without weights, which may be more than are needed.
+            steps = sampling_steps(chosen, pixels_of(chosen, steps), weights=weights)
         if max(steps) > 1 and covered_decides:
             # A small object in a large view would fall between the pixels.
             steps = sampling_steps(chosen, source.count * plan.pixels, _coverage(renderer, source, chosen))
