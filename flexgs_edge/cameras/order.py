@@ -37,7 +37,7 @@ def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, c
     """
     if not cameras:
         return []
-    seen = np.array([_in_picture(camera, points, near) for camera in cameras])
+    seen = np.array([in_picture(camera, points, near) for camera in cameras])
     away = points[None] - np.array([camera.center for camera in cameras])[:, :, None]
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     known = np.zeros(seen.shape)
@@ -51,7 +51,7 @@ def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, c
     return order
 
 
-def _in_picture(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
+def in_picture(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
     """[n] bool, the points ([3, n] f64) that project into the picture of a camera."""
     x, y, z = camera.rotation @ points + camera.translation[:, None]
     with np.errstate(all="ignore"):

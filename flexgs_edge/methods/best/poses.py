@@ -12,7 +12,7 @@ from flexgs_edge.cameras.order import covering_order
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, pixels_of, sampled_poses, sampling_steps
 from flexgs_edge.methods.best.margin import with_margin
-from flexgs_edge.methods.best.view_weights import base_errors, view_weights
+from flexgs_edge.methods.best.view_weights import base_errors, rareness, view_weights
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import DEFAULT_MAX_DROP, CompressOptions
 from flexgs_edge.scene.source import SceneSource
@@ -75,7 +75,8 @@ def scored_poses(
         The photo of one of these ([H, W, 3] f32). Poses then get pixels by `view_weights`. Default: alike.
     """
     plan = EFFORTS[options.effort]
-    order = covering_order(cameras, some_positions(source), renderer.near, plan.views)
+    positions = some_positions(source)
+    order = covering_order(cameras, positions, renderer.near, plan.views)
     rest = sorted(set(range(len(cameras))) - set(order))
     ordered = [cameras[i] for i in (*order, *rest)]
     fine = is_fine(options, source)
@@ -87,7 +88,8 @@ def scored_poses(
         steps = sampling_steps(chosen, source.count * plan.pixels)
         if photo is not None:
             errors = base_errors(renderer, source, known, photo)
-            weights = view_weights(errors, known, chosen, options.max_drop or DEFAULT_MAX_DROP)
+            rare = rareness(chosen, positions, renderer.near)
+            weights = view_weights(errors, known, chosen, options.max_drop or DEFAULT_MAX_DROP, rare)
             # As many pixels as without weights, which may be more than are needed.
             steps = sampling_steps(chosen, pixels_of(chosen, steps), weights=weights)
         if max(steps) > 1 and covered_decides:

@@ -3,6 +3,9 @@
 PSNR falls by 10 log10(1 + error / base error). Where the original is near to its photos, a small error costs many decibels;
 where it is far away, the same error hides. Equal errors everywhere would break the good views, so errors near these count
 more: by a power of 1 / (base error + allowed error), the slope of the drop at the target.
+
+And a part of the scene that few poses see counts little in their sum, but wholly in a view that looks there. So poses
+count more whose picture few others share.
 """
 
 from __future__ import annotations
@@ -12,15 +15,18 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.cameras.order import in_picture
 from flexgs_edge.quality.psnr import mse
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.source import SceneSource
 
+LEAST = 1e-6
+"""Least weight of a pose."""
 STEP = 4
 """Every fourth pixel in both directions is compared."""
-POWER = 4.0
-"""Power of the slope. The slope alone would minimise the mean drop; a higher power lifts the worst view, as a soft maximum
-does: docs/results/tuning.md#view_weights"""
+POWER, RARE_POWER = 4.0, 2.0
+"""Powers of the slope, and of how rare a pose's picture is. The slope alone would minimise the mean drop; higher powers lift
+the worst view, as a soft maximum does: docs/results/tuning.md#view_weights"""
 
 
 def base_errors(
@@ -49,7 +55,9 @@ def base_errors(
     return np.array(errors)
 
 
-def view_weights(errors: np.ndarray, known: Sequence[Camera], cameras: Sequence[Camera], drop: float) -> np.ndarray:
+def view_weights(
+    errors: np.ndarray, known: Sequence[Camera], cameras: Sequence[Camera], drop: float, rare: np.ndarray
+) -> np.ndarray:
     """How much an error counts in each pose, relative to the largest weight.
 
     Parameters
@@ -59,9 +67,11 @@ def view_weights(errors: np.ndarray, known: Sequence[Camera], cameras: Sequence[
     known : sequence of Camera
         The m views that the errors belong to.
     cameras : sequence of Camera
-        The scored poses. Each takes the weight of the nearest known view.
+        The scored poses. Each takes the slope of the nearest known view.
     drop : float
         Allowed drop, dB.
+    rare : np.ndarray
+        [n] f64, from `rareness` of the scored poses.
 
     Returns
     -------
@@ -70,10 +80,29 @@ def view_weights(errors: np.ndarray, known: Sequence[Camera], cameras: Sequence[
     """
     allowed = float(np.median(errors)) * (10 ** (drop / 10) - 1)
     slopes = 1.0 / (errors + max(allowed, 1e-12))
-    weights = (slopes / slopes.max()) ** POWER
-    found: np.ndarray = weights[_nearest(known, cameras)]
-    found /= found.max()
-    return found
+    weights: np.ndarray = (slopes / slopes.max())[_nearest(known, cameras)] ** POWER * rare**RARE_POWER
+    relative: np.ndarray = np.maximum(weights / weights.max(), LEAST)
+    return relative
+
+
+def rareness(cameras: Sequence[Camera], points: np.ndarray, near: float) -> np.ndarray:
+    """[n] f64, above 0 to 1: mean over the points in each picture of 1 / number of poses that have them in theirs.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        The scored poses.
+    points : np.ndarray
+        [3, k] f64, a sample of the scene's positions, world coordinates.
+    near : float
+        Near plane, scene units.
+    """
+    seen = np.array([in_picture(camera, points, near) for camera in cameras])
+    share = seen / np.maximum(seen.sum(axis=0), 1)
+    found: np.ndarray = share.sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    # A pose that shows none of the points counts as the least of the others.
+    shown = found > 0
+    return np.where(shown, found, found[shown].min()) if shown.any() else np.ones(len(cameras))
 
 
 def _nearest(known: Sequence[Camera], cameras: Sequence[Camera]) -> np.ndarray:
