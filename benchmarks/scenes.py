@@ -15,7 +15,9 @@ from benchmarks.figures import EFFORTS, MEAN, SCENES, run, write_tables
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=1, help="timed runs after the one that is checked; default: 1")
+    parser.add_argument(
+        "--repeats", type=int, default=1, help="timed runs after the one that is checked; 0: that one counts"
+    )
     options = parser.parse_args()
     run(list(SCENES), [*EFFORTS, *MEAN], options.repeats)
     write_tables()

@@ -15,6 +15,7 @@ import numpy as np
 
 from flexgs_edge.goals.line import AIM, next_point
 from flexgs_edge.goals.promise import mean_alone
+from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.on_grid import lowered
@@ -22,11 +23,11 @@ from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import recolour, to_grid
 from flexgs_edge.grid.values import values_of
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
-from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOPE, Candidate, bounds, misses
+from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOPE, Candidate, RateResult, bounds, misses
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.kept import Kept, Refitted
-from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
+from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART, Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import Schedule, distil
 from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
@@ -111,6 +112,24 @@ class GridSearch(MultiplierSearch[GridScene]):
         # Without a refit of SH, a candidate takes nothing over from the one before.
         self._drift = DRIFT_DISTILLED if steps else DRIFT if effort.refit_rounds else 0.0
         self._expected = 0.0
+
+    def run(self, target: Target, best_effort: bool = False) -> RateResult[GridScene]:
+        """As `MultiplierSearch.run`. Where no descent keeps a promise, colours are refitted instead.
+
+        Descents gain most in the mean, so that the worst view may never come near enough to it.
+        """
+        if not (self.steps and self.refit) or mean_alone(target) is target:
+            return super().run(target, best_effort)
+        descended = super().run(target, best_effort=True)
+        if descended.reached:
+            return descended
+        LOG.info("no descent keeps the promise: colours are refitted instead")
+        self.steps, self.pruned_part, self.keeps_best = 0, PRUNED_PART, False
+        self._descents, self._refitted, self._slopes = [], None, None
+        self._drift = DRIFT if self.effort.refit_rounds else 0.0
+        refitted = super().run(target, best_effort)
+        best = refitted if better(refitted.chosen, descended.chosen, target) else descended
+        return replace(best, steps=(*descended.steps, *refitted.steps))
 
     def _before_refit(self, multiplier: float, anew: bool = False) -> GridScene:
         kept, step_sizes = self._choice(multiplier, anew)
