@@ -71,7 +71,7 @@ def test_slopes_of_a_moved_scene_are_the_same() -> None:
 
 def test_moved_scenes_are_compressed_alike(tmp_path: Path) -> None:
     project = make_project(tmp_path / "tiny")
-    words = {"effort": "fast", "max_drop": 1.0, "holdout": 4}
+    words = {"effort": "fast", "max_drop": 1.0, "holdout": 4, "promise": "mean"}
     found, note = compare(project, tmp_path, FACTOR, **words)
     assert open_scene(tmp_path / "moved" / "point_cloud.ply").count == open_scene(project / "point_cloud.ply").count
     assert len(read_cameras(tmp_path / "moved" / "cameras.json")) == 9

@@ -37,7 +37,7 @@ from stopped import Stopped
 from synthetic import random_scene
 from tiny_project import COUNT, make_project
 
-BEST: dict[str, Any] = {"method": "best", "effort": "fast"}
+BEST: dict[str, Any] = {"method": "best", "effort": "fast", "promise": "mean"}
 SMALL: dict[str, Any] = {**BEST, "resolution": 120}
 TINY: dict[str, Any] = {**BEST, "holdout": 4}
 
