@@ -61,7 +61,7 @@ COMMANDS = {
     "auto": compress("--effort fast --cameras auto --antialiased", views="--resolution 128"),
     "scratch": compress("--effort fast --memory-limit 220MiB"),
     "cluster": compress("--effort fast --cluster local:1"),
-    "layers": compress("--effort fast --layers 4"),
+    "layers": compress("--effort fast --layers 4 --promise mean"),
     "spz": compress("--effort fast", "out.spz"),
     "sog": compress("--effort fast", "out.sog"),
     "compressed": compress("--effort fast", "out.compressed.ply"),
