@@ -73,13 +73,13 @@ def doubts(
     if trained is not None and held_out is not None and trained - held_out > FIT_GAP:
         found.append(
             f"Fidelity is {trained:.1f} dB on training views and {held_out:.1f} dB on held-out views, {trained - held_out:.1f} "
-            "dB less. The result fits the views that were scored, and others may look worse. Score more views (--effort "
-            "thorough, or more cameras), or add --views-margin."
+            "dB less. The result fits the views that were scored, and others may look worse. Give more cameras, and "
+            "leave made ones in (--views-margin)."
         )
     if scored is not None and scored.poses < NEEDED_VIEWS:
         found.append(
             f"Only {scored.poses} camera views were used; below about {NEEDED_VIEWS} the result may look worse from elsewhere. "
-            "Give more cameras, or add --views-margin to generate some."
+            "Give more cameras, and leave made ones in (--views-margin)."
         )
     if scored is not None and views.cameras_from == AUTO_CAMERAS and scored.unseen > UNSEEN_SHARE * count:
         found.append(

@@ -87,7 +87,9 @@ def test_points_are_those_of_compress(study: tuple[RateStudy, Path], project: Pa
     # The first point of a curve starts from a path of its own, as a run of `compress` does.
     for method, variant in (("best", "whole"), ("paper", "nothing pruned")):
         words = {"min_ratio": RATIO} if method == "best" else {"prune_rate": 0.0, "sh_rate": 0.0}
-        made = compress(project / "point_cloud.ply", None, replace(OPTIONS, method=method, promise="mean", **words), dry_run=True)
+        made = compress(
+            project / "point_cloud.ply", None, replace(OPTIONS, method=method, promise="mean", **words), dry_run=True
+        )
         (row,) = (r for r in rows if (r["method"], r["variant"]) == (method, variant) and r["effort"] != "max")
         assert (row["size"], row["kept"]) == (made.size, made.count)
         assert made.quality is not None
