@@ -234,6 +234,21 @@ __kernel void adam(
   }
 }
 
+// Moves a running mean of values towards them by a share; a share of 1 begins it anew.
+__kernel void follow(
+    const uint stride,
+    const uint planes,
+    const float share,
+    __global const float *values,          // [planes, stride]
+    __global float *mean)                  // [planes, stride]
+{
+  const size_t i = get_global_id(0) * W, s = stride;
+  for (size_t k = 0; k < planes; ++k) {
+    const FW value = LOADF(values, k * s + i), old = LOADF(mean, k * s + i);
+    STOREF(share < 1.0f ? fma((FW)share, value - old, old) : value, mean, k * s + i);
+  }
+}
+
 // Rounds a value to the nearest multiple of a step; a step of 0 leaves it as it is.
 inline FW on_grid(FW value, float step) { return step > 0.0f ? rint(value / (FW)step) * (FW)step : value; }
 

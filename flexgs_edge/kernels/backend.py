@@ -75,6 +75,7 @@ KERNELS: dict[str, KernelSpec] = {
     "dssim_residual": KernelSpec("similarity.cl", "uuufubbbbb", "rows"),
     "project_backward": KernelSpec("backward.cl", "uuuuibbbbbbbbbbb", "rows"),
     "adam": KernelSpec("backward.cl", "uuffbbbbbbb", "rows"),
+    "follow": KernelSpec("backward.cl", "uufbb", "rows"),
     "snap": KernelSpec("backward.cl", "uubbbbbbbb", "rows"),
     "dequantize": KernelSpec("dequantize.cl", "uuuuuuubbbb"),
 }

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from flexgs_edge.kernels.twins.activate import activate
-from flexgs_edge.kernels.twins.backward import adam, project_backward, snap
+from flexgs_edge.kernels.twins.backward import adam, follow, project_backward, snap
 from flexgs_edge.kernels.twins.blend import (
     blend,
     blend_backward,
@@ -70,6 +70,7 @@ TWINS: dict[str, Callable[..., None]] = {
     "sh_residual": sh_residual,
     "project_backward": project_backward,
     "adam": adam,
+    "follow": follow,
     "snap": snap,
     "dequantize": dequantize,
 }

@@ -249,6 +249,11 @@ def adam(
         values[k, rows] = fma(-rates[k], step, values[k, rows])
 
 
+def follow(size: tuple[int, ...], stride: int, planes: int, share: float, values: np.ndarray, mean: np.ndarray) -> None:
+    """Move a running mean of values towards them by a share, in place; a share of 1 begins it anew."""
+    mean[:planes] = fma(f32(share), values[:planes] - mean[:planes], mean[:planes]) if share < 1 else values[:planes]
+
+
 def _on_grid(values: np.ndarray, step: np.float32) -> np.ndarray:
     return np.rint(values / step) * step if step > 0 else values
 

@@ -137,7 +137,7 @@ EFFORTS = {
         keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.06, few=400, views=400, pixels=24, refitted=0.7
     ),
     "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, few=400, views=400, pixels=24),
-    "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=400, views=400, pixels=24, passes=10.0),
+    "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=400, views=400, pixels=24, passes=20.0),
 }
 
 

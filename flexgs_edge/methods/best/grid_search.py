@@ -39,9 +39,10 @@ FURTHER = 0.92
 """Loss after a further round of the colour refit, divided by the loss before it: docs/results/tuning.md#further"""
 DRIFT = -0.12
 """Change of the excess by a second refit, which goes on where the first one ended: docs/results/tuning.md#drift"""
-DISTILLED = 0.4
-"""Expected loss after a descent, divided by the loss before it, until a candidate tells. It is cautious on purpose: a
-further descent can keep fewer Gaussians than the one that it goes on from, but not more: docs/results/tuning.md#distilled"""
+DISTILLED, DISTILLED_POWER = 0.6, -0.3
+"""Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
+the power by which it changes with the steps. It is cautious on purpose: a further descent can keep fewer Gaussians than
+the one that it goes on from, but not more: docs/results/tuning.md#distilled"""
 DRIFT_DISTILLED = -0.3
 """Change of the excess by a further descent (as `DRIFT`): docs/results/tuning.md#drift_distilled"""
 PRUNED_DISTILLED = 1.6
@@ -50,6 +51,9 @@ FURTHER_STEPS = 0.4
 """Steps of a further descent, as a share of the first one's. It goes on where the last one ended."""
 FURTHER_RATE = 0.5
 """Rates of a further descent, as a share of the first one's."""
+FULL_PASSES = 10
+"""Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one:
+docs/results/tuning.md#full_passes"""
 FULL_RATES, LEAST_RATE = 41.0, 0.25
 """Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
 DECAY = 0.8
@@ -196,10 +200,14 @@ class GridSearch(MultiplierSearch[GridScene]):
                 break
         return math.exp(place)
 
+    def _passes(self) -> float:
+        """Steps of the descent to the first candidate for each scored pose."""
+        return self.steps / len(self.rounds.original.cameras)
+
     def _refitted_part(self) -> float:
         """Expected loss after the first candidate's refit or descent, divided by the loss before it."""
         if self.steps:
-            return DISTILLED
+            return DISTILLED * max(self._passes(), 1.0) ** DISTILLED_POWER
         return self.effort.refitted * FURTHER ** (self.effort.refit_rounds - 1)
 
     def _choice(self, multiplier: float, anew: bool = False) -> tuple[Kept, StepSizes]:
@@ -243,6 +251,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         """Move all values towards the references, put them on the grid, and refit the constant colour."""
         first = self._descended(multiplier) is None
         count, rate = (self.steps, 1.0) if first else (math.ceil(FURTHER_STEPS * self.steps), FURTHER_RATE)
+        rate *= min(math.sqrt(FULL_PASSES / self._passes()), 1.0)
         rate *= rate_from(self.measure(kept.planes, estimate=True).figure("fidelity"))
         moved = self._distil(kept, Schedule(count, rate), step_sizes)
         own = np.arange(len(kept.rows))

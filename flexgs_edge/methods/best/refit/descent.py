@@ -36,10 +36,10 @@ def widths(sh_degree: int) -> dict[str, int]:
 def descent_bytes(sh_degree: int) -> int:
     """Bytes a row that a descent takes on the backend beside the scene.
 
-    They hold the sums of a view; all planes four times (values, gradient, two running means); stored geometry, degrees,
-    flags and powers.
+    They hold the sums of a view; all planes five times (values and their mean, gradient, two running means of it); stored
+    geometry, degrees, flags and powers.
     """
-    return sum_bytes(GRADIENT_SUMS) + 4 * (4 * sum(widths(sh_degree).values()) + 8 + 4)
+    return sum_bytes(GRADIENT_SUMS) + 4 * (5 * sum(widths(sh_degree).values()) + 8 + 4)
 
 
 class Descent:
@@ -126,6 +126,16 @@ class Descent:
             part.step(self._rates)
             part.snap(self._steps)
 
+    def follow(self, share: float) -> None:
+        """Move the running mean of the values towards them by `share`; 1 begins it anew."""
+        for part in self._parts:
+            part.follow(share)
+
+    def settle(self) -> None:
+        """Take the running mean as the values."""
+        for part in self._parts:
+            part.settle()
+
     def gradients(self) -> dict[str, np.ndarray]:
         """Gradients of the last view ([width, n] f32 by field), zero for rows that it does not show."""
 
@@ -171,7 +181,9 @@ class _Part:
         self.widths, self._arrays = widths(chunk.degree), []  # type: dict[str, int], list[Any]
         stride, count = chunk.stride, sum(self.widths.values())
         try:
-            self.values, self.gradient, self.first, self.second = (self._array((count, stride)) for _ in range(4))
+            self.values, self.gradient, self.first, self.second, self.mean = (
+                self._array((count, stride)) for _ in range(5)
+            )
             self.powers, self.touched = self._array((2, stride)), self._array((stride,))
             self.degrees = self._array((stride,), np.uint32)
             self.stored = [self._array((width, stride)) for width in (3, 4, 1)]
@@ -187,7 +199,7 @@ class _Part:
     def _fill(self, planes: dict[str, np.ndarray], degrees: np.ndarray) -> None:
         backend, chunk = self.backend, self.chunk
         span = slice(chunk.base, chunk.base + chunk.count)
-        for array in (self.values, self.first, self.second):
+        for array in (self.values, self.first, self.second, self.mean):
             backend.fill(array, 0)
         backend.write(self.powers, np.ones(self.powers.shape, np.float32))
         own_degrees = np.zeros(chunk.stride, np.uint32)
@@ -230,6 +242,14 @@ class _Part:
             "adam", (stride,), stride, sum(self.widths.values()), *DECAYS, rates, self.touched, self.gradient, self.powers,
             self.first, self.second, self.values,
         )  # fmt: skip
+
+    def follow(self, share: float) -> None:
+        stride = self.chunk.stride
+        self.backend.launch("follow", (stride,), stride, sum(self.widths.values()), share, self.values, self.mean)
+
+    def settle(self) -> None:
+        stride = self.chunk.stride
+        self.backend.launch("follow", (stride,), stride, sum(self.widths.values()), 1.0, self.mean, self.values)
 
     def release(self) -> None:
         for array in self._arrays:

@@ -16,19 +16,22 @@ from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.scene.rotations import canonical_axes
 from flexgs_edge.views.original import Original
 
-MEANS_RATE = 2.56e-4
-"""Largest change of a position in a step, as a share of the cameras' extent: 1.6 times the reference program's."""
+MEANS_RATE = 1.0e-4
+"""Largest change of a position in a step, as a share of the cameras' extent: 0.6 times the reference program's.
+With more, positions shake: docs/results/tuning.md#means_rate"""
 FIELD_RATES = {
-    "log_scales": 2.4e-2,
+    "log_scales": 4e-2,
     "quats": 4.8e-3,
     "opacity_logits": 8e-2,
     "sh_dc": 8e-3,
     "sh_rest": 1e-3,
 }
-"""Largest changes of the other values in a step: 1.6 (opacities) to 8 times (SH) the reference program's. That program
+"""Largest changes of the other values in a step: 1.6 (opacities) to 8 times (scales, SH) the reference program's. That program
 takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
 STRUCTURE = 0.02
 """Weight of 1 - SSIM in the loss, in units of a squared error: docs/results/tuning.md#structure"""
+MEAN_VIEWS = 0.5
+"""Values on their grids are averaged over this many steps for each view: docs/results/tuning.md#mean_views"""
 LAST, LAST_HELD = 0.06, 0.03
 """Rates at the end as a share of those at the beginning, while geometry moves and while it is held. They fall by the same factor
 at each step. With more, the views that come last decide too much: docs/results/tuning.md#last"""
@@ -133,11 +136,18 @@ def distil(
             # Rates fall while geometry moves, and fall again while it is held.
             falling, last = (part, LAST_HELD) if held else (range(parts[1].stop), LAST)
             if place and len(part):
+                if held and len(parts[1]):
+                    descent.settle()
                 descent.put_on(step_sizes)
             for k in original.progress.track(part, f"distilling{' on the grid' if place else ''}", len(part)):
                 now = schedule.rate * last ** ((k - falling.start) / len(falling))
                 moving = {name: 0.0 if name in held else now * rate for name, rate in rates.items()}
                 descent.step(cameras[order[k]], original.references[order[k]], moving)
+                if place:
+                    # A plain mean first, then one that forgets: single views then decide little.
+                    descent.follow(max(1.0 / (k - part.start + 1), 1.0 / max(MEAN_VIEWS * len(cameras), 1.0)))
+        if len(parts[1]) or len(parts[2]):
+            descent.settle()
         moved = descent.planes()
     back = np.empty_like(rows)
     back[rows] = np.arange(len(rows))
