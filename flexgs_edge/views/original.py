@@ -31,6 +31,8 @@ class Original:
         Further poses. A descent that knew only the scored poses would fit these, and get worse between them.
     progress : Progress
         Told of each view.
+    turns : np.ndarray, optional
+        [n] f64, above 0: how often a descent looks at each of `poses`, relative to the others. Default: alike.
     """
 
     bench: Bench
@@ -39,6 +41,7 @@ class Original:
     references: References
     between: Sequence[Camera] = ()
     progress: Progress = SILENT
+    turns: np.ndarray | None = None
 
     @property
     def poses(self) -> list[Camera]:

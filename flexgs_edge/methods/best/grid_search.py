@@ -207,7 +207,7 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _refitted_part(self) -> float:
         """Expected loss after the first candidate's refit or descent, divided by the loss before it."""
         if self.steps:
-            return DISTILLED * max(self._passes(), 1.0) ** DISTILLED_POWER
+            return DISTILLED * math.pow(max(self._passes(), 1.0), DISTILLED_POWER)
         return self.effort.refitted * FURTHER ** (self.effort.refit_rounds - 1)
 
     def _choice(self, multiplier: float, anew: bool = False) -> tuple[Kept, StepSizes]:

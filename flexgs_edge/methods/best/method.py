@@ -37,12 +37,13 @@ from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
 from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, choose_storage, least_spilled, needed_bytes
+from flexgs_edge.methods.best.view_weights import KnownErrors
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.run.judges import Judges
 from flexgs_edge.run.made import Made
-from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.options import DEFAULT_MAX_DROP, CompressOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings
 from flexgs_edge.scene.check import alive, invisible
@@ -196,7 +197,10 @@ def search_best(
     BudgetError
         When the scene does not fit.
     """
-    with open_rounds(run, bench, poses.cameras, checkpoint=checkpoint) as rounds, run.clock.stage("search"):
+    with (
+        open_rounds(run, bench, poses.cameras, checkpoint=checkpoint, known=poses.known) as rounds,
+        run.clock.stage("search"),
+    ):
         product, search = search_rounds(
             make, rounds, run, judge, on_step=lambda step: LOG.info("%s", step_words(step, run.target))
         )
@@ -210,6 +214,7 @@ def open_rounds(
     scored: Sequence[Camera],
     make: Callable[..., PruneRounds] = PruneRounds,
     checkpoint: Checkpoint | None = None,
+    known: KnownErrors | None = None,
 ) -> Iterator[PruneRounds]:
     """Open the rounds of pruning for one search, or for several that share them, the weakest compression first.
 
@@ -225,6 +230,8 @@ def open_rounds(
         Builds the rounds from the arguments of `PruneRounds`.
     checkpoint : Checkpoint, optional
         Keeps the rounds for a later run.
+    known : KnownErrors, optional
+        From `scored_poses`; descents look at poses by it.
     """
     renderer, source, options, budget = bench.renderer, run.source, run.options, run.budget
     storage, steps = renderer.storage, distil_steps(options, len(scored))
@@ -244,8 +251,10 @@ def open_rounds(
                 # Neighbours in space become neighbours in memory, so views are drawn faster.
                 rows = storage.take(rows, near_rows(storage.take(planes["means"], rows), storage))
                 between = poses_between(scored) if steps else ()
+                drop = options.max_drop or DEFAULT_MAX_DROP
+                turns = known.slopes([*scored, *between], drop) if known and steps else None
                 rounds = make(
-                    Original(bench, source.origin, scored, references, between, run.progress),
+                    Original(bench, source.origin, scored, references, between, run.progress, turns),
                     planes,
                     rows,
                     refit=options.refit,

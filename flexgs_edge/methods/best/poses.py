@@ -12,7 +12,7 @@ from flexgs_edge.cameras.order import covering_order
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, pixels_of, sampled_poses, sampling_steps
 from flexgs_edge.methods.best.margin import with_margin
-from flexgs_edge.methods.best.view_weights import base_errors, rareness, view_weights
+from flexgs_edge.methods.best.view_weights import KnownErrors, base_errors, rareness, view_weights
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import DEFAULT_MAX_DROP, CompressOptions
 from flexgs_edge.scene.source import SceneSource
@@ -37,10 +37,13 @@ class ScoredPoses:
         At every pixel, or at as many as the scene's Gaussians need.
     made : int
         How many of them were generated (`--views-margin`).
+    known : KnownErrors, optional
+        What decides how often descents look at a pose. Default: all alike.
     """
 
     cameras: list[Camera]
     made: int = 0
+    known: KnownErrors | None = None
 
 
 def scored_poses(
@@ -84,19 +87,19 @@ def scored_poses(
     chosen = with_margin(renderer, source, ordered, most) if options.makes_poses else ordered[:most]
     given = {id(camera) for camera in cameras}
     drawn = chosen
+    errors = None if photo is None else KnownErrors(known, base_errors(renderer, source, known, photo))
     if not fine:
         steps = sampling_steps(chosen, source.count * plan.pixels)
-        if photo is not None:
-            errors = base_errors(renderer, source, known, photo)
-            rare = rareness(chosen, positions, renderer.near)
-            weights = view_weights(errors, known, chosen, options.max_drop or DEFAULT_MAX_DROP, rare)
+        if errors is not None:
+            slopes = errors.slopes(chosen, options.max_drop or DEFAULT_MAX_DROP)
+            weights = view_weights(slopes, rareness(chosen, positions, renderer.near))
             # As many pixels as without weights, which may be more than are needed.
             steps = sampling_steps(chosen, pixels_of(chosen, steps), weights=weights)
         if max(steps) > 1 and covered_decides:
             # A small object in a large view would fall between the pixels.
             steps = sampling_steps(chosen, source.count * plan.pixels, _coverage(renderer, source, chosen))
         drawn = sampled_poses(chosen, steps)
-    return ScoredPoses(drawn, sum(id(camera) not in given for camera in chosen))
+    return ScoredPoses(drawn, sum(id(camera) not in given for camera in chosen), errors)
 
 
 def _coverage(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera]) -> float:

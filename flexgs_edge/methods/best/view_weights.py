@@ -4,6 +4,8 @@ PSNR falls by 10 log10(1 + error / base error). Where the original is near to it
 where it is far away, the same error hides. Equal errors everywhere would break the good views, so errors near these count
 more: by a power of 1 / (base error + allowed error), the slope of the drop at the target.
 
+Descents look the more often at a pose, the larger this slope is there.
+
 And a part of the scene that few poses see counts little in their sum, but wholly in a view that looks there. So poses
 count more whose picture few others share.
 """
@@ -11,6 +13,7 @@ count more whose picture few others share.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,6 +30,37 @@ STEP = 4
 POWER, RARE_POWER = 4.0, 2.0
 """Powers of the slope, and of how rare a pose's picture is. The slope alone would minimise the mean drop; higher powers lift
 the worst view, as a soft maximum does: docs/results/tuning.md#view_weights"""
+
+
+@dataclass(frozen=True)
+class KnownErrors:
+    """How near the original is to the photos of the views that decide.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        The m views.
+    errors : np.ndarray
+        [m] f64, from `base_errors`.
+    """
+
+    cameras: Sequence[Camera]
+    errors: np.ndarray
+
+    def slopes(self, cameras: Sequence[Camera], drop: float) -> np.ndarray:
+        """[n] f64, above 0 to 1: the slope of the drop by the error, of the view that is nearest to each camera.
+
+        Parameters
+        ----------
+        cameras : sequence of Camera
+            The n poses.
+        drop : float
+            Allowed drop, dB.
+        """
+        allowed = float(np.median(self.errors)) * (10 ** (drop / 10) - 1)
+        slopes = 1.0 / (self.errors + max(allowed, 1e-12))
+        relative: np.ndarray = (slopes / slopes.max())[_nearest(self.cameras, cameras)]
+        return relative
 
 
 def base_errors(
@@ -55,32 +89,22 @@ def base_errors(
     return np.array(errors)
 
 
-def view_weights(
-    errors: np.ndarray, known: Sequence[Camera], cameras: Sequence[Camera], drop: float, rare: np.ndarray
-) -> np.ndarray:
-    """How much an error counts in each pose, relative to the largest weight.
+def view_weights(slopes: np.ndarray, rare: np.ndarray) -> np.ndarray:
+    """How much an error counts in each scored pose, relative to the largest weight.
 
     Parameters
     ----------
-    errors : np.ndarray
-        [m] f64, from `base_errors`.
-    known : sequence of Camera
-        The m views that the errors belong to.
-    cameras : sequence of Camera
-        The scored poses. Each takes the slope of the nearest known view.
-    drop : float
-        Allowed drop, dB.
+    slopes : np.ndarray
+        [n] f64, from `KnownErrors.slopes`.
     rare : np.ndarray
-        [n] f64, from `rareness` of the scored poses.
+        [n] f64, from `rareness`.
 
     Returns
     -------
     np.ndarray
         [n] f64, above 0 to 1.
     """
-    allowed = float(np.median(errors)) * (10 ** (drop / 10) - 1)
-    slopes = 1.0 / (errors + max(allowed, 1e-12))
-    weights: np.ndarray = (slopes / slopes.max())[_nearest(known, cameras)] ** POWER * rare**RARE_POWER
+    weights: np.ndarray = slopes**POWER * rare**RARE_POWER
     relative: np.ndarray = np.maximum(weights / weights.max(), LEAST)
     return relative
 

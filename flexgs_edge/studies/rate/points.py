@@ -198,7 +198,7 @@ def best_points(
     found = NOTHING
     started = time.perf_counter()
     run = replace(run, options=options)
-    with open_rounds(run, studied.bench, poses.cameras, variant.path) as rounds:
+    with open_rounds(run, studied.bench, poses.cameras, variant.path, known=poses.known) as rounds:
         coder = GridCoder(studied.bench.renderer)
         for ratio in sorted(ratios):
             aimed = run.aimed_at(_target(studied, ratio))

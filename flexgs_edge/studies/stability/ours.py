@@ -78,7 +78,7 @@ def walked(
     options, bench = replace(studied.run.options, views_margin=margin), bench or studied.bench
     run = replace(studied.run.of_source(source), options=options)
     poses = scored_poses(cameras, options, bench.renderer, source, studied.judge.covered_decides)
-    with open_rounds(run, bench, poses.cameras) as rounds:
+    with open_rounds(run, bench, poses.cameras, known=poses.known) as rounds:
         yield rounds
 
 

@@ -151,6 +151,14 @@ def test_each_view_comes_once_in_each_round() -> None:
     assert not same_bits(order[:7], order[7:14])
 
 
+def test_a_view_with_more_turns_comes_more_often() -> None:
+    order = Schedule(40).order(4, np.array([4.0, 2.0, 1.0, 1.0]))
+    assert np.bincount(order).tolist() == [20, 10, 5, 5]
+    # What a round leaves over counts in the next: five steps for each two rounds of four.
+    assert np.bincount(order[:8]).tolist() == [4, 2, 1, 1]
+    assert len(Schedule(3).order(0)) == 0
+
+
 def test_parts_of_a_descent(workshop: Workshop) -> None:
     assert [len(part) for part in Schedule(8).parts(True)] == [4, 2, 2]
     assert [len(part) for part in Schedule(8).parts(False)] == [8, 0, 0]
@@ -211,11 +219,11 @@ def test_distilled_files_lose_less_in_the_same_bytes(project: Path, tmp_path: Pa
         "promise": "mean",
         "cameras": str(project / "cameras.json"),
     }
-    # How far below its limit a search ends is partly chance, and 1 % of the bytes are 0.15 dB here.
+    # How far below its limit a search ends is partly chance.
     plain = compress(project / "point_cloud.ply", tmp_path / "plain.fgs", distil=0, max_size=7500, **words)
-    found = compress(project / "point_cloud.ply", tmp_path / "a.fgs", distil=60, max_size=7500, **words)
-    again = compress(project / "point_cloud.ply", tmp_path / "b.fgs", distil=60, max_size=7500, **words)
-    assert found.size <= 7500 and abs(found.size - plain.size) < 0.02 * found.size
+    found = compress(project / "point_cloud.ply", tmp_path / "a.fgs", distil=240, max_size=7500, **words)
+    again = compress(project / "point_cloud.ply", tmp_path / "b.fgs", distil=240, max_size=7500, **words)
+    assert found.size <= 7500 and found.size <= 1.02 * plain.size
     assert found.training_fidelity is not None and plain.training_fidelity is not None
     # Not of held-out views: of this scene they are worse at 8500 bytes than at 7500, whatever is done.
     assert found.training_fidelity > plain.training_fidelity + 0.5, (found.training_fidelity, plain.training_fidelity)

@@ -20,7 +20,7 @@ from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses, sampling_steps
-from flexgs_edge.methods.best.grid_search import DISTILLED, GridSearch, rate_from
+from flexgs_edge.methods.best.grid_search import DISTILLED, DISTILLED_POWER, FULL_PASSES, GridSearch, rate_from
 from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.multiplier import EXTRA_STEPS
 from flexgs_edge.methods.best.refit.distil import Schedule
@@ -48,7 +48,7 @@ class FakeRounds:
         removal = rng.lognormal(math.log(scale * AT * 50), 3, count) * (weight2 > 0)
         sh = rng.lognormal(math.log(scale * AT * 10), 2, (degree, count)) * (weight2 > 0)
         costs = RemovalCosts(removal, weight2, sh, np.zeros((degree, 3, count), np.float32))
-        self.original = SimpleNamespace(origin=np.zeros(3), cameras=(), bench=SimpleNamespace(renderer=None))
+        self.original = SimpleNamespace(origin=np.zeros(3), cameras=range(10), bench=SimpleNamespace(renderer=None))
         self.snapshots = [Snapshot(np.arange(count), planes, costs)]
         self.shares: list[float] = []
 
@@ -300,7 +300,9 @@ def test_descents_go_on_from_each_other(found: float, gain: float) -> None:
             drop = (super().measure(planes, estimate).drop or 0.0) * (gain if descended else 1.0)
             return Measurement(drop, 30.0, drop)
 
-    world = Blurred(lambda m: found / DISTILLED * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
+    expected_part = DISTILLED * 10**DISTILLED_POWER
+    assert FULL_PASSES >= 10
+    world = Blurred(lambda m: found / expected_part * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
     rounds = FakeRounds()
     result = search(world, MaxDrop(1.0), rounds, kind=Descending, refit=True, steps=100)
     assert result.reached and len(seen) == len(result.steps)
@@ -310,7 +312,7 @@ def test_descents_go_on_from_each_other(found: float, gain: float) -> None:
         expected = (40, 0.5) if any(multiplier <= step.multiplier for multiplier in tried) else (100, 1.0)
         assert call[:2] == expected and (call[2] == 9.0) == (expected[0] == 40)
         tried.append(step.multiplier)
-    assert len(seen) > 1 and (40 in [steps for steps, *_ in seen]) == (gain < DISTILLED)
+    assert len(seen) > 1 and (40 in [steps for steps, *_ in seen]) == (gain < expected_part)
 
 
 @pytest.mark.parametrize(("steps", "after"), [(100, 1), (100, 0), (0, 1)])

@@ -68,11 +68,22 @@ class Schedule:
         )
         return range(free), range(free, moving), range(moving, self.iterations)
 
-    def order(self, views: int) -> np.ndarray:
-        """[iterations] i64, the view of each step: all views in a shuffled order, then all again in another order."""
+    def order(self, views: int, turns: np.ndarray | None = None) -> np.ndarray:
+        """[iterations] i64, the view of each step: all views in a shuffled order, then all again in another order.
+
+        With `turns`, a round has as many steps, and a view comes as often as its share of their sum says; what a round
+        leaves over counts in the next.
+        """
         rng = np.random.default_rng(0)
-        rounds = [rng.permutation(views) for _ in range(-(-self.iterations // max(views, 1)))]
-        return np.concatenate([*rounds, np.zeros(0, np.int64)])[: self.iterations]
+        shares = np.ones(views) if turns is None else turns * (views / turns.sum())
+        due, rounds, left = np.zeros(views), [np.zeros(0, np.int64)], self.iterations if views else 0
+        while left > 0:
+            due += shares
+            times = np.floor(due + 1e-9).astype(np.int64)
+            due -= times
+            rounds.append(rng.permutation(np.repeat(np.arange(views), times)))
+            left -= len(rounds[-1])
+        return np.concatenate(rounds)[: self.iterations]
 
 
 def rates_for(cameras: Sequence[Camera]) -> dict[str, float]:
@@ -129,7 +140,7 @@ def distil(
     rows = np.argsort(degrees == 0, kind="stable")
     ordered = {name: np.ascontiguousarray(values[:, rows]) for name, values in ordered.items()}
     with Descent(original.bench.renderer, ordered, degrees[rows], original.origin, largest, structure) as descent:
-        order = schedule.order(len(cameras))
+        order = schedule.order(len(cameras), original.turns)
         parts = schedule.parts(step_sizes is not None)
         for place, part in enumerate(parts):
             held = HELD if place == 2 else ()
