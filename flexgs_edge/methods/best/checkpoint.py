@@ -114,7 +114,7 @@ def open_checkpoint(
     """Open the folder for the rounds of a search. Its name holds a fingerprint of all that they depend on."""
     options = run.options
     # Rounds that lead to a descent also keep references from between the scored poses.
-    distils = distil_steps(options, len(scored)) > 0
+    distils = distil_steps(options, len(scored), run.source.count) > 0
     words = f"path {EFFORTS[options.effort].keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r} {distils}"
     assert options.near is not None and options.extent is not None
     key = fingerprint(run.source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))

@@ -13,6 +13,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.run.options import CompressOptions
 
+LARGEST_COUNT = 1 << 62
 LEAST_VIEWS = 6
 """Least poses for a step of the refit. Steps from fewer poses overfit the scored poses, and all others get worse:
 docs/results/tuning.md#least_views"""
@@ -56,6 +57,9 @@ class Effort:
         Most poses that trial grids are measured on: docs/results/tuning.md#probed
     passes : float
         How often the descent to the first candidate looks at every scored pose. 0 (default): colours are refitted instead.
+    descends : int
+        Most Gaussians of a scene that descends; of larger ones, colours are refitted. The memory limit has no say, so that
+        files do not depend on it.
     """
 
     keep: float
@@ -69,6 +73,7 @@ class Effort:
     refitted: float = REFITTED
     probed: int = 8
     passes: float = 0.0
+    descends: int = LARGEST_COUNT
 
     def poses_of(self, pixels: Sequence[int], count: int) -> int:
         """How many poses to score for `count` Gaussians; `pixels` are those of each pose, in order."""
@@ -134,13 +139,38 @@ EFFORTS = {
         keep=0.77, refit_rounds=0, subsets=7, steps=1, close=0.08, few=32, views=96, pixels=12, refitted=0.86, probed=4
     ),
     "balanced": Effort(
-        keep=0.88, refit_rounds=2, subsets=7, steps=2, close=0.06, few=400, views=400, pixels=24, refitted=0.7
+        keep=0.88,
+        refit_rounds=2,
+        subsets=7,
+        steps=2,
+        close=0.06,
+        few=400,
+        views=400,
+        pixels=24,
+        refitted=0.7,
+        passes=4.0,
+        descends=500_000,
     ),
     "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, few=400, views=400, pixels=24),
     "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=400, views=400, pixels=24, passes=20.0),
 }
 
 
-def distil_steps(options: CompressOptions, poses: int) -> int:
-    """Steps of the descent to the first candidate; 0 for none."""
-    return round(EFFORTS[options.effort].passes * poses) if options.distil is None else options.distil
+def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool = False) -> int:
+    """Steps of the descent to the first candidate; 0 for none.
+
+    Parameters
+    ----------
+    options : CompressOptions
+        Effort, `distil` and `refit`.
+    poses : int
+        Scored poses.
+    count : int
+        Gaussians of the scene.
+    foreign : bool
+        The file has another format than `.fgs`, with a grid of its own.
+    """
+    plan = EFFORTS[options.effort]
+    if foreign or options.distil is not None:
+        return 0 if foreign else options.distil or 0
+    return round(plan.passes * poses) if options.refit and count <= plan.descends else 0

@@ -99,7 +99,7 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
         with run.clock.stage("search"):
             found = kept_as_it_is(run, bench, coder, judges.decide)
         grid, search = found or search_best(
-            grid_search(run.options, coder), run, bench, poses, judges.decide, checkpoint=kept
+            grid_search(run.options, coder, run.source.count), run, bench, poses, judges.decide, checkpoint=kept
         )
         judges.decided()
         if run.options.layers > 1:
@@ -148,9 +148,9 @@ def _tried(
 
 
 def grid_search(
-    options: CompressOptions, coder: GridCoder, search: type[GridSearch] = GridSearch
+    options: CompressOptions, coder: GridCoder, count: int, search: type[GridSearch] = GridSearch
 ) -> SearchMaker[GridScene]:
-    """Make searches for the grid of a `.fgs`."""
+    """Make searches for the grid of a `.fgs` of a scene of `count` Gaussians."""
 
     def size_of(grid: GridScene) -> int:
         size = coder.size(grid)
@@ -159,7 +159,7 @@ def grid_search(
     plan = EFFORTS[options.effort]
 
     def make(rounds: PruneRounds, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
-        steps = distil_steps(options, len(rounds.original.cameras))
+        steps = distil_steps(options, len(rounds.original.cameras), count)
         return search(rounds, size_of, measure, plan, options.refit, report, steps)
 
     return make
@@ -234,11 +234,11 @@ def open_rounds(
         From `scored_poses`; descents look at poses by it.
     """
     renderer, source, options, budget = bench.renderer, run.source, run.options, run.budget
-    storage, steps = renderer.storage, distil_steps(options, len(scored))
+    storage, steps = renderer.storage, distil_steps(options, len(scored), source.count, run.output.format is not None)
     if storage.spills:
         size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest_of(scored))
     else:
-        size, least = needed_bytes(renderer, source, scored, options)
+        size, least = needed_bytes(renderer, source, scored, options, steps > 0)
     budget.require("a search by measured costs", size + least)
     budget.take("the scene and its search", size)
     try:

@@ -88,11 +88,15 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
     largest = largest_of(scored)
     rows, keep = source.count, EFFORTS[options.effort].keep
     whole = rows * row_bytes(source.sh_degree, keep, parts_of(len(scored)))
-    size, least = needed_bytes(renderer, source, scored, options)
+    distils = distil_steps(options, len(scored), source.count) > 0
+    size, least = needed_bytes(renderer, source, scored, options, distils)
     if size + least <= budget.free:
         return IN_MEMORY
-    if distil_steps(options, len(scored)):
-        budget.require("distilling (--effort max, --distil), which stays in memory as a whole,", size + least)
+    if distils:
+        budget.require(
+            "distilling, which stays in memory as a whole (--distil 0 refits colours instead, in larger files),",
+            size + least,
+        )
     budget.require(
         "a search by measured costs with all else in scratch files",
         READING_BYTES + SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest),
@@ -112,19 +116,18 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
 
 
 def needed_bytes(
-    renderer: Renderer, source: SceneSource, scored: Sequence[Camera], options: CompressOptions
+    renderer: Renderer, source: SceneSource, scored: Sequence[Camera], options: CompressOptions, distils: bool
 ) -> tuple[int, int]:
     """Bytes that a search in memory holds, and the least bytes that drawing needs beside them."""
     size, sums = (
         source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep, parts_of(len(scored))),
         sum_row_bytes(source.sh_degree),
     )
-    distils = distil_steps(options, len(scored))
     if distils:
         # A descent holds all kept rows at once, with their gradients. That is the whole scene at most.
         sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))
         size += source.count * DESCENTS * stored_bytes(source.sh_degree)
-    return size, _least_bytes(renderer, source, largest_of(scored), sums, distils > 0)
+    return size, _least_bytes(renderer, source, largest_of(scored), sums, distils)
 
 
 def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:
