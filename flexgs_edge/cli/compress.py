@@ -198,7 +198,7 @@ Several scenes:
     metavar="STEPS",
     type=int,
     help="Fine-tune all remaining Gaussians against renders of the original, one view a step. Needs no photos; .fgs only. "
-    "Slower, smaller files. 0: off. Default: off; with --effort max, 10 steps a scored view.",
+    "Slower, smaller files. 0: off. Default: by --effort.",
 )
 @option(
     METHOD,

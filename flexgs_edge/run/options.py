@@ -182,7 +182,8 @@ class CompressOptions(ViewOptions):
     base_psnr : float
         Assumed PSNR of the original against its photos, for the modelled drop, dB.
     effort : {"fast", "balanced", "thorough", "max"}
-        More effort makes smaller files and takes longer. `max` also distils (`best`, `.fgs`). Default: `balanced`.
+        More effort makes smaller files and takes longer. `balanced` (up to 500 000 Gaussians) and `max` also distil (`best`,
+        `.fgs`). Default: `balanced`.
     best_effort : bool
         If the target cannot be met, write the closest result. Default: raise `TargetError`.
     unseen : str

@@ -122,6 +122,7 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
     with Descent(drawer, planes, np.full(source.count, 4), source.origin, camera, 0.01) as descent:
         descent.put_on(StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04,) * 4))
         descent.step(camera, references[0], {"means": 1e-2, **FIELD_RATES})
+        descent.follow(0.5)
         yield from descent.planes().values()
 
 

@@ -13,6 +13,8 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.run.options import CompressOptions
 
+LEAST_STEPS = 240
+"""Least steps of a descent. Four rounds of a few poses mend less than they break: docs/results/tuning.md#least_steps"""
 LARGEST_COUNT = 1 << 62
 LEAST_VIEWS = 6
 """Least poses for a step of the refit. Steps from fewer poses overfit the scored poses, and all others get worse:
@@ -173,4 +175,6 @@ def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool
     plan = EFFORTS[options.effort]
     if foreign or options.distil is not None:
         return 0 if foreign else options.distil or 0
-    return round(plan.passes * poses) if options.refit and count <= plan.descends else 0
+    if not (plan.passes and options.refit and count <= plan.descends):
+        return 0
+    return max(round(plan.passes * poses), LEAST_STEPS)

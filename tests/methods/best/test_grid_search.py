@@ -19,12 +19,21 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
-from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, Effort, sampled_poses, sampling_steps
+from flexgs_edge.methods.best.effort import (
+    EFFORTS,
+    LARGEST_STEP,
+    LEAST_STEPS,
+    Effort,
+    distil_steps,
+    sampled_poses,
+    sampling_steps,
+)
 from flexgs_edge.methods.best.grid_search import DISTILLED, DISTILLED_POWER, FULL_PASSES, GridSearch, rate_from
 from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.multiplier import EXTRA_STEPS
 from flexgs_edge.methods.best.refit.distil import Schedule
 from flexgs_edge.methods.best.rounds import Snapshot, take_rows
+from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from synthetic import make_camera, random_scene
 
@@ -269,7 +278,19 @@ def test_efforts_grow() -> None:
         assert getattr(fast, name) <= getattr(balanced, name) <= getattr(thorough, name)
         assert getattr(fast, name) < getattr(thorough, name)
     assert fast.close > balanced.close > thorough.close
-    assert EFFORTS["max"].passes > 0 == fast.passes == balanced.passes == thorough.passes
+    assert EFFORTS["max"].passes > balanced.passes > 0 == fast.passes == thorough.passes
+
+
+def test_who_descends() -> None:
+    passes, most = EFFORTS["balanced"].passes, EFFORTS["balanced"].descends
+    assert distil_steps(CompressOptions(), 100, most) == round(100 * passes)
+    assert distil_steps(CompressOptions(), 2, most) == LEAST_STEPS
+    assert (
+        distil_steps(CompressOptions(), 100, most + 1) == 0 < distil_steps(CompressOptions(effort="max"), 100, most + 1)
+    )
+    assert distil_steps(CompressOptions(distil=7), 100, most + 1) == 7
+    for words, foreign in (({"distil": 0}, False), ({"refit": False}, False), ({"effort": "fast"}, False), ({}, True)):
+        assert distil_steps(CompressOptions(**words), 100, 10, foreign) == 0, (words, foreign)
 
 
 def test_descents_with_less_to_mend_go_at_smaller_rates() -> None:
