@@ -25,7 +25,7 @@ NO_CAMERAS = "none"
 """`--cameras none`: no views at all. Only fixed rates work then."""
 METHODS = ("best", "paper")
 EFFORT_WORDS = (*REFINE_STEPS, "max")
-"""`max` also distils. Only the method `best` knows it, and only for a `.fgs`."""
+"""`max` always distils. Only the method `best` knows it, and only for a `.fgs`."""
 SELECTS = ("test", "train")
 PROMISES = ("whole", "mean")
 NONE = "none"
