@@ -59,9 +59,10 @@ class Effort:
         Most poses that trial grids are measured on: docs/results/tuning.md#probed
     passes : float
         How often the descent to the first candidate looks at every scored pose. 0 (default): colours are refitted instead.
-    descends : int
-        Most Gaussians of a scene that descends; of larger ones, colours are refitted. The memory limit has no say, so that
-        files do not depend on it.
+    descends : tuple of int
+        Least and most Gaussians of a scene that descends; of others, colours are refitted. Small scenes gain nothing by it
+        (docs/results/tuning.md#descends), large ones need much memory. The memory limit has no say, so that files do not
+        depend on it.
     """
 
     keep: float
@@ -75,7 +76,7 @@ class Effort:
     refitted: float = REFITTED
     probed: int = 8
     passes: float = 0.0
-    descends: int = LARGEST_COUNT
+    descends: tuple[int, int] = (0, LARGEST_COUNT)
 
     def poses_of(self, pixels: Sequence[int], count: int) -> int:
         """How many poses to score for `count` Gaussians; `pixels` are those of each pose, in order."""
@@ -151,7 +152,7 @@ EFFORTS = {
         pixels=24,
         refitted=0.7,
         passes=4.0,
-        descends=500_000,
+        descends=(10_000, 500_000),
     ),
     "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, few=400, views=400, pixels=24),
     "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=400, views=400, pixels=24, passes=20.0),
@@ -175,6 +176,7 @@ def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool
     plan = EFFORTS[options.effort]
     if foreign or options.distil is not None:
         return 0 if foreign else options.distil or 0
-    if not (plan.passes and options.refit and count <= plan.descends):
+    least, most = plan.descends
+    if not (plan.passes and options.refit and least <= count <= most):
         return 0
     return max(round(plan.passes * poses), LEAST_STEPS)

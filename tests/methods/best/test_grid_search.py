@@ -282,15 +282,16 @@ def test_efforts_grow() -> None:
 
 
 def test_who_descends() -> None:
-    passes, most = EFFORTS["balanced"].passes, EFFORTS["balanced"].descends
+    passes, (least, most) = EFFORTS["balanced"].passes, EFFORTS["balanced"].descends
     assert distil_steps(CompressOptions(), 100, most) == round(100 * passes)
     assert distil_steps(CompressOptions(), 2, most) == LEAST_STEPS
     assert (
         distil_steps(CompressOptions(), 100, most + 1) == 0 < distil_steps(CompressOptions(effort="max"), 100, most + 1)
     )
+    assert distil_steps(CompressOptions(), 100, least - 1) == 0 < distil_steps(CompressOptions(), 100, least)
     assert distil_steps(CompressOptions(distil=7), 100, most + 1) == 7
     for words, foreign in (({"distil": 0}, False), ({"refit": False}, False), ({"effort": "fast"}, False), ({}, True)):
-        assert distil_steps(CompressOptions(**words), 100, 10, foreign) == 0, (words, foreign)
+        assert distil_steps(CompressOptions(**words), 100, least, foreign) == 0, (words, foreign)
 
 
 def test_descents_with_less_to_mend_go_at_smaller_rates() -> None:
