@@ -63,8 +63,8 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
     searches: list[GridSearch] = []
     steps: list[Candidate] = []
 
-    def recording(options: CompressOptions, coder: GridCoder, count: int) -> Any:
-        make = grid_search(options, coder, count)
+    def recording(options: CompressOptions, coder: GridCoder) -> Any:
+        make = grid_search(options, coder)
 
         def recorded(path: Any, measure: Any, report: Any) -> Any:
             def noted(step: Candidate) -> None:

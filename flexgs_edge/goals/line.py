@@ -87,7 +87,7 @@ def search_line(
         if found:
             if any(-CLOSE < step.excess <= 0 for step in found.values()):
                 break
-            points = [(_position(prune, by_size), excess) for prune, excess in _weighed(list(found.values()))]
+            points = weighed([(_position(step.choice.prune, by_size), step.excess) for step in found.values()])
             rate = _rate(next_point(points, -1.0 if by_size else SLOPE, 1.2 if by_size else 0.3), by_size)
             if count == steps - 1 and not any(step.holds for step in found.values()):
                 # The last step measures the gentlest point for a quality, or the smallest file for a size.
@@ -101,16 +101,24 @@ def search_line(
     return list(found.values())
 
 
-def _weighed(steps: list[Step]) -> list[tuple[int, float]]:
-    """(rate, excess) of the steps; after several on one side, the other side counts half for each beyond the first.
+def weighed(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The points for `next_point`; after several on one side, the other side's excess counts half for each beyond the first.
 
     This is the Illinois rule. The log of a loss is curved, so that plain false position would approach the target
     slowly.
+
+    Parameters
+    ----------
+    points : sequence of tuple
+        (position, excess) in the order in which they were measured, at least one.
     """
-    side = steps[-1].holds
-    streak = next((i for i, step in enumerate(reversed(steps)) if step.holds != side), len(steps))
+    sides = [excess <= 0.0 for _, excess in points]
+    streak = next((count for count, side in enumerate(reversed(sides)) if side != sides[-1]), len(sides))
     far = 0.5 ** (streak - 1)
-    return [(step.choice.prune, step.excess * (1.0 if step.holds == side else far)) for step in steps]
+    return [
+        (position, excess * (1.0 if side == sides[-1] else far))
+        for (position, excess), side in zip(points, sides, strict=True)
+    ]
 
 
 def _position(prune: int, by_size: bool) -> float:

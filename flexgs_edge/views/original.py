@@ -28,9 +28,11 @@ class Original:
     references : References
         Renders of the original from `cameras`, then from `between`.
     between : sequence of Camera
-        Further poses. A descent that knew only the scored poses would fit these, and get worse between them.
+        Further poses, if there are descents. One that knew only the scored poses would fit these, and get worse between them.
     progress : Progress
         Told of each view.
+    steps : int
+        Steps of the descent to the first candidate; 0 (default): colours are refitted instead.
     turns : np.ndarray, optional
         [n] f64, above 0: how often a descent looks at each of `poses`, relative to the others. Default: alike.
     """
@@ -41,6 +43,7 @@ class Original:
     references: References
     between: Sequence[Camera] = ()
     progress: Progress = SILENT
+    steps: int = 0
     turns: np.ndarray | None = None
 
     @property

@@ -120,11 +120,11 @@ def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: 
             descent.step(cameras[k], padded_target(cameras[k], k), RATES)
             descent.follow(1.0)
             descent.step(cameras[k], padded_target(cameras[k], k), RATES)
-            before_mean = descent.planes()
+            unaveraged = descent.planes()
             descent.follow(0.25)
             descent.settle()
         moved = descent.planes()
-    assert not same_bits(moved["means"], before_mean["means"])
+    assert not same_bits(moved["means"], unaveraged["means"])
     renderer.release()
     assert paired.launched["blend_backward"] > 3 and paired.launched["adam"] == 4 * 3
     for name, before in planes.items():

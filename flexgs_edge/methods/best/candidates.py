@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from flexgs_edge.goals.line import NEAREST, next_point
+from flexgs_edge.goals.line import NEAREST, next_point, weighed
 from flexgs_edge.goals.target import Measurement, Target
 
 Product = TypeVar("Product")
@@ -106,9 +106,5 @@ def bounds(steps: Sequence[Candidate], by_size: bool) -> tuple[float, float]:
 def next_multiplier(steps: Sequence[Candidate], target: Target) -> float:
     """The multiplier at which the excess should be just below zero."""
     slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
-    # After several on one side, the other side counts half for each beyond the first: the Illinois rule.
-    side = steps[-1].holds
-    streak = next((count for count, step in enumerate(reversed(steps)) if step.holds != side), len(steps))
-    far = 0.5 ** (streak - 1)
-    points = [(math.log(s.multiplier), s.excess * (1.0 if s.holds == side else far)) for s in steps]
+    points = weighed([(math.log(s.multiplier), s.excess) for s in steps])
     return math.exp(next_point(points, slope, LARGEST_STRIDE))

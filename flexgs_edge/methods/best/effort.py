@@ -5,6 +5,7 @@ Work is counted and never timed, so the same command gives the same bytes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,7 +16,6 @@ from flexgs_edge.run.options import CompressOptions
 
 LEAST_STEPS = 240
 """Least steps of a descent. Four rounds of a few poses mend less than they break: docs/results/tuning.md#least_steps"""
-LARGEST_COUNT = 1 << 62
 LEAST_VIEWS = 6
 """Least poses for a step of the refit. Steps from fewer poses overfit the scored poses, and all others get worse:
 docs/results/tuning.md#least_views"""
@@ -59,7 +59,7 @@ class Effort:
         Most poses that trial grids are measured on: docs/results/tuning.md#probed
     passes : float
         How often the descent to the first candidate looks at every scored pose. 0 (default): colours are refitted instead.
-    descends : tuple of int
+    descends : tuple of float
         Least and most Gaussians of a scene that descends; of others, colours are refitted. Small scenes gain nothing by it
         (docs/results/tuning.md#descends), large ones need much memory. The memory limit has no say, so that files do not
         depend on it.
@@ -76,7 +76,7 @@ class Effort:
     refitted: float = REFITTED
     probed: int = 8
     passes: float = 0.0
-    descends: tuple[int, int] = (0, LARGEST_COUNT)
+    descends: tuple[float, float] = (0, math.inf)
 
     def poses_of(self, pixels: Sequence[int], count: int) -> int:
         """How many poses to score for `count` Gaussians; `pixels` are those of each pose, in order."""
@@ -173,9 +173,11 @@ def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool
     foreign : bool
         The file has another format than `.fgs`, with a grid of its own.
     """
+    if foreign:
+        return 0
+    if options.distil is not None:
+        return options.distil
     plan = EFFORTS[options.effort]
-    if foreign or options.distil is not None:
-        return 0 if foreign else options.distil or 0
     least, most = plan.descends
     if not (plan.passes and options.refit and least <= count <= most):
         return 0

@@ -43,7 +43,7 @@ from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.run.judges import Judges
 from flexgs_edge.run.made import Made
-from flexgs_edge.run.options import DEFAULT_MAX_DROP, CompressOptions
+from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings
 from flexgs_edge.scene.check import alive, invisible
@@ -99,7 +99,7 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
         with run.clock.stage("search"):
             found = kept_as_it_is(run, bench, coder, judges.decide)
         grid, search = found or search_best(
-            grid_search(run.options, coder, run.source.count), run, bench, poses, judges.decide, checkpoint=kept
+            grid_search(run.options, coder), run, bench, poses, judges.decide, checkpoint=kept
         )
         judges.decided()
         if run.options.layers > 1:
@@ -148,9 +148,9 @@ def _tried(
 
 
 def grid_search(
-    options: CompressOptions, coder: GridCoder, count: int, search: type[GridSearch] = GridSearch
+    options: CompressOptions, coder: GridCoder, search: type[GridSearch] = GridSearch
 ) -> SearchMaker[GridScene]:
-    """Make searches for the grid of a `.fgs` of a scene of `count` Gaussians."""
+    """Make searches for the grid of a `.fgs`."""
 
     def size_of(grid: GridScene) -> int:
         size = coder.size(grid)
@@ -159,8 +159,7 @@ def grid_search(
     plan = EFFORTS[options.effort]
 
     def make(rounds: PruneRounds, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
-        steps = distil_steps(options, len(rounds.original.cameras), count)
-        return search(rounds, size_of, measure, plan, options.refit, report, steps)
+        return search(rounds, size_of, measure, plan, options.refit, report, rounds.original.steps)
 
     return make
 
@@ -251,10 +250,9 @@ def open_rounds(
                 # Neighbours in space become neighbours in memory, so views are drawn faster.
                 rows = storage.take(rows, near_rows(storage.take(planes["means"], rows), storage))
                 between = poses_between(scored) if steps else ()
-                drop = options.max_drop or DEFAULT_MAX_DROP
-                turns = known.slopes([*scored, *between], drop) if known and steps else None
+                turns = known.slopes([*scored, *between]) if known and steps else None
                 rounds = make(
-                    Original(bench, source.origin, scored, references, between, run.progress, turns),
+                    Original(bench, source.origin, scored, references, between, run.progress, steps, turns),
                     planes,
                     rows,
                     refit=options.refit,

@@ -87,12 +87,14 @@ def scored_poses(
     chosen = with_margin(renderer, source, ordered, most) if options.makes_poses else ordered[:most]
     given = {id(camera) for camera in cameras}
     drawn = chosen
-    errors = None if photo is None else KnownErrors(known, base_errors(renderer, source, known, photo))
+    errors = None
+    if photo is not None:
+        drop = options.max_drop or DEFAULT_MAX_DROP
+        errors = KnownErrors(known, base_errors(renderer, source, known, photo), drop)
     if not fine:
         steps = sampling_steps(chosen, source.count * plan.pixels)
         if errors is not None:
-            slopes = errors.slopes(chosen, options.max_drop or DEFAULT_MAX_DROP)
-            weights = view_weights(slopes, rareness(chosen, positions, renderer.near))
+            weights = view_weights(errors.slopes(chosen), rareness(chosen, positions, renderer.near))
             # As many pixels as without weights, which may be more than are needed.
             steps = sampling_steps(chosen, pixels_of(chosen, steps), weights=weights)
         if max(steps) > 1 and covered_decides:

@@ -42,22 +42,23 @@ class KnownErrors:
         The m views.
     errors : np.ndarray
         [m] f64, from `base_errors`.
+    drop : float
+        Allowed drop, dB.
     """
 
     cameras: Sequence[Camera]
     errors: np.ndarray
+    drop: float
 
-    def slopes(self, cameras: Sequence[Camera], drop: float) -> np.ndarray:
+    def slopes(self, cameras: Sequence[Camera]) -> np.ndarray:
         """[n] f64, above 0 to 1: the slope of the drop by the error, of the view that is nearest to each camera.
 
         Parameters
         ----------
         cameras : sequence of Camera
             The n poses.
-        drop : float
-            Allowed drop, dB.
         """
-        allowed = float(np.median(self.errors)) * (10 ** (drop / 10) - 1)
+        allowed = float(np.median(self.errors)) * (10 ** (self.drop / 10) - 1)
         slopes = 1.0 / (self.errors + max(allowed, 1e-12))
         relative: np.ndarray = (slopes / slopes.max())[_nearest(self.cameras, cameras)]
         return relative

@@ -202,7 +202,7 @@ def best_points(
         coder = GridCoder(studied.bench.renderer)
         for ratio in sorted(ratios):
             aimed = run.aimed_at(_target(studied, ratio))
-            make = grid_search(options, coder, source.count, variant.search)
+            make = grid_search(options, coder, variant.search)
             with run.clock.stage("search"):
                 grid, search = search_rounds(make, rounds, aimed, studied.judge)
             seconds = time.perf_counter() - started

@@ -111,9 +111,7 @@ def _search(studied: StudyScene, rounds: PruneRounds, judge: Judge, renderer: Re
             return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))
 
     options = replace(studied.run.options, refit=True)
-    made = grid_search(options, GridCoder(renderer), studied.run.source.count, FixedSearch)(
-        rounds, measure, lambda step: None
-    )
+    made = grid_search(options, GridCoder(renderer), FixedSearch)(rounds, measure, lambda step: None)
     assert isinstance(made, FixedSearch)
     return made
 

@@ -36,13 +36,13 @@ def test_base_errors_are_those_against_photos() -> None:
 def test_each_pose_has_the_weight_of_the_nearest_view() -> None:
     known = [make_camera(translation=(place, 0.0, 0.0)) for place in (0.0, 5.0)]
     cameras = [make_camera(translation=(place, 0.0, 0.1)) for place in (5.2, 0.3, 0.2)]
-    errors = KnownErrors(known, np.array([1e-3, 3e-3]))
-    found = view_weights(errors.slopes(cameras, 1.0), np.ones(3))
+    errors = KnownErrors(known, np.array([1e-3, 3e-3]), 1.0)
+    found = view_weights(errors.slopes(cameras), np.ones(3))
     allowed = 2e-3 * (10**0.1 - 1)
     assert found.tolist() == pytest.approx([((1e-3 + allowed) / (3e-3 + allowed)) ** POWER, 1.0, 1.0])
     # The largest weight among the poses is 1, even if the best view has no pose near it.
-    assert view_weights(errors.slopes(cameras[:1], 1.0), np.ones(1)).tolist() == [1.0]
-    assert KnownErrors(known, np.zeros(2)).slopes(cameras, 1.0).tolist() == [1.0] * 3
+    assert view_weights(errors.slopes(cameras[:1]), np.ones(1)).tolist() == [1.0]
+    assert KnownErrors(known, np.zeros(2), 1.0).slopes(cameras).tolist() == [1.0] * 3
 
 
 def test_a_picture_that_few_share_counts_more() -> None:

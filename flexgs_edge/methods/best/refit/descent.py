@@ -91,7 +91,7 @@ class Descent:
             if not self._scene.resident:
                 raise BudgetError(
                     f"distilling {source.count} Gaussians keeps all of them in memory at once with what their steps remember "
-                    f"({format_mib(size)}), more than the memory limit leaves: use a larger --memory-limit, or --effort thorough"
+                    f"({format_mib(size)}), more than the memory limit leaves: use a larger --memory-limit, or --distil 0"
                 )
             self._rates, self._steps = (self._array((n,)) for n in (sum(self.widths.values()), GRID_VALUES))
             for chunk in self._scene.chunks():
