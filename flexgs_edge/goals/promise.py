@@ -189,6 +189,13 @@ def mean_alone(target: Target) -> Target:
     return target.target if isinstance(target, Promised) else target
 
 
+def means(target: Target) -> Target:
+    """The target with those parts of the promise that are means over the views, which a first guess can tell."""
+    if not isinstance(target, Promised):
+        return target
+    return promised(target.target, [part for part in target.parts if isinstance(part, MeanSsim)])
+
+
 def in_the_way(target: Target, size: int, measurement: Measurement | None) -> str:
     """A sentence on the part of the promise that a point misses by most, and what would lift it; empty if there is none."""
     if not isinstance(target, Promised) or measurement is None:

@@ -29,6 +29,25 @@ in every view."""
 
 
 @dataclass(frozen=True)
+class Warming:
+    """A descent between two rounds of pruning, so that the rounds that follow know what mends itself.
+
+    Parameters
+    ----------
+    loss : float
+        Pruning stops for it at this share of the loss that the target allows.
+    size : float
+        With a target for the size, pruning stops for it at this many times the Gaussians that fit.
+    share : float
+        Its steps, as a share of those of the descent to a candidate.
+    """
+
+    loss: float
+    size: float
+    share: float
+
+
+@dataclass(frozen=True)
 class Effort:
     """How much work a search spends, as fixed counts.
 
@@ -58,7 +77,9 @@ class Effort:
     probed : int
         Most poses that trial grids are measured on: docs/results/tuning.md#probed
     passes : float
-        How often the descent to the first candidate looks at every scored pose. 0 (default): colours are refitted instead.
+        How often the descent to a candidate looks at every scored pose. 0 (default): colours are refitted instead.
+    warming : tuple of Warming
+        Descents before the first candidate. They pay where candidates descend for long: docs/results/tuning.md#warming
     descends : tuple of float
         Least and most Gaussians of a scene that descends; of others, colours are refitted. Small scenes gain nothing by it
         (docs/results/tuning.md#descends), large ones need much memory. The memory limit has no say, so that files do not
@@ -76,6 +97,7 @@ class Effort:
     refitted: float = REFITTED
     probed: int = 8
     passes: float = 0.0
+    warming: tuple[Warming, ...] = ()
     descends: tuple[float, float] = (0, math.inf)
 
     def poses_of(self, pixels: Sequence[int], count: int) -> int:
@@ -142,7 +164,7 @@ EFFORTS = {
         keep=0.77, refit_rounds=0, subsets=7, steps=1, close=0.08, few=32, views=96, pixels=12, refitted=0.86, probed=4
     ),
     "balanced": Effort(
-        keep=0.88,
+        keep=0.8,
         refit_rounds=2,
         subsets=7,
         steps=2,
@@ -155,12 +177,23 @@ EFFORTS = {
         descends=(10_000, 500_000),
     ),
     "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, few=400, views=400, pixels=24),
-    "max": Effort(keep=0.8, refit_rounds=1, subsets=7, steps=2, close=0.05, few=400, views=400, pixels=24, passes=20.0),
+    "max": Effort(
+        keep=0.8,
+        refit_rounds=1,
+        subsets=7,
+        steps=2,
+        close=0.05,
+        few=400,
+        views=400,
+        pixels=24,
+        passes=12.0,
+        warming=(Warming(loss=0.8, size=2.2, share=1 / 3), Warming(loss=0.7, size=1.6, share=1 / 3)),
+    ),
 }
 
 
 def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool = False) -> int:
-    """Steps of the descent to the first candidate; 0 for none.
+    """Steps of the descent to a candidate; 0 for none.
 
     Parameters
     ----------

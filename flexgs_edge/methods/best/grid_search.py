@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.goals.line import AIM, next_point
-from flexgs_edge.goals.promise import mean_alone
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
@@ -39,18 +38,15 @@ FURTHER = 0.92
 """Loss after a further round of the colour refit, divided by the loss before it: docs/results/tuning.md#further"""
 DRIFT = -0.12
 """Change of the excess by a second refit, which goes on where the first one ended: docs/results/tuning.md#drift"""
-DISTILLED, DISTILLED_POWER = 0.6, -0.3
+DISTILLED, DISTILLED_POWER = 0.46, -0.2
 """Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
-the power by which it changes with the steps. It is cautious on purpose: a further descent can keep fewer Gaussians than
-the one that it goes on from, but not more: docs/results/tuning.md#distilled"""
-DRIFT_DISTILLED = -0.3
-"""Change of the excess by a further descent (as `DRIFT`): docs/results/tuning.md#drift_distilled"""
+the power by which it changes with the steps: docs/results/tuning.md#distilled"""
+WARMED = 1.35
+"""Factor on it if descents between the rounds have mended a part already: docs/results/tuning.md#distilled"""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
-FURTHER_STEPS = 0.4
-"""Steps of a further descent, as a share of the first one's. It goes on where the last one ended."""
-FURTHER_RATE = 0.5
-"""Rates of a further descent, as a share of the first one's."""
+WARMING_LAST = 0.5
+"""Rates at the end of a descent between rounds, as a share of those at its beginning. Its values need not settle."""
 FULL_PASSES = 10
 """Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one:
 docs/results/tuning.md#full_passes"""
@@ -61,6 +57,9 @@ DECAY = 0.8
 docs/results/tuning.md#decay"""
 FARTHER = 0.05
 """How much farther below the target we aim for each candidate in a row that missed it, from the second on."""
+PILOT, PILOT_POWER = 0.5, -0.33
+"""Steps of the descent that tells how much a candidate's will mend, as a share of these, and the power by which the loss
+changes with the steps. Behind descents between the rounds, no pilot is needed: docs/results/tuning.md#pilot"""
 PROBES = 4
 """Most probes between two candidates."""
 FARTHEST = 2.0
@@ -93,7 +92,7 @@ class GridSearch(MultiplierSearch[GridScene]):
     on_step : callable, optional
         Called with each candidate.
     steps : int
-        Views that the descent to the first candidate looks at. 0 (default): colours are refitted instead.
+        Views that the descent to a candidate looks at. 0 (default): colours are refitted instead.
     """
 
     def __init__(
@@ -112,31 +111,52 @@ class GridSearch(MultiplierSearch[GridScene]):
             self.pruned_part, self.keeps_best = PRUNED_DISTILLED, True
         self._slopes: Slopes | None = None
         self._refitted: Refitted | None = None
-        self._descents: list[tuple[float, Refitted]] = []
-        # Without a refit of SH, a candidate takes nothing over from the one before.
-        self._drift = DRIFT_DISTILLED if steps else DRIFT if effort.refit_rounds else 0.0
+        # Without a refit of SH, a candidate takes nothing over from the one before. Descents begin anew as well.
+        self._drift = DRIFT if effort.refit_rounds and not steps else 0.0
         self._expected = 0.0
 
     def run(self, target: Target, best_effort: bool = False) -> RateResult[GridScene]:
-        """As `MultiplierSearch.run`. Where no descent keeps a promise, colours are refitted instead.
+        """As `MultiplierSearch.run`. Where no descent reaches a quality, colours are refitted instead.
 
         Descents gain most in the mean, so that the worst view may never come near enough to it.
         """
-        if not (self.steps and self.refit) or mean_alone(target) is target:
+        if not (self.steps and self.refit) or target.limit_bytes is not None:
             return super().run(target, best_effort)
         descended = super().run(target, best_effort=True)
         if descended.reached:
             return descended
-        LOG.info("no descent keeps the promise: colours are refitted instead")
-        self.steps, self.pruned_part, self.keeps_best = 0, PRUNED_PART, False
-        self._descents, self._refitted, self._slopes = [], None, None
+        LOG.info("no descent reaches the target: colours are refitted instead")
+        self.steps, self.pruned_part, self.keeps_best, self._begin = 0, PRUNED_PART, False, 0
+        self._refitted, self._slopes = None, None
         self._drift = DRIFT if self.effort.refit_rounds else 0.0
         refitted = super().run(target, best_effort)
         best = refitted if better(refitted.chosen, descended.chosen, target) else descended
         return replace(best, steps=(*descended.steps, *refitted.steps))
 
-    def _before_refit(self, multiplier: float, anew: bool = False) -> GridScene:
-        kept, step_sizes = self._choice(multiplier, anew)
+    def _start(self, target: Target) -> float:
+        for warming in self.effort.warming if self.steps else ():
+            self._prune(target, warming.loss, warming.size)
+            self._warm(warming.share)
+        return super()._start(target)
+
+    def _warm(self, share: float) -> None:
+        """Descend off the grid between two rounds of pruning, with `share` of the steps."""
+
+        def change() -> tuple[np.ndarray, dict[str, np.ndarray]]:
+            kept = self.kept(self._cut(self.rounds.snapshots[-1]))
+            schedule = Schedule(math.ceil(share * self.steps), self._rate(kept.planes), WARMING_LAST)
+            return kept.rows, distil(kept.planes, kept.degrees, self.rounds.original, schedule)
+
+        self.rounds.renew(change)
+        self._begin = len(self.rounds.snapshots) - 1
+
+    def _rate(self, planes: Planes) -> float:
+        """Share of the full rates for a descent from these planes."""
+        longer = min(math.sqrt(FULL_PASSES / self._passes()), 1.0)
+        return longer * rate_from(self.measure(planes, estimate=True).figure("fidelity"))
+
+    def _before_refit(self, multiplier: float) -> GridScene:
+        kept, step_sizes = self._choice(multiplier)
         return self._to_grid(kept.planes, kept.degrees, step_sizes, self.rounds.storage)[0]
 
     def _to_grid(
@@ -157,28 +177,28 @@ class GridSearch(MultiplierSearch[GridScene]):
         subsets = self.effort.subsets_of(len(original.cameras))
         return refit_colours(planes, degrees, original, rounds=times, bands=bands, subsets=subsets)
 
-    def _probe(self, multiplier: float, target: Target, anew: bool = False) -> float:
-        """Excess of a probe: the grid of a multiplier, without a refit of its own; `anew` is as for `_choice`."""
-        grid = self._before_refit(multiplier, anew)
+    def _probe(self, multiplier: float, target: Target) -> float:
+        """Excess of a probe: the grid of a multiplier, without a refit of its own."""
+        grid = self._before_refit(multiplier)
         if target.limit_bytes is not None:
             return target.excess(self.size_of(grid), None)
-        return mean_alone(target).excess(0, self.measure(values_of(grid, self.rounds.storage), estimate=True))
+        return self._guess(values_of(grid, self.rounds.storage), target)
 
     def _aim(self, multiplier: float, steps: Sequence[Candidate], target: Target) -> float:
         """Probe for the multiplier whose candidate should be just below the target. A refit changes the excess alike nearby."""
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
         offset = math.log(self._refitted_part()) if self.refit and not by_size else 0.0
-        # A candidate that keeps more than the last descent does not go on from it: it needs a descent of its own.
-        anew = bool(self.steps and steps and not steps[-1].holds and not by_size)
         if steps:
-            offset = steps[-1].excess - self._probe(steps[-1].multiplier, target, anew)
-            if self.refit and not by_size and not anew:
+            offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
+            if self.refit and not by_size:
                 # Probes have the colours of the last refit, and the next refit goes on from these.
-                if len(steps) > 1:
+                if len(steps) > 1 and not self.steps:
                     self._drift = DECAY * (self._drift + steps[-1].excess - self._expected)
                 # If candidates keep missing, for whatever reason, aim farther each time.
                 offset += self._drift + FARTHER * max(misses(steps) - 1, 0)
+        elif not by_size:
+            self._learn_lead(values_of(self._before_refit(multiplier), self.rounds.storage), target)
         low, high = bounds(steps, by_size)
         place = min(max(math.log(multiplier), low), high)
         if math.isfinite(high - low):
@@ -186,36 +206,50 @@ class GridSearch(MultiplierSearch[GridScene]):
             self._expected = AIM
             return math.exp(place)
         # If nothing holds and the curve is flat, the search must not run away to infinity.
-        low, high = max(low, place - FARTHEST), min(high, place + FARTHEST)
+        ends = max(low, place - FARTHEST), min(high, place + FARTHEST)
+        place = self._probed(place, offset, ends, slope, target)
+        if self.steps and not (steps or by_size or self._begin):
+            place = self._probed(place, self._piloted(math.exp(place), target), ends, slope, target)
+        return math.exp(place)
+
+    def _probed(self, place: float, offset: float, ends: tuple[float, float], slope: float, target: Target) -> float:
+        """Log of the multiplier, between `ends`, whose probe and `offset` together are just below the target."""
         seen: list[tuple[float, float]] = []
         self._expected = AIM
         for _ in range(PROBES):
-            excess = self._probe(math.exp(place), target, anew) + offset
+            excess = self._probe(math.exp(place), target) + offset
             if abs(excess - AIM) < -AIM:
                 self._expected = excess
                 break
             seen.append((place, excess))
-            there, place = place, min(max(next_point(seen, slope, LARGEST_STRIDE), low), high)
+            there, place = place, min(max(next_point(seen, slope, LARGEST_STRIDE), ends[0]), ends[1])
             if place == there:
                 break
-        return math.exp(place)
+        return place
+
+    def _piloted(self, multiplier: float, target: Target) -> float:
+        """Change of the excess by a descent, as a shorter one tells. Scenes differ in it by more than sizes may be off."""
+        kept, step_sizes = self._choice(multiplier)
+        grid = self._distilled(kept, step_sizes, math.ceil(PILOT * self.steps))
+        found = target.excess(0, self.measure(values_of(grid, self.rounds.storage)))
+        return found - self._probe(multiplier, target) - PILOT_POWER * math.log(PILOT)
 
     def _passes(self) -> float:
-        """Steps of the descent to the first candidate for each scored pose."""
+        """Steps of the descent to a candidate for each scored pose."""
         return self.steps / len(self.rounds.original.cameras)
 
     def _refitted_part(self) -> float:
         """Expected loss after the first candidate's refit or descent, divided by the loss before it."""
         if self.steps:
-            return DISTILLED * math.pow(max(self._passes(), 1.0), DISTILLED_POWER)
+            part = DISTILLED * math.pow(max(self._passes(), 1.0), DISTILLED_POWER)
+            return WARMED * part if self._begin else part
         return self.effort.refitted * FURTHER ** (self.effort.refit_rounds - 1)
 
-    def _choice(self, multiplier: float, anew: bool = False) -> tuple[Kept, StepSizes]:
-        """The rows that a multiplier keeps, with the colours of the last refit unless `anew`, and the grid's step sizes."""
+    def _choice(self, multiplier: float) -> tuple[Kept, StepSizes]:
+        """The rows that a multiplier keeps, with the colours of the last refit, and the grid's step sizes."""
         kept = self.kept(multiplier)
-        refitted = None if anew else self._descended(multiplier) if self.steps else self._refitted
-        if refitted is not None:
-            kept.planes = refitted.apply(kept.rows, kept.degrees, kept.planes, self.rounds.storage)
+        if self._refitted is not None:
+            kept.planes = self._refitted.apply(kept.rows, kept.degrees, kept.planes, self.rounds.storage)
         snapshot = self.rounds.snapshots[kept.snapshot]
         if self._slopes is None:
             # Measured once, near the answer: slopes change little between snapshots, and step sizes must not jump there.
@@ -229,7 +263,7 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, GridScene]:
         started = time.perf_counter()
         kept, step_sizes = self._choice(multiplier)
-        grid = self._distilled(multiplier, kept, step_sizes) if self.steps else self._finish(kept, step_sizes)
+        grid = self._distilled(kept, step_sizes, self.steps) if self.steps else self._finish(kept, step_sizes)
         grid = lowered(grid, self.rounds.storage)
         size = self.size_of(grid)
         measurement = self.measure(values_of(grid, self.rounds.storage))
@@ -238,24 +272,9 @@ class GridSearch(MultiplierSearch[GridScene]):
         found = Candidate(multiplier, len(kept.rows), grid.sh_count, size, measurement, excess, seconds, kept.left_out)
         return found, grid
 
-    def _descended(self, multiplier: float) -> Refitted | None:
-        """Values of the last descent that kept all that this multiplier keeps; None if there is none.
-
-        A descent that kept fewer Gaussians will not do. Its values make up for the missing ones, which are back now:
-        docs/results/tuning.md#descended
-        """
-        before = [(at, refitted) for at, refitted in self._descents if at <= multiplier]
-        return max(before, key=lambda pair: pair[0])[1] if before else None
-
-    def _distilled(self, multiplier: float, kept: Kept, step_sizes: StepSizes) -> GridScene:
+    def _distilled(self, kept: Kept, step_sizes: StepSizes, count: int) -> GridScene:
         """Move all values towards the references, put them on the grid, and refit the constant colour."""
-        first = self._descended(multiplier) is None
-        count, rate = (self.steps, 1.0) if first else (math.ceil(FURTHER_STEPS * self.steps), FURTHER_RATE)
-        rate *= min(math.sqrt(FULL_PASSES / self._passes()), 1.0)
-        rate *= rate_from(self.measure(kept.planes, estimate=True).figure("fidelity"))
-        moved = self._distil(kept, Schedule(count, rate), step_sizes)
-        own = np.arange(len(kept.rows))
-        self._descents.append((multiplier, Refitted.of(kept.rows, kept.degrees, own, moved, fields=tuple(moved))))
+        moved = self._distil(kept, Schedule(count, self._rate(kept.planes)), step_sizes)
         grid, order = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
         if not self.refit:
             return grid

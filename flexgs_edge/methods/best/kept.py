@@ -1,11 +1,10 @@
-"""The Gaussians that a multiplier keeps, and the values that a refit of them gave.
+"""The Gaussians that a multiplier keeps, and the colours that a refit of them gave.
 
 A search hands these from candidate to candidate, so that each refit goes on from the last one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,7 @@ COLOURS = ("sh_dc", "sh_rest")
 
 @dataclass
 class Refitted:
-    """Values after a refit (colours) or a descent (all fields), from which the next one starts.
+    """Colours after a refit, from which the next one starts.
 
     Attributes
     ----------
@@ -27,7 +26,7 @@ class Refitted:
     degrees : np.ndarray
         [n] u8, SH degrees at the time of the refit.
     planes : dict
-        The changed fields ([width, n] f32 by field).
+        Their colours ([width, n] f32 by field).
     """
 
     rows: np.ndarray
@@ -42,32 +41,28 @@ class Refitted:
         order: np.ndarray,
         planes: dict[str, np.ndarray],
         storage: Storage = IN_MEMORY,
-        fields: Iterable[str] = COLOURS,
     ) -> Refitted:
-        """Take the changed `fields` of `planes`, whose columns belong to `rows[order]`, back into the order of `rows`."""
+        """Take the colours of `planes`, whose columns belong to `rows[order]`, back into the order of `rows`."""
         back = storage.empty((len(order),), np.int64)
         back[order] = np.arange(len(order))
-        return cls(rows, degrees, {name: storage.take(planes[name], back) for name in fields})
+        return cls(rows, degrees, {name: storage.take(planes[name], back) for name in COLOURS})
 
     def apply(
         self, rows: np.ndarray, degrees: np.ndarray, planes: dict[str, np.ndarray], storage: Storage = IN_MEMORY
     ) -> dict[str, np.ndarray]:
-        """`planes` with these values: geometry of every row that was refitted, colours only if its SH degree was the same."""
+        """`planes` with these colours, where a row was refitted with the same SH degree."""
         if not len(self.rows) or not len(rows):
             return planes
         changed = {name: storage.empty(planes[name].shape, planes[name].dtype) for name in self.planes}
         for part in blocks(len(rows)):
             some = rows[part]
             at = np.minimum(np.searchsorted(self.rows, some), len(self.rows) - 1)
-            kept = self.rows[at] == some
-            alike = kept & (self.degrees[at] == degrees[part])
+            same = np.flatnonzero((self.rows[at] == some) & (self.degrees[at] == degrees[part]))
             span = slice(int(at[0]), int(at[-1]) + 1)
             for name, values in changed.items():
-                same = np.flatnonzero(alike if name in COLOURS else kept)
                 to, places = read_rows(planes[name], part).copy(), at[same] - span.start
                 # The grid may lack the highest SH degrees. Coefficients lie channel by channel, so we go by channel.
-                channels = 3 if name in COLOURS else 1
-                both = (v.reshape(channels, -1, v.shape[-1]) for v in (to, self.planes[name]))
+                both = (v.reshape(3, -1, v.shape[-1]) for v in (to, self.planes[name]))
                 for held, new in zip(*both, strict=True):
                     for plane, moved in zip(held, new, strict=False):
                         plane[same] = read_rows(moved, span).take(places)

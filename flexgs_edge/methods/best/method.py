@@ -157,6 +157,8 @@ def grid_search(
         return size if options.layers == 1 else round(LAYERS_COST * size)
 
     plan = EFFORTS[options.effort]
+    if options.distil is not None:
+        plan = replace(plan, warming=())
 
     def make(rounds: PruneRounds, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
         return search(rounds, size_of, measure, plan, options.refit, report, rounds.original.steps)

@@ -17,7 +17,7 @@ import numpy as np
 
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
-from flexgs_edge.goals.promise import mean_alone
+from flexgs_edge.goals.promise import mean_alone, means
 from flexgs_edge.goals.steps import better, obstacle
 from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.methods.best.allocation import BitModel, choose, drop_bands, keep_one
@@ -43,7 +43,9 @@ MOST_ROUNDS = 24
 """Most rounds of pruning."""
 EXTRA_STEPS = 4
 """Candidates beyond the effort's own, while none holds or the best is far below the target."""
-FAR = 0.25
+LEAD_FROM = 1.0
+"""Rounds of pruning measure SSIM once, from this far below their end on, in logs of the loss. Before, it means little."""
+FAR = 0.15
 """A candidate this far below the target (log of loss over limit) makes a file much larger than needed."""
 
 
@@ -76,6 +78,7 @@ class MultiplierSearch(ABC, Generic[Product]):
     ) -> None:
         self.rounds, self.measure, self.effort, self.on_step = rounds, measure, effort, on_step
         self.bits = BitModel()
+        self._lead, self._begin = 0.0, 0
 
     @abstractmethod
     def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, Product]:
@@ -151,19 +154,39 @@ class MultiplierSearch(ABC, Generic[Product]):
 
     def _start(self, target: Target) -> float:
         """Prune until pruning alone has used up its share of the target; returns the multiplier of that cut."""
+        self._prune(target, self.pruned_part)
+        return self._cut(self.rounds.snapshots[-1])
+
+    def _prune(self, target: Target, part: float, times: float = 1.0) -> None:
+        """Prune until pruning alone loses `part` of what the target allows, or `times` the rows are left that a size allows."""
         for _ in range(MOST_ROUNDS):
             last = self.rounds.snapshots[-1]
             if target.limit_bytes is not None:
-                if last.count * self.bits.base / 8 <= target.limit_bytes:
+                if last.count * self.bits.base / 8 <= times * target.limit_bytes:
                     break
             elif len(self.rounds.snapshots) > 1:
-                excess = mean_alone(target).excess(0, self.measure(last.planes, estimate=True))
-                if excess >= math.log(self.pruned_part):
+                excess, end = self._guess(last.planes, target), math.log(part)
+                if self._lead == 0.0 and excess >= end - LEAD_FROM:
+                    self._learn_lead(last.planes, target)
+                    excess += self._lead
+                if excess >= end:
                     break
             if last.count < 16:
                 break
             self.rounds.descend(self.effort.keep)
-        return self._cut(self.rounds.snapshots[-1])
+
+    def _guess(self, planes: dict[str, np.ndarray], target: Target) -> float:
+        """Excess of planes by a target for quality, from its mean alone.
+
+        Where SSIM is the nearer bound, it is so by a share that changes little with compression or by a refit. We measure
+        it once: docs/results/tuning.md#lead
+        """
+        return mean_alone(target).excess(0, self.measure(planes, estimate=True)) + self._lead
+
+    def _learn_lead(self, planes: dict[str, np.ndarray], target: Target) -> None:
+        """Measure by how much SSIM is nearer to its bound than the mean."""
+        quality = self.measure(planes)
+        self._lead = max(means(target).excess(0, quality) - mean_alone(target).excess(0, quality), 0.0)
 
     def _cut(self, snapshot: Snapshot) -> float:
         """The multiplier that would cut a snapshot by half a round more."""
@@ -174,8 +197,11 @@ class MultiplierSearch(ABC, Generic[Product]):
         return max(float(np.quantile(costs, share)) / self.bits.base, 1e-30)
 
     def _snapshot(self, multiplier: float) -> tuple[int, np.ndarray, np.ndarray]:
-        """First snapshot that this multiplier cuts by at most a round: its number, and the choice. Does more rounds if needed."""
-        for index in range(MOST_ROUNDS + 1):
+        """First snapshot that this multiplier cuts by at most a round: its number, and the choice. Does more rounds if needed.
+
+        Snapshots before `_begin` do not count: descents have changed all costs since.
+        """
+        for index in range(self._begin, self._begin + MOST_ROUNDS + 1):
             if index == len(self.rounds.snapshots):
                 self.rounds.descend(self.effort.keep)
             snapshot = self.rounds.snapshots[index]

@@ -6,7 +6,7 @@ the original's renders. Searches start from the snapshots that the rounds leave 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -181,6 +181,23 @@ class PruneRounds:
         ]
         costs = RemovalCosts.of(self._parts, self.storage)
         return self._add(Snapshot(self.storage.take(last.rows, keep), planes, costs))
+
+    def renew(self, change: Callable[[], tuple[np.ndarray, dict[str, np.ndarray]]]) -> Snapshot:
+        """Append rows and planes that a descent has moved, with costs measured anew over all poses.
+
+        Parameters
+        ----------
+        change : callable
+            Makes the rows ([n] i64, places in `rows`, ascending) and their planes. It is not called if a checkpoint has them.
+        """
+        if self._resumed():
+            return self.snapshots[-1]
+        rows, planes = change()
+        renderer = self.original.bench.renderer
+        source = MemorySource(planes, origin=self.original.origin)
+        with renderer.load(source, sum_bytes(2) + cost_bytes(source.sh_degree), view_sums=2) as scene:
+            self._parts = [self._measure(scene, some) for some in self._views]
+        return self._add(Snapshot(rows, planes, RemovalCosts.of(self._parts, self.storage)))
 
     def _add(self, snapshot: Snapshot, keep_views: bool = False) -> Snapshot:
         """Append a snapshot, and save it if there is a checkpoint."""

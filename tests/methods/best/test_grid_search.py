@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from flexgs_edge.errors import TargetError
+from flexgs_edge.goals.promise import MeanSsim, Promised
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, MinFidelity, Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
+from flexgs_edge.methods.best import grid_search
 from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
@@ -24,11 +26,21 @@ from flexgs_edge.methods.best.effort import (
     LARGEST_STEP,
     LEAST_STEPS,
     Effort,
+    Warming,
     distil_steps,
     sampled_poses,
     sampling_steps,
 )
-from flexgs_edge.methods.best.grid_search import DISTILLED, DISTILLED_POWER, FULL_PASSES, GridSearch, rate_from
+from flexgs_edge.methods.best.grid_search import (
+    DISTILLED,
+    DISTILLED_POWER,
+    FULL_PASSES,
+    PILOT,
+    PILOT_POWER,
+    WARMING_LAST,
+    GridSearch,
+    rate_from,
+)
 from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.multiplier import EXTRA_STEPS
 from flexgs_edge.methods.best.refit.distil import Schedule
@@ -69,6 +81,12 @@ class FakeRounds:
         costs = RemovalCosts(c.removal[keep], c.weight2[keep], c.sh[:, keep], c.sh_mean[:, :, keep])
         self.snapshots.append(Snapshot(last.rows[keep], take_rows(last.planes, keep), costs))
         return self.snapshots[-1]
+
+    def renew(self, change: Callable[[], tuple[np.ndarray, dict[str, np.ndarray]]]) -> None:
+        rows, planes = change()
+        c, keep = self.snapshots[0].costs, rows
+        costs = RemovalCosts(c.removal[keep], c.weight2[keep], c.sh[:, keep], c.sh_mean[:, :, keep])
+        self.snapshots.append(Snapshot(rows, planes, costs))
 
 
 class World:
@@ -300,48 +318,93 @@ def test_descents_with_less_to_mend_go_at_smaller_rates() -> None:
     assert rate_from(53.0) == pytest.approx(0.25, abs=0.002) and rate_from(90.0) == 0.25
 
 
-@pytest.mark.parametrize(("found", "gain"), [(0.2, 0.1), (0.33, 0.2), (0.33, 1.0), (0.5, 1.0)])
-def test_descents_go_on_from_each_other(found: float, gain: float) -> None:
-    """The first whole result takes all steps, the next ones a part; values go on where they were, also those of geometry."""
-    seen: list[tuple[int, float, float]] = []
+class Mending(KnownSearch):
+    """Descents mark opacities; `calls` has the steps, rate and first opacity of each."""
 
-    class Descending(KnownSearch):
-        def _distil(self, kept: Kept, schedule: Schedule, steps: StepSizes) -> Any:
-            logits = kept.planes["opacity_logits"]
-            seen.append((schedule.iterations, schedule.rate, float(logits.max())))
-            return {**kept.planes, "opacity_logits": np.full_like(logits, 9.0)}
+    calls: list[tuple[int, float, float]]
 
-        def _refit_colours(self, planes: Any, *_: Any, **__: Any) -> Any:
-            return planes
+    def _distil(self, kept: Kept, schedule: Schedule, steps: StepSizes) -> Any:
+        logits = kept.planes["opacity_logits"]
+        self.calls.append((schedule.iterations, schedule.rate, float(logits.max())))
+        return {**kept.planes, "opacity_logits": np.full_like(logits, MARK)}
 
-    class Blurred(World):
-        """Nothing is so near the original that descents go at smaller rates."""
+    def _refit_colours(self, planes: Any, *_: Any, **__: Any) -> Any:
+        return planes
 
-        def measure(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
-            descended = bool((planes["opacity_logits"] > 8.5).all())
-            drop = (super().measure(planes, estimate).drop or 0.0) * (gain if descended else 1.0)
-            return Measurement(drop, 30.0, drop)
 
-    expected_part = DISTILLED * 10**DISTILLED_POWER
+MARK = 9.0
+"""Opacity logit of what a descent has moved."""
+
+
+class Mended(World):
+    """What a descent has marked loses `part` as much. Nothing is so near the original that descents go at smaller rates."""
+
+    def __init__(self, part: float, expected: float, ssim: float | None = None) -> None:
+        super().__init__(lambda m: (m / AT) ** 0.6 / expected, lambda m: BYTES * (m / AT) ** -0.45)
+        self.part, self.ssim = part, ssim
+
+    def measure(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
+        descended = bool((planes["opacity_logits"] > MARK - 0.5).all())
+        drop = (super().measure(planes, estimate).drop or 0.0) * (self.part if descended else 1.0)
+        return Measurement(drop, 30.0, drop, ssim_drop=None if estimate or self.ssim is None else self.ssim * drop)
+
+
+@pytest.mark.parametrize("part", [0.1, 0.2, 0.5])
+def test_a_pilot_tells_how_much_descents_mend(part: float) -> None:
+    """Half the steps, then candidates of all steps, each from the beginning; the first one is near, whatever a descent mends."""
+    expected = DISTILLED * 10**DISTILLED_POWER
     assert FULL_PASSES >= 10
-    world = Blurred(lambda m: found / expected_part * (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
+    Mending.calls = calls = []
+    result = search(Mended(part, expected), MaxDrop(1.0), kind=Mending, refit=True, steps=100)
+    assert result.reached and [steps for steps, *_ in calls] == [50] + [100] * len(result.steps)
+    assert all(rate == 1.0 and before < MARK - 0.5 for _, rate, before in calls)
+    # The pilot of this world mends as much as a whole descent, from which more is expected.
+    assert abs(result.steps[0].excess - PILOT_POWER * math.log(PILOT)) < 0.1
+
+
+def test_a_size_needs_no_pilot() -> None:
+    Mending.calls = calls = []
+    result = search(Mended(0.3, 0.3), MaxSize(3000), kind=Mending, refit=True, steps=100)
+    assert result.reached and [steps for steps, *_ in calls] == [100] * len(result.steps)
+
+
+@pytest.mark.parametrize("ssim", [0.001, 0.03])
+def test_the_first_candidate_aims_at_ssim_where_it_is_nearer(ssim: float) -> None:
+    world = Mended(1.0, 1.0, ssim)
+    target = Promised(MaxDrop(1.0), (MeanSsim(0.015),))
+    first = search(world, target, kind=Mending, refit=False, steps=0).steps[0]
+    assert abs(first.excess) < 0.1 and (first.measurement.drop or 0.0) == pytest.approx(min(1.0, 0.015 / ssim), rel=0.1)
+
+
+@pytest.mark.parametrize("target", [MaxDrop(1.0), MaxSize(2000)])
+def test_descents_between_the_rounds(target: Target, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They come before the first candidate, with a share of its steps, and all costs are measured anew behind them."""
+    counts: list[tuple[int, int]] = []
+
+    def moved(planes: dict[str, np.ndarray], degrees: np.ndarray, original: Any, schedule: Schedule) -> Any:
+        assert schedule.last == WARMING_LAST
+        counts.append((schedule.iterations, len(degrees)))
+        return {**planes, "opacity_logits": np.full_like(planes["opacity_logits"], MARK)}
+
+    monkeypatch.setattr(grid_search, "distil", moved)
+    Mending.calls = calls = []
     rounds = FakeRounds()
-    result = search(world, MaxDrop(1.0), rounds, kind=Descending, refit=True, steps=100)
-    assert result.reached and len(seen) == len(result.steps)
-    tried: list[float] = []
-    for step, call in zip(result.steps, seen, strict=True):
-        # From a descent that kept as much or more; else from the beginning.
-        expected = (40, 0.5) if any(multiplier <= step.multiplier for multiplier in tried) else (100, 1.0)
-        assert call[:2] == expected and (call[2] == 9.0) == (expected[0] == 40)
-        tried.append(step.multiplier)
-    assert len(seen) > 1 and (40 in [steps for steps, *_ in seen]) == (gain < expected_part)
+    effort = replace(EFFORT, warming=(Warming(0.1, 4.0, 0.25), Warming(0.3, 2.0, 0.5)))
+    result = search(Mended(1.0, 1.0), target, rounds, kind=Mending, refit=True, steps=100, effort=effort)
+    assert result.reached and [steps for steps, _ in counts] == [25, 50]
+    assert 600 > counts[0][1] > counts[1][1] >= result.chosen.count
+    # No pilot, and candidates start from values that have moved.
+    assert [(steps, before) for steps, _, before in calls] == [(100, MARK)] * len(result.steps)
+    if isinstance(target, MaxSize):
+        assert counts[0][1] * 50 / 8 < 4 * 2000 and counts[1][1] * 50 / 8 < 2 * 2000
 
 
 @pytest.mark.parametrize(("steps", "after"), [(100, 1), (100, 0), (0, 1)])
 def test_an_interrupted_search_with_descents_keeps_the_best(steps: int, after: int) -> None:
     done: list[int] = []
+    Mending.calls = []
 
-    class Interrupted(KnownSearch):
+    class Interrupted(Mending):
         def _whole(self, multiplier: float, target: Target) -> Any:
             if len(done) == after:
                 raise KeyboardInterrupt
@@ -405,12 +468,3 @@ def test_large_scenes_are_scored_from_more_poses() -> None:
     pixels = [100] * 9
     assert [effort.poses_of(pixels, count) for count in (1, 30, 31, 40, 41, 60, 1000)] == [3, 3, 4, 4, 5, 6, 6]
     assert effort.poses_of(pixels[:2], 1) == effort.poses_of(pixels[:2], 1000) == 2
-
-
-def test_geometry_goes_on_whatever_the_degree() -> None:
-    moved = {"sh_dc": np.ones((3, 2), np.float32), "means": np.array([[1, 2]] * 3, np.float32)}
-    last = Refitted.of(np.array([2, 7]), np.array([0, 1]), np.array([1, 0]), moved, fields=tuple(moved))
-    planes = {"sh_dc": np.zeros((3, 3), np.float32), "means": np.zeros((3, 3), np.float32)}
-    found = last.apply(np.array([1, 2, 7]), np.array([1, 1, 1]), planes)
-    np.testing.assert_array_equal(found["means"], [[0, 2, 1]] * 3)
-    np.testing.assert_array_equal(found["sh_dc"], [[0, 0, 1]] * 3)

@@ -52,12 +52,15 @@ class Schedule:
         How many views it looks at, one a step.
     rate : float
         Factor on all rates.
+    last : float
+        Rates at the end as a share of those at the beginning.
     on_grid, holding : float
         Share of the steps before values are put on their grids for drawing, and share before geometry is held there.
     """
 
     iterations: int
     rate: float = 1.0
+    last: float = LAST
     on_grid: float = ON_GRID
     holding: float = HOLDING
 
@@ -145,7 +148,7 @@ def distil(
         for place, part in enumerate(parts):
             held = HELD if place == 2 else ()
             # Rates fall while geometry moves, and fall again while it is held.
-            falling, last = (part, LAST_HELD) if held else (range(parts[1].stop), LAST)
+            falling, last = (part, LAST_HELD) if held else (range(parts[1].stop), schedule.last)
             if place and len(part):
                 if held and len(parts[1]):
                     descent.settle()
