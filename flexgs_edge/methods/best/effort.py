@@ -64,6 +64,8 @@ class Effort:
         Most candidates, unless none of them holds.
     close : float
         The search ends when a candidate is no farther than this below the target (log of limit over loss).
+    far : float
+        After `steps` candidates, the search goes on only if the best one is farther than this below the target.
     few : int
         Least scored poses, if there are as many: docs/results/tuning.md#few
     views : int
@@ -98,6 +100,7 @@ class Effort:
     probed: int = 8
     passes: float = 0.0
     warming: tuple[Warming, ...] = ()
+    far: float = 0.15
     descends: tuple[float, float] = (0, math.inf)
 
     def poses_of(self, pixels: Sequence[int], count: int) -> int:
@@ -161,7 +164,17 @@ def pixels_of(cameras: Sequence[Camera], steps: Sequence[int]) -> int:
 
 EFFORTS = {
     "fast": Effort(
-        keep=0.77, refit_rounds=0, subsets=7, steps=1, close=0.08, few=32, views=96, pixels=12, refitted=0.86, probed=4
+        keep=0.77,
+        refit_rounds=0,
+        subsets=7,
+        steps=1,
+        close=0.08,
+        few=32,
+        views=96,
+        pixels=12,
+        refitted=0.86,
+        probed=4,
+        far=0.25,
     ),
     "balanced": Effort(
         keep=0.8,

@@ -42,11 +42,9 @@ docs/results/tuning.md#pruned_part"""
 MOST_ROUNDS = 24
 """Most rounds of pruning."""
 EXTRA_STEPS = 4
-"""Candidates beyond the effort's own, while none holds or the best is far below the target."""
+"""Most candidates beyond the effort's own, while none holds or the best is far below the target."""
 LEAD_FROM = 1.0
 """Rounds of pruning measure SSIM once, from this far below their end on, in logs of the loss. Before, it means little."""
-FAR = 0.15
-"""A candidate this far below the target (log of loss over limit) makes a file much larger than needed."""
 
 
 class MultiplierSearch(ABC, Generic[Product]):
@@ -138,7 +136,7 @@ class MultiplierSearch(ABC, Generic[Product]):
             else:
                 self.discard(product)
             close = best[0].holds and best[0].excess > -self.effort.close
-            enough = best[0].holds and best[0].excess > -FAR and count + 1 >= self.effort.steps
+            enough = best[0].holds and best[0].excess > -self.effort.far and count + 1 >= self.effort.steps
             if close or enough or step.multiplier < 1e-30:
                 break
             multiplier = self._aim(next_multiplier(steps, target), steps, target)
