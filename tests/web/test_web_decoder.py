@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import shutil
 import subprocess
@@ -26,7 +27,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 DECODER = REPOSITORY / "web" / "decoder"
 CORPUS = REPOSITORY / "tests" / "fuzz" / "corpus"
 SEEDS = REPOSITORY / "tests" / "golden"
-DAMAGED = 1000
+DAMAGED = int(os.environ.get("FLEXGS_DAMAGED", "300"))
 SLOW = 5.0
 """Seconds that no small file may take, on a busy machine."""
 
