@@ -26,7 +26,7 @@ function start() {
   wire(viewer);
   wireFiles(viewer);
   const first = firstScene();
-  if (first) show(viewer, first.source, first.name, config.poses ?? []);
+  if (first) show(viewer, first.source, first.name, config.poses, config.look);
   else say('Drop a .fgs file here, or choose one in the panel.');
 }
 
@@ -44,11 +44,11 @@ function firstScene() {
   return address ? { source: new URL(address, location.href).href, name: config.name ?? address } : null;
 }
 
-async function show(viewer, source, name, poses) {
+async function show(viewer, source, name, poses = [], look = {}) {
   say('Loading …');
   document.title = name ? `${name} – flexgs-edge` : 'flexgs-edge';
   find('name').textContent = name ?? '';
-  await viewer.load(source, { name, poses, agree }).catch(() => {});
+  await viewer.load(source, { name, poses, look, agree }).catch(() => {});
 }
 
 async function agree(bytes) {
@@ -150,7 +150,7 @@ function showNumbers({ stats, canvas, renderer }) {
 function wireFiles(viewer) {
   const open = (file) => {
     config.name = file.name;
-    show(viewer, file, file.name, []);
+    show(viewer, file, file.name);
   };
   find('file').addEventListener('change', (event) => event.target.files[0] && open(event.target.files[0]));
   document.addEventListener('dragover', (event) => event.preventDefault());

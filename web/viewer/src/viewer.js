@@ -47,14 +47,15 @@ export class Viewer extends EventTarget {
    * Load a scene.
    *
    * @param {string | Uint8Array | Blob} source an absolute address, or bytes
-   * @param {{name: string, poses: object[], agree?: (bytes: number) => Promise<boolean>}} options
+   * @param {{name: string, poses: object[], look?: object, agree?: (bytes: number) => Promise<boolean>}} options
    * @returns {Promise<void>} when all is there
    */
-  async load(source, { name, poses = [], agree = async () => true }) {
+  async load(source, { name, poses = [], look = {}, agree = async () => true }) {
     this.loader?.terminate();
     this.sorter?.terminate();
     this.#reset();
     this.poses = poses;
+    this.asked = look;
     this.started = performance.now();
     this.sorter = startWorker('sort');
     this.sorter.onmessage = ({ data }) => this.#sorted(data);
@@ -99,6 +100,7 @@ export class Viewer extends EventTarget {
     if (Array.isArray(background) && background.length === 3) this.look.background = background.map(Number);
     this.look.antialiased = antialiased === true;
     this.look.degree = header.shDegree;
+    Object.assign(this.look, this.asked);
     Object.assign(this.stats, { splats: header.count, bytes: header.size, layers: header.layers.length });
     this.camera = new Camera(upOf(this.poses));
     if (this.poses.length) this.setPose(0);
