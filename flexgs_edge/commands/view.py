@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import logging
 import os
 import tempfile
@@ -27,7 +28,7 @@ from flexgs_edge.run.open_scene import is_fgs, scene_file
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.viewer.assets import PAGE, content_type, web_files
-from flexgs_edge.viewer.scene_page import page_config, served_page, single_page
+from flexgs_edge.viewer.scene_page import page_config, served_files, single_page
 from flexgs_edge.viewer.server import Resource, SceneServer
 
 LOG = logging.getLogger("flexgs_edge")
@@ -95,9 +96,11 @@ def view(
             with atomic_write(output, force) as file:
                 file.write(page)
             return ViewResult(scene_info(run.scene), size, len(cameras), os.fspath(output), len(page))
-        page_text = served_page(files, page_config(name, cameras, look, "scene.fgs"))
-        resources = {path: Resource(content_type(path), text.encode()) for path, text in files.items()}
-        resources[PAGE] = Resource(content_type(PAGE), page_text.encode())
+        texts = served_files(files, page_config(name, cameras, look, "scene.fgs"))
+        resources = {
+            path: Resource(content_type(path), text.encode(), gzip.compress(text.encode()))
+            for path, text in texts.items()
+        }
         resources[_SCENE] = Resource("application/octet-stream", scene)
         server = SceneServer(resources, host, port)
         address = server.address(PAGE)

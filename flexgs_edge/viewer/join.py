@@ -20,7 +20,8 @@ _LEFT = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
 def join_modules(files: Mapping[str, str], entry: str) -> str:
     """One script that does what the module `entry` does.
 
-    Comments that stand alone and indentation are left out: with them, a page would be half as large again. Each module becomes a function of its own, so that names in two modules do not meet, and hands over what it exports.
+    Comments that stand alone and indentation are left out: with them, a page would be half as large again. Each module
+    becomes a function of its own, so that names in two modules do not meet, and hands over what it exports.
 
     Parameters
     ----------

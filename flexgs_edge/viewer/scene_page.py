@@ -50,9 +50,13 @@ def _short(value: float) -> float:
     return value if isinstance(value, int) else float(f"{value:.9g}")
 
 
-def served_page(files: Mapping[str, str], config: Mapping[str, Any]) -> str:
-    """The page with what it is told, to be served beside its files."""
-    return _replaced(files[PAGE], {_CONFIG: _config(config)})
+def served_files(files: Mapping[str, str], config: Mapping[str, Any]) -> dict[str, str]:
+    """The page with what it is told and the files beside it, by their paths.
+
+    Modules are joined, so that they come with one request and not one after the other.
+    """
+    scripts = {path: join_modules(files, path) for path in (MAIN, *WORKERS.values())}
+    return {PAGE: _replaced(files[PAGE], {_CONFIG: _config(config)}), STYLE: files[STYLE], **scripts}
 
 
 def single_page(files: Mapping[str, str], config: Mapping[str, Any], scene: bytes) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import re
 import socket
 import threading
@@ -25,7 +26,7 @@ def server(tmp_path: Path) -> Iterator[SceneServer]:
     (tmp_path / "secret.txt").write_bytes(b"not for you")
     made = SceneServer(
         {
-            "viewer/index.html": Resource("text/html; charset=utf-8", b"<p>page</p>"),
+            "viewer/index.html": Resource("text/html; charset=utf-8", b"<p>page</p>", gzip.compress(b"<p>page</p>")),
             "viewer/scene.fgs": Resource("application/octet-stream", tmp_path / "scene.fgs"),
         }
     )
@@ -82,6 +83,16 @@ def test_what_is_there_is_given_with_strict_headers(server: SceneServer) -> None
     status, headers, body = ask(server, path_of(server, "viewer/scene.fgs") + "?x=1", "HEAD")
     assert (status, headers["Content-Length"], body) == (200, str(len(BODY)), b"")
     assert ask(server, path_of(server, "viewer/scene.fgs"))[2] == BODY
+
+
+def test_texts_are_packed_for_those_who_take_it(server: SceneServer) -> None:
+    path = path_of(server, "viewer/index.html")
+    _, headers, body = ask(server, path, **{"Accept-Encoding": "br, gzip"})
+    assert headers["Content-Encoding"] == "gzip" and gzip.decompress(body) == b"<p>page</p>"
+    assert "Content-Encoding" not in ask(server, path, **{"Accept-Encoding": "br"})[1]
+    _, headers, body = ask(server, path_of(server, "viewer/scene.fgs"), **{"Accept-Encoding": "gzip"})
+    assert "Content-Encoding" not in headers and body == BODY
+    assert ask(server, path, **{"Accept-Encoding": "gzip", "Range": "bytes=0-2"})[::2] == (206, b"<p>")
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ def test_it_serves_until_it_is_stopped(scene: Path, stop: signal.Signals) -> Non
             with urllib.request.urlopen(address) as answer:
                 page = answer.read().decode()
             assert json.loads(part(page, "scene"))["scene"] == "scene.fgs"
-            for name in ("scene.fgs", "src/page.js", "style.css", "../decoder/src/index.js"):
+            for name in ("scene.fgs", "src/page.js", "style.css", "src/load-worker.js", "src/sort-worker.js"):
                 with urllib.request.urlopen(urllib.parse.urljoin(address, name)) as answer:
                     assert answer.status == 200, name
         finally:

@@ -19,6 +19,8 @@ export class Viewer extends EventTarget {
   constructor(canvas, options) {
     super();
     this.canvas = canvas;
+    // Workers load while the shaders are compiled.
+    this.fresh = { load: startWorker('load'), sort: startWorker('sort') };
     this.renderer = new Renderer(canvas, options);
     this.camera = new Camera([0, -1, 0]);
     this.controls = new Controls(canvas, () => this.camera, () => this.refresh());
@@ -57,9 +59,11 @@ export class Viewer extends EventTarget {
     this.poses = poses;
     this.asked = look;
     this.started = performance.now();
-    this.sorter = startWorker('sort');
+    const { load, sort } = this.fresh ?? { load: startWorker('load'), sort: startWorker('sort') };
+    this.fresh = null;
+    this.sorter = sort;
     this.sorter.onmessage = ({ data }) => this.#sorted(data);
-    this.loader = startWorker('load');
+    this.loader = load;
     try {
       await new Promise((resolve, reject) => {
         this.loader.onerror = (event) => reject(new Error(event.message || 'The worker that decodes did not start.'));
