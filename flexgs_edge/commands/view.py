@@ -6,6 +6,7 @@ import gzip
 import logging
 import os
 import tempfile
+import threading
 import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -107,8 +108,9 @@ def view(
         LOG.info("%s is at %s until Ctrl-C", name, address)
         if ready is not None:
             ready(server)
-        if browser and not webbrowser.open(address):
-            LOG.warning("no browser opened: open the address by hand")
+        if browser:
+            # Beside the server: where only a browser for terminals is there, `open` returns when it ends.
+            threading.Thread(target=_open, args=(address,), daemon=True).start()
         try:
             server.serve()
         except KeyboardInterrupt:
@@ -116,11 +118,17 @@ def view(
         return ViewResult(scene_info(run.scene), size, len(cameras), address, None)
 
 
+def _open(address: str) -> None:
+    if not webbrowser.open(address):
+        LOG.warning("no browser opened: open the address by hand")
+
+
 @contextmanager
 def _coded(run: Run[ViewOptions], path: str | os.PathLike[str]) -> Iterator[Path]:
     """The scene as a `.fgs`: the file itself, or a temporary one of version 1, which takes no search."""
     place = scene_file(path)
-    if is_fgs(place) and not run.options.drop_invalid and run.scene.input_sh_degree == run.source.sh_degree:
+    as_it_is = run.options.frame is None and not run.options.drop_invalid
+    if is_fgs(place) and as_it_is and run.scene.input_sh_degree == run.source.sh_degree:
         yield place
         return
     source = run.source

@@ -98,8 +98,9 @@ class SceneServer:
         self.port = int(self._server.server_address[1])
 
     def address(self, path: str) -> str:
-        """The address of a resource."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
+        """The address of a resource, as this machine reaches it."""
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
+        host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/{self.secret}/{path}"
 
     def serve(self) -> None:

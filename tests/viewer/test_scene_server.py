@@ -262,5 +262,6 @@ def test_hosts_of_a_server_for_other_machines() -> None:
     try:
         for host, known in (("192.168.1.5", True), ("evil.example", False), ("localhost", True), ("[::1]", True)):
             assert made.knows(f"{host}:{made.port}") is known
+        assert made.address("a").startswith(f"http://127.0.0.1:{made.port}/")
     finally:
         made._server.server_close()

@@ -9,6 +9,8 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from PIL import Image
 import browser as browser_module
 from browser import Browser, find_browser
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.codec.v2.container import write_grid
+from flexgs_edge.codec.v2.container import GridContainer, write_grid
 from flexgs_edge.commands.render import render_views
 from flexgs_edge.commands.view import view
 from flexgs_edge.grid.step_sizes import StepSizes
@@ -28,6 +30,7 @@ from flexgs_edge.io.ply import PlySource
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.viewer.assets import PAGE
 from flexgs_edge.viewer.server import SceneServer
+from web_vectors import FOLDER
 
 POSES = (0, 27, 53)
 SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
@@ -254,6 +257,44 @@ def test_a_damaged_file_is_no_scene(tab: Browser, scene: Path, sample_dir: Path,
             scene.write_bytes(good)
     assert "checksum: wanted" in text and "the file is damaged" in text
     assert tab.run("viewer.renderer.drawn") == 0
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+def test_the_decoder_runs_in_a_worker_of_another_page(tab: Browser, repository: Path) -> None:
+    """As an npm package would: modules from a server, the file by ranges or as a stream, errors with their byte."""
+    web = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(repository / "web" / "decoder")))
+    threading.Thread(target=web.serve_forever, daemon=True).start()
+    try:
+        vectors = f"http://127.0.0.1:{web.server_port}/tests/vectors"
+        tab.send("Page.navigate", url=f"{vectors}/vectors.json")
+        tab.wait("Page.loadEventFired")
+        script = """(async (source) => {
+            const { openInWorker } = await import('/src/worker-client.js');
+            const file = await openInWorker(source);
+            const seen = [];
+            for await (const chunk of file.chunks({ values: true })) {
+                seen.push([chunk.rows, chunk.values.means.length, Number.isFinite(chunk.values.shRest[0])]);
+            }
+            await file.close();
+            return seen;
+        })"""
+        name = "three_chunks_of_512_rows_in_two_layers.fgs"
+        wanted = [[rows, 3 * rows, True] for rows in chunk_rows(FOLDER / name)]
+        assert tab.run(f"{script}('{name}')") == wanted
+        assert tab.run(f"fetch('{name}').then((answer) => answer.blob()).then({script})") == wanted
+        failed = tab.run(f"{script}('vectors.json').catch((error) => [error.name, error.offset, error.message])")
+        assert failed[:2] == ["FgsError", 0] and "not a .fgs file" in failed[2]
+    finally:
+        web.shutdown()
+        web.server_close()
+
+
+def chunk_rows(path: Path) -> list[int]:
+    return [chunk.stop - chunk.start for chunk in GridContainer(path).header.chunks()]
 
 
 def test_a_page_of_one_file_opens_from_disk(tab: Browser, scene: Path, sample_dir: Path, tmp_path: Path) -> None:

@@ -104,6 +104,20 @@ test('claims are compared with the size before anything is made', async () => {
   await assert.rejects(open(streamOf(huge, 500)), FgsError);
 });
 
+test('an interrupted download is an error, not a scene', async () => {
+  let given = 0;
+  const broken = new ReadableStream({
+    pull(controller) {
+      if (given > 10_000) return controller.error(new Error('the line is dead'));
+      controller.enqueue(bytes.slice(given, given + 1000));
+      given += 1000;
+    },
+  });
+  await assert.rejects(readAll(broken), /the line is dead/);
+  const short = { size: bytes.length, read: async (offset, length) => bytes.slice(offset, Math.min(offset + length, 12_000)) };
+  await assert.rejects(readAll(short), (error) => error instanceof FgsError && /the file is truncated/.test(error.message));
+});
+
 test('what is no source is a TypeError', async () => {
   await assert.rejects(open(5), TypeError);
   assert.ok(looksLikeFgs(bytes));
