@@ -111,6 +111,18 @@ def test_name_version_licence_and_command(archives: tuple[Path, Path]) -> None:
     assert any(name.endswith("LICENSE") for name in wheel.namelist())
 
 
+def test_an_installed_copy_has_its_viewer(archives: tuple[Path, Path], tmp_path: Path) -> None:
+    zipfile.ZipFile(archives[1]).extractall(tmp_path)
+    script = f"""
+import sys
+sys.path.insert(0, {str(tmp_path)!r})
+from flexgs_edge.viewer.assets import PAGE, web_files, web_folder
+print(web_folder())
+print(PAGE in web_files())
+"""
+    assert run_in(tmp_path, script) == [str(tmp_path / "flexgs_edge" / "web"), "True"]
+
+
 def run_in(folder: Path, script: str, **environment: str) -> list[str]:
     """Output lines of `script` in an interpreter outside the checkout."""
     variables = {name: value for name, value in os.environ.items() if not name.startswith(("FLEXGS", "PYTHONPATH"))}

@@ -1,4 +1,5 @@
 import { HeaderError } from './errors.js';
+import { shown } from './shown.js';
 
 /** As deep as any parser of the program goes. */
 const DEEPEST = 900;
@@ -105,7 +106,7 @@ class Parser {
       this.space();
     }
     this.at++;
-    if (twice !== null) throw new HeaderError(`wanted each key once, got '${twice}' twice`);
+    if (twice !== null) throw new HeaderError(`wanted each key once, got ${shown(twice)} twice`);
     return record;
   }
 
