@@ -7,9 +7,9 @@ import io
 import json
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,8 @@ from flexgs_edge.viewer.server import SceneServer
 from web_vectors import FOLDER
 
 POSES = (0, 27, 53)
+LOOK: dict[str, Any] = {"background": (0.2, 0.4, 0.9)}
+Drawn = Callable[[bool], tuple[str, ...]]
 SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 FINE = StepSizes(0.003, 0.1, 0.02, 0.2, 0.03, (0.03, 0.03, 0.03))
 
@@ -48,6 +50,21 @@ def scene(sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("scene") / "still_life.fgs"
     write_grid(place, grid, {}, chunk_rows=4096)
     return place
+
+
+@pytest.fixture(scope="module")
+def drawn(scene: Path, sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Drawn:
+    """The files that `render` writes, drawn once."""
+
+    @cache
+    def draw(antialiased: bool) -> tuple[str, ...]:
+        folder = tmp_path_factory.mktemp("drawn")
+        cameras = str(sample_dir / "cameras.json")
+        return render_views(
+            scene, folder, views=POSES, cameras=cameras, device="numpy", antialiased=antialiased, **LOOK
+        ).files
+
+    return draw
 
 
 @pytest.fixture(scope="module")
@@ -131,15 +148,13 @@ def decibels(one: np.ndarray, two: np.ndarray) -> float:
     ids=["half", "bytes", "antialiased"],
 )
 def test_pictures_are_those_of_render(
-    tab: Browser, scene: Path, sample_dir: Path, tmp_path: Path, bits: int, antialiased: bool, least: float
+    tab: Browser, scene: Path, sample_dir: Path, drawn: Drawn, bits: int, antialiased: bool, least: float
 ) -> None:
-    cameras = str(sample_dir / "cameras.json")
-    words = {"antialiased": antialiased, "background": (0.2, 0.4, 0.9)}
-    result = render_views(scene, tmp_path, views=POSES, cameras=cameras, device="numpy", **words)
-    with served(scene, cameras, **words) as address:
+    files = drawn(antialiased)
+    with served(scene, str(sample_dir / "cameras.json"), **LOOK, antialiased=antialiased) as address:
         go(tab, f"{address}?bits={bits}")
         assert tab.run("viewer.renderer.half") is (bits == 16)
-        for pose, file in zip(POSES, result.files, strict=True):
+        for pose, file in zip(POSES, files, strict=True):
             wanted = np.asarray(Image.open(file), np.float64)
             got = picture(tab, pose, wanted.shape[1], wanted.shape[0])
             assert decibels(got, wanted) >= least, pose
