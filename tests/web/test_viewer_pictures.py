@@ -163,6 +163,30 @@ def test_pictures_are_those_of_render(
         assert hosts == {address.split("/")[2]}
 
 
+def test_a_ply_is_shown_too(tab: Browser, sample_dir: Path, tmp_path: Path) -> None:
+    """Coded with 16 bits a value, as a file of version 1."""
+    cameras, scene = str(sample_dir / "cameras.json"), sample_dir / "point_cloud.ply"
+    (file,) = render_views(scene, tmp_path, views=[3], cameras=cameras, device="numpy").files
+    with served(scene, cameras) as address:
+        go(tab, address)
+        assert tab.run("viewer.header.version") == 1
+        wanted = np.asarray(Image.open(file), np.float64)
+        assert decibels(picture(tab, 3, wanted.shape[1], wanted.shape[0]), wanted) >= 50
+
+
+def test_a_browser_without_webgl2_is_told_so(tab: Browser, scene: Path) -> None:
+    script = "HTMLCanvasElement.prototype.getContext = () => null"
+    added = tab.send("Page.addScriptToEvaluateOnNewDocument", source=script)["identifier"]
+    try:
+        with served(scene, "none") as address:
+            tab.send("Page.navigate", url=address)
+            tab.wait("Page.loadEventFired")
+            until(tab, "document.querySelector('#status.error')")
+            assert "needs WebGL2" in tab.run("document.getElementById('status').textContent")
+    finally:
+        tab.send("Page.removeScriptToEvaluateOnNewDocument", identifier=added)
+
+
 def requests(tab: Browser) -> list[dict[str, Any]]:
     sent = [event for event in tab.events if event.get("method") == "Network.requestWillBeSent"]
     return [event for event in sent if not event["params"]["request"]["url"].startswith(("data:", "blob:"))]

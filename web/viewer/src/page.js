@@ -14,10 +14,11 @@ function say(text, isError = false) {
 
 function start() {
   const canvas = find('canvas');
+  const first = firstScene();
   let viewer;
   try {
     const half = new URLSearchParams(location.search).get('bits') !== '8';
-    viewer = new Viewer(canvas, { half });
+    viewer = new Viewer(canvas, { half, first });
   } catch (error) {
     say(error.message, true);
     return;
@@ -25,7 +26,6 @@ function start() {
   globalThis.viewer = viewer;
   wire(viewer);
   wireFiles(viewer);
-  const first = firstScene();
   if (first) show(viewer, first.source, first.name, config.poses, config.look);
   else say('Drop a .fgs file here, or choose one in the panel.');
 }

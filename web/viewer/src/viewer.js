@@ -14,14 +14,15 @@ const GRID = 256 * 2 ** 20;
 export class Viewer extends EventTarget {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {{half?: boolean}} [options]
+   * @param {{half?: boolean, first?: {source: string | Uint8Array, name: string}}} [options] `first` is decoded while the
+   *   shaders are compiled; `load` must be called with it at once
    */
-  constructor(canvas, options) {
+  constructor(canvas, { half, first } = {}) {
     super();
     this.canvas = canvas;
-    // Workers load while the shaders are compiled.
-    this.fresh = { load: startWorker('load'), sort: startWorker('sort') };
-    this.renderer = new Renderer(canvas, options);
+    this.fresh = { load: startWorker('load'), sort: startWorker('sort'), first, started: performance.now() };
+    if (first) this.fresh.load.postMessage(first);
+    this.renderer = new Renderer(canvas, { half });
     this.camera = new Camera([0, -1, 0]);
     this.controls = new Controls(canvas, () => this.camera, () => this.refresh());
     this.look = { near: 0.2, degree: 4, antialiased: false, background: [0, 0, 0] };
@@ -58,9 +59,10 @@ export class Viewer extends EventTarget {
     this.#reset();
     this.poses = poses;
     this.asked = look;
-    this.started = performance.now();
+    const begun = this.fresh?.first?.source === source && this.fresh;
     const { load, sort } = this.fresh ?? { load: startWorker('load'), sort: startWorker('sort') };
     this.fresh = null;
+    this.started = begun ? begun.started : performance.now();
     this.sorter = sort;
     this.sorter.onmessage = ({ data }) => this.#sorted(data);
     this.loader = load;
@@ -68,7 +70,7 @@ export class Viewer extends EventTarget {
       await new Promise((resolve, reject) => {
         this.loader.onerror = (event) => reject(new Error(event.message || 'The worker that decodes did not start.'));
         this.loader.onmessage = ({ data }) => this.#loaded(data, agree).then((done) => done && resolve(), reject);
-        this.loader.postMessage({ source, name });
+        if (!begun) this.loader.postMessage({ source, name });
       });
     } catch (error) {
       this.loader.terminate();
