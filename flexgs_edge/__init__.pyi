@@ -23,6 +23,7 @@ from .commands.score import score_gaussians as score_gaussians
 from .commands.synth import synth as synth
 from .commands.trim import trim as trim
 from .commands.verify import verify as verify
+from .commands.view import view as view
 from .commands.worth import worth as worth
 from .errors import BudgetError as BudgetError
 from .errors import DeviceError as DeviceError
@@ -42,6 +43,7 @@ from .report.file_results import ScoreResult as ScoreResult
 from .report.file_results import SynthResult as SynthResult
 from .report.file_results import TrimResult as TrimResult
 from .report.file_results import VerifyResult as VerifyResult
+from .report.file_results import ViewResult as ViewResult
 from .report.info_result import InfoResult as InfoResult
 from .report.results import CompressResult as CompressResult
 from .report.results import EvaluateResult as EvaluateResult

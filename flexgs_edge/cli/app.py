@@ -24,6 +24,7 @@ COMMANDS = {
     "info": "Show what a scene file holds.",
     "trim": "Cut a layered .fgs file to a size, without the original.",
     "verify": "Check every byte of a .fgs file against its checksums.",
+    "view": "Look at a scene in the browser.",
     "render": "Draw views of a scene as PNG files.",
     "evaluate": "Compare a scene with its original, view by view.",
     "score": "Save the importance of every Gaussian, for --method paper.",

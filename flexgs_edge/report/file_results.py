@@ -211,6 +211,51 @@ class TrimResult:
 
 
 @dataclass(frozen=True)
+class ViewResult:
+    """Result of `view`: the scene that was shown, and where.
+
+    Parameters
+    ----------
+    scene : SceneInfo
+        The input.
+    size, views : int
+        Bytes of the `.fgs` that was shown, and cameras to choose from.
+    place : str
+        The page that was written, or the address that was served.
+    page_size : int or None
+        Bytes of the page that was written.
+    """
+
+    scene: SceneInfo
+    size: int
+    views: int
+    place: str
+    page_size: int | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the record as JSON values."""
+        return {
+            "program": f"flexgs-edge {__version__}",
+            "command": "view",
+            "input": self.scene.to_json(),
+            "size": self.size,
+            "views": self.views,
+            "output" if self.page_size is not None else "address": self.place,
+            "page_size": self.page_size,
+        }
+
+    def summary(self) -> str:
+        """Return the text that the command prints."""
+        lines = scene_lines("scene", self.scene)
+        lines.append(line("shown", f"{self.size} bytes ({format_size(self.size)}), {self.views} cameras"))
+        if self.page_size is None:
+            lines.append(line("served", self.place))
+        else:
+            lines.append(line("wrote", f"{self.place}, {self.page_size} bytes ({format_size(self.page_size)})"))
+        return text(lines)
+
+
+@dataclass(frozen=True)
 class SynthResult:
     """Result of `synth`: the scene it made.
 

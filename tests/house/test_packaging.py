@@ -34,7 +34,7 @@ def archives(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
         "constraints.txt",
     ):
         (tree / name).write_bytes((repository / name).read_bytes())
-    for name in ("flexgs_edge", "cl_kernels", "docs", "tests", "samples", "benchmarks", "deploy"):
+    for name in ("flexgs_edge", "cl_kernels", "web", "docs", "tests", "samples", "benchmarks", "deploy"):
         (tree / name).symlink_to(repository / name)
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(tree)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -64,9 +64,20 @@ def template_files(repository: Path) -> set[str]:
     return {str(path.relative_to(repository)) for path in folder.iterdir()}
 
 
+def web_file_names(repository: Path) -> set[str]:
+    """What the viewer and its decoder need to run."""
+    web = repository / "web"
+    places = [
+        *(web / "decoder" / "src").glob("*.js"),
+        *(web / "viewer" / "src").glob("*.js"),
+        *(web / "viewer").glob("*.html"),
+    ]
+    return {str(place.relative_to(repository)) for place in [*places, *(web / "viewer").glob("*.css")]}
+
+
 def test_every_package_is_listed_in_setup_cfg(repository: Path) -> None:
     listed = set(read_configuration(repository / "setup.cfg")["options"]["packages"])
-    found = {*find_packages(str(repository), include=["flexgs_edge*"]), "flexgs_edge.cl_kernels"}
+    found = {*find_packages(str(repository), include=["flexgs_edge*"]), "flexgs_edge.cl_kernels", "flexgs_edge.web"}
     assert listed == found, "correct [options] packages in setup.cfg"
 
 
@@ -75,13 +86,15 @@ def test_the_wheel_holds_the_package_the_templates_and_the_kernels(
 ) -> None:
     files = {name for name in files_of(archives[1]) if ".dist-info/" not in name}
     kernels = {f"flexgs_edge/cl_kernels/{name}" for name in kernel_files(repository)}
-    assert files == python_files(repository) | template_files(repository) | kernels
+    web = {f"flexgs_edge/{name}" for name in web_file_names(repository)}
+    assert files == python_files(repository) | template_files(repository) | kernels | web
 
 
 def test_the_sdist_can_be_built_from_and_holds_no_tests(repository: Path, archives: tuple[Path, Path]) -> None:
     files = files_of(archives[0])
     assert python_files(repository) | template_files(repository) <= files
     assert {f"cl_kernels/{name}" for name in kernel_files(repository)} <= files
+    assert web_file_names(repository) <= files
     assert {"LICENSE", "README.md", "CHANGELOG.md", "constraints.txt", "setup.cfg", "pyproject.toml"} <= files
     assert {"docs/design.md", "docs/format.md"} <= files
     assert [name for name in files if name.startswith(("tests/", "samples/", "benchmarks/", "deploy/"))] == []
@@ -96,6 +109,18 @@ def test_name_version_licence_and_command(archives: tuple[Path, Path]) -> None:
     assert re.search(r"^License(-Expression)?: Apache-2\.0$", metadata, re.MULTILINE)
     assert "flexgs-edge = flexgs_edge.cli.app:main" in wheel.read(f"{info}/entry_points.txt").decode()
     assert any(name.endswith("LICENSE") for name in wheel.namelist())
+
+
+def test_an_installed_copy_has_its_viewer(archives: tuple[Path, Path], tmp_path: Path) -> None:
+    zipfile.ZipFile(archives[1]).extractall(tmp_path)
+    script = f"""
+import sys
+sys.path.insert(0, {str(tmp_path)!r})
+from flexgs_edge.viewer.assets import PAGE, web_files, web_folder
+print(web_folder())
+print(PAGE in web_files())
+"""
+    assert run_in(tmp_path, script) == [str(tmp_path / "flexgs_edge" / "web"), "True"]
 
 
 def run_in(folder: Path, script: str, **environment: str) -> list[str]:
@@ -203,7 +228,7 @@ def test_an_editable_install_finds_the_kernels_of_the_checkout(repository: Path,
     # setuptools' own hook makes the editable wheel; installing it is unzipping it into a folder of site-packages.
     tree, site = tmp_path / "tree", tmp_path / "site"
     tree.mkdir()
-    for name in ("setup.cfg", "pyproject.toml", "LICENSE", "README.md", "flexgs_edge", "cl_kernels"):
+    for name in ("setup.cfg", "pyproject.toml", "LICENSE", "README.md", "flexgs_edge", "cl_kernels", "web"):
         (tree / name).symlink_to(repository / name)
     build = f"import setuptools.build_meta as b; print(b.build_editable({str(tmp_path)!r}))"
     wheel = run_in(tree, build)[-1]

@@ -1,0 +1,140 @@
+"""`view`: look at a scene in the browser, from a local server or from one file."""
+
+from __future__ import annotations
+
+import gzip
+import logging
+import os
+import tempfile
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.codec.v1.container import write_container
+from flexgs_edge.errors import InputError
+from flexgs_edge.files import atomic_write, check_writable
+from flexgs_edge.methods.paper.prune import nonzero_sh
+from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.packed.quantize import quantize_scene
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.report.file_results import ViewResult
+from flexgs_edge.run.inputs import scene_info
+from flexgs_edge.run.open_scene import is_fgs, scene_file
+from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.run import Run, open_run
+from flexgs_edge.viewer.assets import PAGE, content_type, web_files
+from flexgs_edge.viewer.scene_page import page_config, served_files, single_page
+from flexgs_edge.viewer.server import Resource, SceneServer
+
+LOG = logging.getLogger("flexgs_edge")
+
+FINE = BitSpec(xyz=16, dc=16, scale=16, rot=16, opacity=16, rest=16)
+"""Bits of a scene that is coded only to be looked at."""
+_SCENE = "viewer/scene.fgs"
+
+
+def view(
+    input: str | os.PathLike[str],
+    output: str | os.PathLike[str] | None = None,
+    options: ViewOptions | None = None,
+    force: bool = False,
+    progress: Progress = SILENT,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    browser: bool = True,
+    ready: Callable[[SceneServer], None] | None = None,
+    **words: Any,
+) -> ViewResult:
+    """Look at a scene in the browser.
+
+    Parameters
+    ----------
+    input : path
+        A scene file or a model folder. A `.fgs` is shown as it is, other scenes with 16 bits a value.
+    output : path, optional
+        Write a page of one file, which opens from disk without a network. Default: serve until interrupted.
+    options : ViewOptions, optional
+        Options as on the command line: cameras, and how the scene is drawn.
+    force : bool
+        Overwrite `output`. Default: raise `InputError`.
+    progress : Progress, optional
+        Shows bars.
+    host, port : str, int
+        Where to serve. Default: this machine alone, any free port.
+    browser : bool
+        Open the page in the browser.
+    ready : callable, optional
+        Called with the server before it serves.
+    **words
+        Single options, by the names of `ViewOptions`.
+
+    Returns
+    -------
+    ViewResult
+        What was shown, and where.
+    """
+    if output is not None:
+        if Path(output).suffix.lower() not in (".html", ".htm"):
+            raise InputError(f"-o {output}: expected a name that ends in .html")
+        check_writable(output, force)
+    if not 0 <= port <= 65535:
+        raise InputError(f"--port {port}: expected 0 to 65535")
+    run = open_run(input, replace(options or ViewOptions(), **words), progress, photos=False)
+    cameras = [] if run.views is None else list(run.views.cameras)
+    look = {"near": run.options.near, "background": run.options.background, "antialiased": run.options.antialiased}
+    name = Path(os.fspath(input)).resolve().name
+    files = web_files()
+    with _coded(run, input) as scene:
+        size = os.stat(scene).st_size
+        if output is not None:
+            page = single_page(files, page_config(name, cameras, look), scene.read_bytes()).encode()
+            with atomic_write(output, force) as file:
+                file.write(page)
+            return ViewResult(scene_info(run.scene), size, len(cameras), os.fspath(output), len(page))
+        texts = served_files(files, page_config(name, cameras, look, "scene.fgs"))
+        resources = {
+            path: Resource(content_type(path), text.encode(), gzip.compress(text.encode()))
+            for path, text in texts.items()
+        }
+        resources[_SCENE] = Resource("application/octet-stream", scene)
+        server = SceneServer(resources, host, port)
+        address = server.address(PAGE)
+        LOG.info("%s is at %s until Ctrl-C", name, address)
+        if ready is not None:
+            ready(server)
+        if browser:
+            # Beside the server: where only a browser for terminals is there, `open` returns when it ends.
+            threading.Thread(target=_open, args=(address,), daemon=True).start()
+        try:
+            server.serve()
+        except KeyboardInterrupt:
+            LOG.info("stopped")
+        return ViewResult(scene_info(run.scene), size, len(cameras), address, None)
+
+
+def _open(address: str) -> None:
+    if not webbrowser.open(address):
+        LOG.warning("no browser opened: open the address by hand")
+
+
+@contextmanager
+def _coded(run: Run[ViewOptions], path: str | os.PathLike[str]) -> Iterator[Path]:
+    """The scene as a `.fgs`: the file itself, or a temporary one of version 1, which takes no search."""
+    place = scene_file(path)
+    as_it_is = run.options.frame is None and not run.options.drop_invalid
+    if is_fgs(place) and as_it_is and run.scene.input_sh_degree == run.source.sh_degree:
+        yield place
+        return
+    source = run.source
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="flexgs-view-")))
+        has_sh = nonzero_sh(source)
+        quantized = quantize_scene(source, np.flatnonzero(has_sh), np.flatnonzero(~has_sh), FINE)
+        write_container(folder / "scene.fgs", quantized, {})
+        yield folder / "scene.fgs"

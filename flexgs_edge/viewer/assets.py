@@ -1,0 +1,40 @@
+"""The files of the viewer (`web/`), and their content types."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flexgs_edge.errors import InputError
+
+PAGE = "viewer/index.html"
+STYLE = "viewer/style.css"
+MAIN = "viewer/src/page.js"
+WORKERS = {"load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
+"""Workers of the page by the name that `startWorker` knows."""
+_KINDS = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+}
+_PATTERNS = ("viewer/*.html", "viewer/*.css", "viewer/src/*.js", "decoder/src/*.js")
+
+
+def web_folder() -> Path:
+    """The folder of the viewer: `web` inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    for candidate in (package / "web", package.parent / "web"):
+        if (candidate / PAGE).is_file():
+            return candidate
+    raise InputError(f"the viewer: expected {PAGE} in {package / 'web'}, found none: install flexgs-edge again")
+
+
+def web_files() -> dict[str, str]:
+    """Texts of all files that the viewer needs, by their path below `web/`."""
+    folder = web_folder()
+    places = [place for pattern in _PATTERNS for place in sorted(folder.glob(pattern))]
+    return {place.relative_to(folder).as_posix(): place.read_text(encoding="utf-8") for place in places}
+
+
+def content_type(path: str) -> str:
+    """Content type of a file by its suffix."""
+    return _KINDS[Path(path).suffix]

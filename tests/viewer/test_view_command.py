@@ -1,0 +1,149 @@
+"""`view`: the page of one file, the server as a process, and the scripts that both need."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import urllib.parse
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from flexgs_edge.codec.open_fgs import read_header
+from flexgs_edge.codec.v2.container import write_grid
+from flexgs_edge.commands.view import view
+from flexgs_edge.errors import InputError
+from flexgs_edge.io.ply import write_ply
+from flexgs_edge.viewer.assets import MAIN, WORKERS, web_files
+from flexgs_edge.viewer.join import join_modules
+from grid_scenes import make_grid
+from quantized_scenes import make_scene
+
+CAMERA = {
+    "id": 0,
+    "img_name": "</script><b>",
+    "width": 40,
+    "height": 30,
+    "position": [1234.5, 0, -3],
+    "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "fx": 40,
+    "fy": 40,
+}
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    write_grid(tmp_path / "scene.fgs", make_grid(300, 1), {"near": 0.01})
+    (tmp_path / "cameras.json").write_text(json.dumps([CAMERA]))
+    return tmp_path / "scene.fgs"
+
+
+def part(page: str, name: str) -> str:
+    found = re.search(rf'<script type="[^"]*" id="{name}">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+def test_a_page_of_one_file(scene: Path) -> None:
+    output = scene.with_suffix(".html")
+    result = view(scene, output)
+    page = output.read_text()
+    assert base64.b64decode(part(page, "scene-bytes")) == scene.read_bytes()
+    config = json.loads(part(page, "scene"))
+    assert config["name"] == "scene.fgs" and "scene" not in config
+    assert config["poses"][0]["name"] == CAMERA["img_name"] and config["poses"][0]["position"] == CAMERA["position"]
+    assert config["look"]["near"] == 0.01
+    assert "<b>" not in page
+    script = re.search(r'<script type="module">(.*?)</script>', page, re.DOTALL)
+    assert script is not None
+    digest = base64.b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}' blob:" in page
+    # Nothing is fetched: no address but those of data.
+    assert not re.search(r"""(?:src|href)=["'](?!data:)""", page) and "http://" not in page and "https://" not in page
+    assert (result.size, result.views, result.page_size) == (scene.stat().st_size, 1, output.stat().st_size)
+    assert "wrote" in result.summary() and result.to_json()["output"] == str(output)
+    with pytest.raises(InputError, match="exists"):
+        view(scene, output)
+
+
+def test_other_scenes_are_coded_with_16_bits(tmp_path: Path) -> None:
+    write_ply(tmp_path / "scene.ply", make_scene(200, 1))
+    view(tmp_path / "scene.ply", tmp_path / "scene.html", cameras="none")
+    data = base64.b64decode(part((tmp_path / "scene.html").read_text(), "scene-bytes"))
+    (tmp_path / "coded.fgs").write_bytes(data)
+    header = read_header(tmp_path / "coded.fgs")
+    assert (header.count, header.sh_degree, header.version if hasattr(header, "version") else 1) == (200, 1, 1)
+
+
+def test_arguments_that_are_wrong(scene: Path) -> None:
+    with pytest.raises(InputError, match=r"ends in \.html"):
+        view(scene, scene.with_suffix(".fgs.out"))
+    with pytest.raises(InputError, match="--port"):
+        view(scene, port=70000)
+    with pytest.raises(InputError, match="cannot listen"):
+        view(scene, host="no.such.host.invalid", browser=False)
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_it_serves_until_it_is_stopped(scene: Path, stop: signal.Signals) -> None:
+    command = [sys.executable, "-m", "flexgs_edge", "view", str(scene), "--no-browser", "-q"]
+    folder = Path(__file__).resolve().parents[2]
+    with subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(folder)},
+    ) as process:
+        assert process.stderr is not None
+        address = process.stderr.readline().strip()
+        try:
+            assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]+/viewer/index\.html", address)
+            with urllib.request.urlopen(address) as answer:
+                page = answer.read().decode()
+            assert json.loads(part(page, "scene"))["scene"] == "scene.fgs"
+            for name in ("scene.fgs", "src/page.js", "style.css", "src/load-worker.js", "src/sort-worker.js"):
+                with urllib.request.urlopen(urllib.parse.urljoin(address, name)) as answer:
+                    assert answer.status == 200, name
+        finally:
+            process.send_signal(stop)
+        rest = process.communicate(timeout=60)[1]
+    assert process.returncode == (0 if stop == signal.SIGINT else 128 + stop), rest
+    assert "Traceback" not in rest
+
+
+def test_modules_are_joined() -> None:
+    files = {
+        "a/main.js": "import { two, one as uno } from './b.js';\nimport './c.js';\nexport const three = uno + two();\n"
+        "globalThis.found = three;\n",
+        "a/b.js": "/** A comment. */\nexport { one } from '../d.js';\nexport function two() {\n  return 2;\n}\n",
+        "a/c.js": "export class C {}\n// alone\n",
+        "d.js": "export const one = 1;\n",
+    }
+    text = join_modules(files, "a/main.js")
+    assert "comment" not in text and "alone" not in text and "import" not in text
+    node = shutil.which("node")
+    if node is not None:
+        run = subprocess.run([node, "-e", f"{text}\nconsole.log(found)"], capture_output=True, text=True, check=True)
+        assert run.stdout == "3\n"
+    with pytest.raises(ValueError, match="cannot join 'export default"):
+        join_modules({"x.js": "export default 3;\n"}, "x.js")
+
+
+def test_our_modules_are_joined_into_scripts_that_parse(tmp_path: Path) -> None:
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no node to parse scripts with")
+    for entry in (MAIN, *WORKERS.values()):
+        # The page's script is a module, for `import.meta`.
+        place = tmp_path / f"{Path(entry).stem}{'.mjs' if entry == MAIN else '.cjs'}"
+        place.write_text(join_modules(web_files(), entry))
+        subprocess.run([node, "--check", str(place)], check=True, timeout=60)

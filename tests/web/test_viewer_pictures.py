@@ -1,0 +1,346 @@
+"""The viewer in headless Chromium: its pictures are those of `render`, and its buttons and keys do what they say."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache, partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import browser as browser_module
+from browser import Browser, find_browser
+from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.codec.v2.container import GridContainer, write_grid
+from flexgs_edge.commands.render import render_views
+from flexgs_edge.commands.view import view
+from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.io.ply import PlySource
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.viewer.assets import PAGE
+from flexgs_edge.viewer.server import SceneServer
+from web_vectors import FOLDER
+
+POSES = (0, 27, 53)
+LOOK: dict[str, Any] = {"background": (0.2, 0.4, 0.9)}
+Drawn = Callable[[bool], tuple[str, ...]]
+SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+FINE = StepSizes(0.003, 0.1, 0.02, 0.2, 0.03, (0.03, 0.03, 0.03))
+
+
+@pytest.fixture(scope="module")
+def scene(sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample, coded on a fine grid in two layers: no search, since only the drawing is looked at."""
+    source = PlySource(sample_dir / "point_cloud.ply")
+    planes = source.read(slice(0, source.count), list(FIELD))
+    layer = np.arange(source.count) % 2
+    degrees = np.full(source.count, source.sh_degree)
+    grid = to_grid(planes, degrees, FINE, tuple(source.origin), layer)[0]
+    place = tmp_path_factory.mktemp("scene") / "still_life.fgs"
+    write_grid(place, grid, {}, chunk_rows=4096)
+    return place
+
+
+@pytest.fixture(scope="module")
+def drawn(scene: Path, sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Drawn:
+    """The files that `render` writes, drawn once."""
+
+    @cache
+    def draw(antialiased: bool) -> tuple[str, ...]:
+        folder = tmp_path_factory.mktemp("drawn")
+        cameras = str(sample_dir / "cameras.json")
+        return render_views(
+            scene, folder, views=POSES, cameras=cameras, device="numpy", antialiased=antialiased, **LOOK
+        ).files
+
+    return draw
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    program = find_browser()
+    if program is None:
+        pytest.skip("no Chromium: the viewer's pictures need one")
+    with pytest.MonkeyPatch.context() as patch:
+        flags = tuple(flag for flag in browser_module.FLAGS if flag != "--disable-gpu")
+        patch.setattr(browser_module, "FLAGS", (*flags, *SOFTWARE))
+        with Browser(program, tmp_path_factory.mktemp("profile")) as made:
+            if not made.run("Boolean(document.createElement('canvas').getContext('webgl2'))"):
+                pytest.skip("this Chromium has no WebGL2, not even in software")
+            yield made
+
+
+@contextmanager
+def served(scene: Path, cameras: str, **words: Any) -> Iterator[str]:
+    """The address of the viewer's page."""
+    ready: list[SceneServer] = []
+    event = threading.Event()
+
+    def started(server: SceneServer) -> None:
+        ready.append(server)
+        event.set()
+
+    thread = threading.Thread(
+        target=lambda: view(scene, browser=False, ready=started, cameras=cameras, **words), daemon=True
+    )
+    thread.start()
+    assert event.wait(60)
+    try:
+        yield ready[0].address(PAGE)
+    finally:
+        ready[0].stop()
+        thread.join(20)
+
+
+def go(tab: Browser, address: str, width: int = 480, height: int = 360, dark: bool = False) -> None:
+    """Load the page and wait for the whole scene."""
+    tab.events.clear()
+    tab.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 400)
+    scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+    tab.send("Emulation.setEmulatedMedia", features=[scheme])
+    tab.send("Page.navigate", url=address)
+    tab.wait("Page.loadEventFired")
+    until(tab, "globalThis.viewer && viewer.stats.wholeMs > 0 && viewer.stats.firstMs > 0")
+
+
+def until(tab: Browser, condition: str) -> None:
+    for _ in range(600):
+        if tab.run(f"Boolean({condition})"):
+            return
+        time.sleep(0.1)
+    raise AssertionError(f"not within a minute: {condition}; {tab.run('document.body.innerText')!r}, {faults(tab)}")
+
+
+def faults(tab: Browser) -> list[str]:
+    """What went wrong in the page: exceptions, refused requests, broken policies."""
+    names = ("Runtime.exceptionThrown", "Log.entryAdded", "Network.loadingFailed")
+    return [json.dumps(event)[:500] for event in tab.events if event.get("method") in names]
+
+
+def picture(tab: Browser, pose: int, width: int, height: int) -> np.ndarray:
+    text = tab.run(
+        f"(async () => {{ viewer.setPose({pose}); const blob = await viewer.picture({width}, {height});"
+        "const reader = new FileReader(); reader.readAsDataURL(blob);"
+        "await new Promise((done) => (reader.onload = done)); return reader.result; })()"
+    )
+    data = base64.b64decode(text.partition(",")[2])
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), np.float64)
+
+
+def decibels(one: np.ndarray, two: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / max(((one - two) ** 2).mean(), 1e-9)))
+
+
+@pytest.mark.parametrize(
+    ("bits", "antialiased", "least"),
+    [(16, False, 50), (8, False, 40), (16, True, 50)],
+    ids=["half", "bytes", "antialiased"],
+)
+def test_pictures_are_those_of_render(
+    tab: Browser, scene: Path, sample_dir: Path, drawn: Drawn, bits: int, antialiased: bool, least: float
+) -> None:
+    files = drawn(antialiased)
+    with served(scene, str(sample_dir / "cameras.json"), **LOOK, antialiased=antialiased) as address:
+        go(tab, f"{address}?bits={bits}")
+        assert tab.run("viewer.renderer.half") is (bits == 16)
+        for pose, file in zip(POSES, files, strict=True):
+            wanted = np.asarray(Image.open(file), np.float64)
+            got = picture(tab, pose, wanted.shape[1], wanted.shape[0])
+            assert decibels(got, wanted) >= least, pose
+        assert faults(tab) == []
+        hosts = {event["params"]["request"]["url"].split("/")[2] for event in requests(tab)}
+        assert hosts == {address.split("/")[2]}
+
+
+def test_a_ply_is_shown_too(tab: Browser, sample_dir: Path, tmp_path: Path) -> None:
+    """Coded with 16 bits a value, as a file of version 1."""
+    cameras, scene = str(sample_dir / "cameras.json"), sample_dir / "point_cloud.ply"
+    (file,) = render_views(scene, tmp_path, views=[3], cameras=cameras, device="numpy").files
+    with served(scene, cameras) as address:
+        go(tab, address)
+        assert tab.run("viewer.header.version") == 1
+        wanted = np.asarray(Image.open(file), np.float64)
+        assert decibels(picture(tab, 3, wanted.shape[1], wanted.shape[0]), wanted) >= 50
+
+
+def test_a_browser_without_webgl2_is_told_so(tab: Browser, scene: Path) -> None:
+    script = "HTMLCanvasElement.prototype.getContext = () => null"
+    added = tab.send("Page.addScriptToEvaluateOnNewDocument", source=script)["identifier"]
+    try:
+        with served(scene, "none") as address:
+            tab.send("Page.navigate", url=address)
+            tab.wait("Page.loadEventFired")
+            until(tab, "document.querySelector('#status.error')")
+            assert "needs WebGL2" in tab.run("document.getElementById('status').textContent")
+    finally:
+        tab.send("Page.removeScriptToEvaluateOnNewDocument", identifier=added)
+
+
+def requests(tab: Browser) -> list[dict[str, Any]]:
+    sent = [event for event in tab.events if event.get("method") == "Network.requestWillBeSent"]
+    return [event for event in sent if not event["params"]["request"]["url"].startswith(("data:", "blob:"))]
+
+
+def eye(tab: Browser) -> list[float]:
+    found: list[float] = tab.run("[...viewer.camera.eye, ...viewer.camera.axes.flat()]")
+    return found
+
+
+def drag(tab: Browser, dx: int, dy: int, button: str = "left", modifiers: int = 0) -> None:
+    mouse = {"button": button, "buttons": 1 if button == "left" else 2, "modifiers": modifiers}
+    tab.send("Input.dispatchMouseEvent", type="mousePressed", x=200, y=200, clickCount=1, **mouse)
+    for step in range(1, 5):
+        tab.send("Input.dispatchMouseEvent", type="mouseMoved", x=200 + dx * step / 4, y=200 + dy * step / 4, **mouse)
+    tab.send("Input.dispatchMouseEvent", type="mouseReleased", x=200 + dx, y=200 + dy, **mouse)
+
+
+def hold(tab: Browser, key: str, code: str) -> None:
+    """Hold a key until the camera has moved; frames in software take their time."""
+    state = "JSON.stringify([viewer.camera.eye, viewer.camera.axes])"
+    before = tab.run(state)
+    tab.send("Input.dispatchKeyEvent", type="keyDown", key=key, code=code)
+    until(tab, f"{state} !== {json.dumps(before)}")
+    tab.send("Input.dispatchKeyEvent", type="keyUp", key=key, code=code)
+
+
+def test_mouse_touch_and_keys(tab: Browser, scene: Path, sample_dir: Path) -> None:
+    with served(scene, str(sample_dir / "cameras.json")) as address:
+        go(tab, address)
+        names = [camera.name for camera in read_cameras(sample_dir / "cameras.json")]
+        assert tab.run("[...document.getElementById('pose').options].map((o) => o.text)") == sorted(names)
+        distance = tab.run("viewer.camera.distance")
+        start = eye(tab)
+        drag(tab, 60, 20)
+        turned = eye(tab)
+        assert turned != start and tab.run("viewer.camera.distance") == pytest.approx(distance)
+        drag(tab, 60, 20, "right")
+        assert eye(tab)[3:] == turned[3:] and eye(tab)[:3] != turned[:3]
+        tab.send("Input.dispatchMouseEvent", type="mouseWheel", x=200, y=200, deltaX=0, deltaY=-200)
+        until(tab, f"viewer.camera.distance < {distance} * 0.9")
+        tab.run("document.getElementById('canvas').focus()")
+        for key, code in (("w", "KeyW"), ("ArrowLeft", "ArrowLeft"), ("e", "KeyE")):
+            hold(tab, key, code)
+        assert not tab.run("viewer.controls.active")
+        before = eye(tab)
+        points = [[{"x": 150 - 10 * i, "y": 200}, {"x": 250 + 10 * i, "y": 200}] for i in range(4)]
+        tab.send("Input.dispatchTouchEvent", type="touchStart", touchPoints=points[0])
+        for both in points[1:]:
+            tab.send("Input.dispatchTouchEvent", type="touchMove", touchPoints=both)
+        tab.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+        assert eye(tab) != before
+        tab.press("r", 82)
+        assert eye(tab) == pytest.approx(start)
+        tab.press("]", 221)
+        assert tab.run("[viewer.pose, document.getElementById('pose').value]") == [1, "1"]
+        assert faults(tab) == []
+
+
+def change(tab: Browser, name: str, value: str) -> None:
+    tab.run(
+        f"(() => {{ const field = document.getElementById('{name}');"
+        f"if (field.type === 'checkbox') field.checked = {json.dumps(value)} === 'on'; else field.value = {json.dumps(value)};"
+        "field.dispatchEvent(new Event('input')); })()"
+    )
+
+
+def test_the_panel_on_a_phone_in_the_dark(tab: Browser, scene: Path, sample_dir: Path) -> None:
+    with served(scene, str(sample_dir / "cameras.json")) as address:
+        go(tab, address, 360, 640, dark=True)
+        tab.run("document.querySelector('summary').click()")
+        assert tab.run("document.documentElement.scrollWidth <= innerWidth")
+        assert tab.run("getComputedStyle(document.body).color") == "rgb(236, 238, 241)"
+        change(tab, "theme", "light")
+        assert tab.run("getComputedStyle(document.body).color") == "rgb(28, 29, 31)"
+        full = picture(tab, 0, 120, 90)
+        change(tab, "degree", "0")
+        plain = picture(tab, 0, 120, 90)
+        assert decibels(full, plain) < 60
+        change(tab, "degree", "3")
+        change(tab, "background", "#ff0000")
+        change(tab, "antialiased", "on")
+        assert tab.run("[viewer.look.background, viewer.look.antialiased]") == [[1, 0, 0], True]
+        drawn = tab.run("viewer.renderer.drawn")
+        change(tab, "share", "50")
+        until(tab, f"!viewer.sorting && viewer.renderer.drawn < 0.6 * {drawn}")
+        change(tab, "fly", "on")
+        assert tab.run("viewer.controls.fly") is True
+        assert tab.run("document.getElementById('numbers').innerText").count("ms") >= 4
+        # Every field has a name for those who hear the page.
+        assert tab.run("[...document.querySelectorAll('input, select')].every((f) => f.labels.length === 1)")
+        assert faults(tab) == []
+
+
+def test_a_damaged_file_is_no_scene(tab: Browser, scene: Path, sample_dir: Path, tmp_path: Path) -> None:
+    data = bytearray(scene.read_bytes())
+    with served(scene, str(sample_dir / "cameras.json")) as address:
+        good = bytes(data)
+        data[-3000] ^= 1
+        scene.write_bytes(data)
+        try:
+            tab.send("Page.navigate", url=address)
+            tab.wait("Page.loadEventFired")
+            until(tab, "document.querySelector('#status.error')")
+            text = tab.run("document.getElementById('status').textContent")
+        finally:
+            scene.write_bytes(good)
+    assert "checksum: wanted" in text and "the file is damaged" in text
+    assert tab.run("viewer.renderer.drawn") == 0
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+def test_the_decoder_runs_in_a_worker_of_another_page(tab: Browser, repository: Path) -> None:
+    """As an npm package would: modules from a server, the file by ranges or as a stream, errors with their byte."""
+    web = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(repository / "web" / "decoder")))
+    threading.Thread(target=web.serve_forever, daemon=True).start()
+    try:
+        vectors = f"http://127.0.0.1:{web.server_port}/tests/vectors"
+        tab.send("Page.navigate", url=f"{vectors}/vectors.json")
+        tab.wait("Page.loadEventFired")
+        script = """(async (source) => {
+            const { openInWorker } = await import('/src/worker-client.js');
+            const file = await openInWorker(source);
+            const seen = [];
+            for await (const chunk of file.chunks({ values: true })) {
+                seen.push([chunk.rows, chunk.values.means.length, Number.isFinite(chunk.values.shRest[0])]);
+            }
+            await file.close();
+            return seen;
+        })"""
+        name = "three_chunks_of_512_rows_in_two_layers.fgs"
+        wanted = [[rows, 3 * rows, True] for rows in chunk_rows(FOLDER / name)]
+        assert tab.run(f"{script}('{name}')") == wanted
+        assert tab.run(f"fetch('{name}').then((answer) => answer.blob()).then({script})") == wanted
+        failed = tab.run(f"{script}('vectors.json').catch((error) => [error.name, error.offset, error.message])")
+        assert failed[:2] == ["FgsError", 0] and "not a .fgs file" in failed[2]
+    finally:
+        web.shutdown()
+        web.server_close()
+
+
+def chunk_rows(path: Path) -> list[int]:
+    return [chunk.stop - chunk.start for chunk in GridContainer(path).header.chunks()]
+
+
+def test_a_page_of_one_file_opens_from_disk(tab: Browser, scene: Path, sample_dir: Path, tmp_path: Path) -> None:
+    page = tmp_path / "scene.html"
+    view(scene, page, cameras=str(sample_dir / "cameras.json"))
+    go(tab, page.as_uri())
+    assert tab.run("viewer.rows") == tab.run("viewer.header.count") > 10000
+    assert [event["params"]["request"]["url"] for event in requests(tab)] == [page.as_uri()]
+    assert faults(tab) == []
+    assert picture(tab, 0, 120, 90).std() > 10

@@ -1,0 +1,135 @@
+"""The decoder in JavaScript (web/decoder): its own tests, and the same values and the same refusals as ours."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import educational_decoder2
+from benchmarks.damage import mutate_bytes, mutate_sealed
+from flexgs_edge.codec.open_fgs import open_fgs, verify
+from flexgs_edge.codec.v2.container import trim_container, write_grid
+from flexgs_edge.errors import FormatError
+from flexgs_edge.scene.fields import FIELD
+from grid_scenes import make_grid
+from web_vectors import FOLDER, KINDS, expected, write_all, write_expected
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+DECODER = REPOSITORY / "web" / "decoder"
+CORPUS = REPOSITORY / "tests" / "fuzz" / "corpus"
+SEEDS = REPOSITORY / "tests" / "golden"
+DAMAGED = int(os.environ.get("FLEXGS_DAMAGED", "300"))
+SLOW = 5.0
+"""Seconds that no small file may take, on a busy machine."""
+
+
+@pytest.fixture(scope="module")
+def node() -> str:
+    found = shutil.which("node")
+    if found is None:
+        pytest.skip("no node: the decoder in JavaScript runs in it")
+    version = subprocess.run([found, "--version"], capture_output=True, text=True, check=True).stdout
+    if int(version.lstrip("v").split(".")[0]) < 18:
+        pytest.skip(f"node {version.strip()}: the decoder in JavaScript needs 18 or later")
+    return found
+
+
+def compare(node: str, folder: Path) -> dict[str, Any]:
+    """What the decoder reads differently from `expected.json`."""
+    command = [node, str(DECODER / "tests" / "compare.mjs"), str(folder)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=250)
+    assert result.returncode == 0, result.stderr
+    record: dict[str, Any] = json.loads(result.stdout)
+    return record
+
+
+def outcome(path: Path) -> dict[str, Any]:
+    """What our decoder reads, or says."""
+    try:
+        return expected(path)
+    except FormatError as error:
+        return {"error": str(error).removeprefix(f"{path.parent}/")}
+
+
+def test_its_own_tests_pass(node: str) -> None:
+    files = sorted(str(path) for path in (DECODER / "tests").glob("*.test.mjs"))
+    result = subprocess.run([node, "--test", *files], capture_output=True, text=True, check=False, timeout=250)
+    assert result.returncode == 0, result.stdout[-5000:]
+
+
+def test_the_vectors_are_read_as_they_say() -> None:
+    """By our decoder; theirs is in its own tests. A writer may get better, so the files are not compared."""
+    record = json.loads((FOLDER / "vectors.json").read_text())
+    assert len(record) >= len(KINDS)
+    assert {path.name for path in FOLDER.glob("*.fgs")} == set(record)
+    for name, wanted in record.items():
+        assert expected(FOLDER / name) == wanted, name
+
+
+@pytest.mark.parametrize("name", ["degree_4_SH_beyond_the_limit_of_a_sum", "escapes", "chunks_of_one_row"])
+def test_a_vector_is_read_from_the_page_alone(name: str) -> None:
+    """By the decoder that follows docs/format.md and knows nothing of the package."""
+    path = FOLDER / f"{name}.fgs"
+    _, values = educational_decoder2.decode(path.read_bytes())
+    source = open_fgs(path)
+    for field, planes in source.read(slice(0, source.count), list(FIELD)).items():
+        assert planes.tobytes() == np.ascontiguousarray(values[field]).tobytes(), field
+
+
+def test_what_the_writer_makes_today(node: str, tmp_path: Path) -> None:
+    files = list(write_all(tmp_path).values())
+    for layers in (1, 3):
+        for degree in (0, 3):
+            path = tmp_path / f"{layers}_{degree}.fgs"
+            write_grid(path, make_grid(3000, degree, layers=layers), {}, chunk_rows=1024)
+            files.append(path)
+    for size in (26_000, 30_000):
+        path = tmp_path / f"cut_{size}.fgs"
+        trim_container(tmp_path / "3_0.fgs", path, size)
+        files.append(path)
+    write_expected(files, tmp_path / "expected.json")
+    assert compare(node, tmp_path)["different"] == []
+
+
+def test_damaged_files_are_refused_with_the_same_words(node: str, tmp_path: Path) -> None:
+    """Bits, bytes, numbers, pieces, JSON; a part of the files with correct checksums."""
+    draw = random.Random(33)
+    seeds = [
+        (path.read_bytes(), verify(path))
+        for path in (
+            SEEDS / "v1/tiny.fgs",
+            SEEDS / "v2/tiny.fgs",
+            FOLDER / "chunks_of_one_row.fgs",
+            FOLDER / "255_rows.fgs",
+        )
+    ]
+    for i in range(DAMAGED):
+        data, sections = seeds[i % len(seeds)]
+        made = mutate_bytes(draw, data) if i % 10 < 3 else mutate_sealed(draw, data, sections)
+        (tmp_path / f"{i:04d}.fgs").write_bytes(made)
+    for path in CORPUS.glob("*.fgs"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    outcomes = {path.name: outcome(path) for path in sorted(tmp_path.glob("*.fgs"))}
+    assert sum("error" in record for record in outcomes.values()) > DAMAGED // 2
+    (tmp_path / "expected.json").write_text(json.dumps(outcomes))
+    record = compare(node, tmp_path)
+    assert list(unlike(record["different"])) == []
+    assert record["files"] >= DAMAGED and record["seconds"] < SLOW
+
+
+def unlike(different: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
+    """Differences but for the words of Python's JSON parser and how deep it goes, which change with its version."""
+    for record in different:
+        texts = [record[side].get("error", "") for side in ("wanted", "got")]
+        about_json = "wanted JSON" in texts[1] and ("wanted JSON" in texts[0] or "nested too deep" in texts[1])
+        if not (about_json and all(": header: " in text for text in texts)):
+            yield record

@@ -1,0 +1,125 @@
+import assert from 'node:assert/strict';
+import { readFileSync } from 'node:fs';
+import { createServer } from 'node:http';
+import { test } from 'node:test';
+import { FgsError, looksLikeFgs, open } from '../src/index.js';
+import { readAll, streamOf } from './read.mjs';
+
+const NAME = 'three_chunks_of_512_rows_in_two_layers.fgs';
+const FOLDER = new URL('vectors/', import.meta.url);
+const bytes = new Uint8Array(readFileSync(new URL(NAME, FOLDER)));
+const wanted = JSON.parse(readFileSync(new URL('vectors.json', FOLDER), 'utf8'))[NAME];
+
+async function withServer(ranges, use) {
+  const asked = [];
+  const server = createServer((request, response) => {
+    const range = /^bytes=(\d+)-(\d+)$/.exec(request.headers.range ?? '');
+    asked.push(request.headers.range);
+    if (request.url !== '/scene.fgs') return response.writeHead(404).end();
+    if (!ranges || !range) return response.writeHead(200).end(bytes);
+    const [first, last] = [Number(range[1]), Math.min(Number(range[2]), bytes.length - 1)];
+    response.writeHead(206, { 'Content-Range': `bytes ${first}-${last}/${bytes.length}` });
+    return response.end(bytes.subarray(first, last + 1));
+  });
+  await new Promise((ready) => server.listen(0, '127.0.0.1', ready));
+  try {
+    await use(`http://127.0.0.1:${server.address().port}/scene.fgs`, asked);
+  } finally {
+    server.closeAllConnections?.();
+    server.close();
+  }
+}
+
+test('an address with ranges', () =>
+  withServer(true, async (url, asked) => {
+    assert.deepEqual(await readAll(url), wanted);
+    assert.ok(asked.every((range) => range));
+  }));
+
+test('an address without ranges', () => withServer(false, async (url) => assert.deepEqual(await readAll(new URL(url)), wanted)));
+
+test('a response, and an address that is not there', () =>
+  withServer(false, async (url) => {
+    assert.deepEqual(await readAll(await fetch(url)), wanted);
+    await assert.rejects(open(`${url}x`), /the server says 404/);
+  }));
+
+test('chunks of a stream come before its end, unverified', async () => {
+  let given = 0;
+  const stream = new ReadableStream(
+    {
+      pull(controller) {
+        if (given >= bytes.length) return controller.close();
+        controller.enqueue(bytes.slice(given, given + 100));
+        given += 100;
+      },
+    },
+    { highWaterMark: 0 },
+  );
+  const file = await open(stream);
+  const seen = [];
+  for await (const chunk of file.chunks()) seen.push([chunk.verified, given]);
+  assert.equal(seen.length, 4);
+  assert.equal(seen[0][0], false);
+  assert.ok(seen[0][1] < seen[3][1] && seen[0][1] < bytes.length - 1500, `the first chunk came after ${seen[0][1]} of ${bytes.length} bytes`);
+});
+
+test('damage of a stream is told at its end, also where the chunk decodes', async () => {
+  for (const at of [bytes.length - 37, bytes.length - 200, Math.floor(bytes.length * 0.6), bytes.length - 1]) {
+    const bad = bytes.slice();
+    bad[at] ^= 4;
+    await assert.rejects(readAll(streamOf(bad, 333)), (error) => error instanceof FgsError && /checksum/.test(error.message));
+  }
+});
+
+test('a stream that ends early or goes on is refused', async () => {
+  await assert.rejects(readAll(streamOf(bytes.subarray(0, bytes.length - 5), 333)), /byte 16: file size: wanted \d+, got \d+/);
+  const longer = new Uint8Array(bytes.length + 1000);
+  longer.set(bytes);
+  const message = new RegExp(`file size: wanted ${bytes.length}, got ${longer.length}: truncated or extended`);
+  await assert.rejects(readAll(streamOf(longer, 333)), message);
+});
+
+test('a part of a file: layers, first chunks, no SH', async () => {
+  const file = await open(bytes);
+  const seen = async (options) => {
+    const found = [];
+    for await (const chunk of file.chunks(options)) found.push(chunk);
+    return found;
+  };
+  const all = await seen({});
+  assert.deepEqual((await seen({ layers: 1 })).map((chunk) => chunk.index), [0, 1]);
+  assert.deepEqual((await seen({ first: 2 })).map((chunk) => chunk.index), [2, 3]);
+  const [bare] = await seen({ sh: false });
+  assert.deepEqual(bare.codes.dc, all[0].codes.dc);
+  assert.deepEqual(bare.codes.sh, []);
+  assert.ok(bare.values().shRest.every((value) => value === 0));
+});
+
+test('claims are compared with the size before anything is made', async () => {
+  const huge = bytes.slice();
+  // A count of rows that the file cannot hold, under correct checksums, is in tests/fuzz/corpus; here the preamble lies.
+  new DataView(huge.buffer).setBigUint64(16, 2n ** 60n, true);
+  await assert.rejects(open(huge), FgsError);
+  await assert.rejects(open(streamOf(huge, 500)), FgsError);
+});
+
+test('an interrupted download is an error, not a scene', async () => {
+  let given = 0;
+  const broken = new ReadableStream({
+    pull(controller) {
+      if (given > 10_000) return controller.error(new Error('the line is dead'));
+      controller.enqueue(bytes.slice(given, given + 1000));
+      given += 1000;
+    },
+  });
+  await assert.rejects(readAll(broken), /the line is dead/);
+  const short = { size: bytes.length, read: async (offset, length) => bytes.slice(offset, Math.min(offset + length, 12_000)) };
+  await assert.rejects(readAll(short), (error) => error instanceof FgsError && /the file is truncated/.test(error.message));
+});
+
+test('what is no source is a TypeError', async () => {
+  await assert.rejects(open(5), TypeError);
+  assert.ok(looksLikeFgs(bytes));
+  assert.ok(!looksLikeFgs(bytes.subarray(1)));
+});

@@ -1,0 +1,110 @@
+// Mouse, touch and keys, as moves of the camera. `moved` is called after each.
+
+const TURN = 0.005;
+const KEY_SPEED = 0.8;
+const MOVES = {
+  KeyW: [0, 0, 1],
+  KeyS: [0, 0, -1],
+  KeyA: [-1, 0, 0],
+  KeyD: [1, 0, 0],
+  KeyQ: [0, 1, 0],
+  KeyE: [0, -1, 0],
+};
+const TURNS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+
+export class Controls {
+  /**
+   * @param {HTMLElement} element
+   * @param {() => import('./camera.js').Camera} camera
+   * @param {() => void} moved
+   */
+  constructor(element, camera, moved) {
+    this.element = element;
+    this.camera = camera;
+    this.moved = moved;
+    this.fly = false;
+    this.pointers = new Map();
+    this.held = new Set();
+    element.addEventListener('pointerdown', (event) => this.#down(event));
+    element.addEventListener('pointermove', (event) => this.#move(event));
+    for (const end of ['pointerup', 'pointercancel']) element.addEventListener(end, (event) => this.#up(event));
+    element.addEventListener('wheel', (event) => this.#wheel(event), { passive: false });
+    element.addEventListener('contextmenu', (event) => event.preventDefault());
+    element.addEventListener('keydown', (event) => this.#key(event, true));
+    element.addEventListener('keyup', (event) => this.#key(event, false));
+    element.addEventListener('blur', () => this.held.clear());
+  }
+
+  /** Whether a key is held, so that frames must follow each other. */
+  get active() {
+    return this.held.size > 0;
+  }
+
+  /** Move by the keys that are held, for so many seconds. */
+  step(seconds) {
+    const speed = KEY_SPEED * seconds;
+    const camera = this.camera();
+    for (const code of this.held) {
+      if (MOVES[code]) camera.move(...MOVES[code].map((way) => way * speed * camera.distance));
+      else this.#turn(...TURNS[code].map((way) => way * speed));
+    }
+  }
+
+  #turn(side, upwards) {
+    // Dragging turns the scene when orbiting, and the head when flying: the other way round.
+    if (this.fly) this.camera().look(-side, upwards);
+    else this.camera().orbit(-side, upwards);
+  }
+
+  #down(event) {
+    this.element.setPointerCapture(event.pointerId);
+    this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
+  }
+
+  #up(event) {
+    this.pointers.delete(event.pointerId);
+  }
+
+  #move(event) {
+    const before = this.pointers.get(event.pointerId);
+    if (!before) return;
+    const others = [...this.pointers].filter(([id]) => id !== event.pointerId).map(([, place]) => place);
+    const [dx, dy] = [event.clientX - before[0], event.clientY - before[1]];
+    if (others.length) this.#pinch(before, [event.clientX, event.clientY], others[0]);
+    else if (event.buttons & 6 || event.shiftKey) this.#pan(dx, dy);
+    else this.#turn(dx * TURN, -dy * TURN);
+    this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
+    this.moved();
+  }
+
+  /** Two fingers: their distance zooms, their middle moves. */
+  #pinch(before, now, other) {
+    const wide = (place) => Math.max(Math.hypot(place[0] - other[0], place[1] - other[1]), 10);
+    this.camera().zoom(wide(before) / wide(now));
+    this.#pan((now[0] - before[0]) / 2, (now[1] - before[1]) / 2);
+  }
+
+  /** Move what lies at the target's depth with the pointer. */
+  #pan(dx, dy) {
+    const camera = this.camera();
+    const box = this.element.getBoundingClientRect();
+    const { fx, fy } = camera.view(box.width, box.height);
+    camera.move((-dx * camera.distance) / fx, (-dy * camera.distance) / fy, 0);
+  }
+
+  #wheel(event) {
+    event.preventDefault();
+    const factor = Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * 0.001)));
+    if (this.fly) this.camera().move(0, 0, (1 - factor) * this.camera().distance);
+    else this.camera().zoom(factor);
+    this.moved();
+  }
+
+  #key(event, down) {
+    if (!(event.code in MOVES || event.code in TURNS) || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    if (down) this.held.add(event.code);
+    else this.held.delete(event.code);
+    this.moved();
+  }
+}

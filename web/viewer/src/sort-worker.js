@@ -1,0 +1,15 @@
+import { Sorter } from './sort.js';
+
+const sorter = new Sorter();
+
+/** In: { add }, { share }, { view, near, buffer }, { clear }. Out, for each view: { order, count, ms }. */
+self.onmessage = ({ data }) => {
+  if (data.add) sorter.add(data.add.means, data.add.importance);
+  if (data.share !== undefined) sorter.setShare(data.share);
+  if (!data.view) return;
+  const start = performance.now();
+  const room = data.buffer && data.buffer.byteLength >= 4 * sorter.rows ? data.buffer : new ArrayBuffer(4 * sorter.rows);
+  const order = new Uint32Array(room);
+  const count = sorter.sort(data.view, data.near, order);
+  self.postMessage({ order, count, ticket: data.ticket, ms: performance.now() - start }, [room]);
+};

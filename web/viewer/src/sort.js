@@ -1,0 +1,94 @@
+// The order of drawing: back to front by depth along the view. Depths are float32, as in the program, and sorted stably by their
+// bits, so that splats of equal depth keep the order of their rows.
+
+const BITS = 11;
+const SIZE = 1 << BITS;
+
+/** Sorts growing lists of rows. */
+export class Sorter {
+  constructor() {
+    this.means = [];
+    this.rows = 0;
+    this.importance = new Float32Array(0);
+    this.threshold = -Infinity;
+    this.share = 1;
+  }
+
+  /** Add a chunk's planes of positions, and how much its rows show. */
+  add(means, importance) {
+    this.means.push(means);
+    const all = new Float32Array(this.rows + importance.length);
+    all.set(this.importance);
+    all.set(importance, this.rows);
+    this.importance = all;
+    this.rows = all.length;
+    this.keys = new Uint32Array(this.rows);
+    this.spare = new Uint32Array(this.rows);
+    this.places = new Uint32Array(this.rows);
+    this.spareKeys = new Uint32Array(this.rows);
+    this.setShare(this.share);
+  }
+
+  /** Draw only this share of the rows, those that show most. */
+  setShare(share) {
+    this.share = share;
+    const drop = Math.floor((1 - share) * this.rows);
+    this.threshold = drop > 0 ? Float32Array.from(this.importance).sort()[drop] : -Infinity;
+  }
+
+  /**
+   * @param {number[]} view third row of the rotation, and minus its product with the eye: depth = x . view + view[3]
+   * @param {number} near rows at this depth or before are left out
+   * @param {Uint32Array} out gets the rows, back to front
+   * @returns {number} how many
+   */
+  sort(view, near, out) {
+    let count = 0;
+    let first = 0;
+    for (const means of this.means) {
+      count = depths(means, first, view, near, this.importance, this.threshold, this.keys, this.places, count);
+      first += means.length / 3;
+    }
+    const { keys, places, spareKeys, spare } = this;
+    pass(keys, places, count, 0, spareKeys, spare);
+    pass(spareKeys, spare, count, BITS, keys, places);
+    pass(keys, places, count, 2 * BITS, spareKeys, spare);
+    reverse(spare, count, out);
+    return count;
+  }
+}
+
+const FLOAT = new Float32Array(1);
+const WORD = new Uint32Array(FLOAT.buffer);
+
+function depths(means, first, [x, y, z, offset], near, importance, threshold, keys, places, count) {
+  const rows = means.length / 3;
+  for (let i = 0; i < rows; i++) {
+    FLOAT[0] = x * means[i] + y * means[rows + i] + z * means[2 * rows + i] + offset;
+    if (FLOAT[0] > near && importance[first + i] >= threshold) {
+      // Bits of positive floats sort as the floats do.
+      keys[count] = WORD[0];
+      places[count++] = first + i;
+    }
+  }
+  return count;
+}
+
+function pass(keys, places, count, shift, toKeys, toPlaces) {
+  const starts = new Uint32Array(SIZE);
+  for (let i = 0; i < count; i++) starts[(keys[i] >>> shift) & (SIZE - 1)]++;
+  for (let d = 0, sum = 0; d < SIZE; d++) {
+    const size = starts[d];
+    starts[d] = sum;
+    sum += size;
+  }
+  for (let i = 0; i < count; i++) {
+    const to = starts[(keys[i] >>> shift) & (SIZE - 1)]++;
+    toKeys[to] = keys[i];
+    toPlaces[to] = places[i];
+  }
+}
+
+function reverse(places, count, out) {
+  for (let i = 0; i < count; i++) out[i] = places[count - 1 - i];
+}

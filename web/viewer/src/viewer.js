@@ -1,0 +1,238 @@
+import { boxOf, Camera, outsidePose, upOf } from './camera.js';
+import { Controls } from './controls.js';
+import { Renderer } from './renderer.js';
+import { subtract, dot, times, add } from './vectors.js';
+import { startWorker } from './workers.js';
+
+const GRID = 256 * 2 ** 20;
+
+/**
+ * A scene on a canvas. It draws when something changed, and while a key is held.
+ *
+ * `look` may be changed by the page, followed by `refresh`; `stats` tells numbers.
+ */
+export class Viewer extends EventTarget {
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {{half?: boolean, first?: {source: string | Uint8Array, name: string}}} [options] `first` is decoded while the
+   *   shaders are compiled; `load` must be called with it at once
+   */
+  constructor(canvas, { half, first } = {}) {
+    super();
+    this.canvas = canvas;
+    this.fresh = { load: startWorker('load'), sort: startWorker('sort'), first, started: performance.now() };
+    if (first) this.fresh.load.postMessage(first);
+    this.renderer = new Renderer(canvas, { half });
+    this.camera = new Camera([0, -1, 0]);
+    this.controls = new Controls(canvas, () => this.camera, () => this.refresh());
+    this.look = { near: 0.2, degree: 4, antialiased: false, background: [0, 0, 0] };
+    this.scale = 1;
+    this.poses = [];
+    this.stats = {};
+    this.#reset();
+    new ResizeObserver(() => this.refresh()).observe(canvas);
+    canvas.addEventListener('webglcontextlost', () => this.#fail('The graphics device was lost: load the page again.'));
+  }
+
+  #reset() {
+    this.header = null;
+    this.rows = 0;
+    this.order = null;
+    this.box = null;
+    this.wanted = false;
+    this.sorting = null;
+    this.sortedFor = null;
+    this.ticket = 0;
+    this.stats = { splats: 0, drawn: 0, bytes: 0, layers: 0, sortMs: 0, frameMs: 0, firstMs: 0, wholeMs: 0 };
+  }
+
+  /**
+   * Load a scene.
+   *
+   * @param {string | Uint8Array | Blob} source an absolute address, or bytes
+   * @param {{name: string, poses: object[], look?: object, agree?: (bytes: number) => Promise<boolean>}} options
+   * @returns {Promise<void>} when all is there
+   */
+  async load(source, { name, poses = [], look = {}, agree = async () => true }) {
+    this.loader?.terminate();
+    this.sorter?.terminate();
+    this.#reset();
+    this.poses = poses;
+    this.asked = look;
+    const begun = this.fresh?.first?.source === source && this.fresh;
+    const { load, sort } = this.fresh ?? { load: startWorker('load'), sort: startWorker('sort') };
+    this.fresh = null;
+    this.started = begun ? begun.started : performance.now();
+    this.sorter = sort;
+    this.sorter.onmessage = ({ data }) => this.#sorted(data);
+    this.loader = load;
+    try {
+      await new Promise((resolve, reject) => {
+        this.loader.onerror = (event) => reject(new Error(event.message || 'The worker that decodes did not start.'));
+        this.loader.onmessage = ({ data }) => this.#loaded(data, agree).then((done) => done && resolve(), reject);
+        if (!begun) this.loader.postMessage({ source, name });
+      });
+    } catch (error) {
+      this.loader.terminate();
+      this.#fail(error.message);
+      throw error;
+    }
+  }
+
+  async #loaded(data, agree) {
+    if (data.error) throw new Error(data.error);
+    if (data.header) return this.#begin(data.header, agree);
+    if (data.chunk) await this.ready;
+    if (data.chunk) this.#add(data.chunk);
+    if (data.done) {
+      await this.ready;
+      this.loader.terminate();
+      this.stats.wholeMs = performance.now() - this.started;
+      this.#tell('loaded');
+      this.refresh();
+    }
+    return Boolean(data.done);
+  }
+
+  async #begin(header, agree) {
+    this.header = header;
+    const bytes = Renderer.bytesOf(header);
+    // Chunks that come while the user decides wait for the answer.
+    this.ready = bytes > GRID ? agree(bytes) : Promise.resolve(true);
+    if (!(await this.ready)) throw new Error('The scene was not loaded.');
+    this.renderer.begin(header);
+    const { near, background, antialiased } = header.settings;
+    if (typeof near === 'number') this.look.near = near;
+    if (Array.isArray(background) && background.length === 3) this.look.background = background.map(Number);
+    this.look.antialiased = antialiased === true;
+    this.look.degree = header.shDegree;
+    Object.assign(this.look, this.asked);
+    Object.assign(this.stats, { splats: header.count, bytes: header.size, layers: header.layers.length });
+    this.camera = new Camera(upOf(this.poses));
+    if (this.poses.length) this.setPose(0);
+    this.#tell('begun');
+    return false;
+  }
+
+  #add(chunk) {
+    this.renderer.add(chunk);
+    this.rows += chunk.rows;
+    if (!this.box) {
+      this.box = boxOf(chunk.means, chunk.rows);
+      if (!this.poses.length) this.poses = [outsidePose(this.box, this.header.origin)];
+      this.setPose(0);
+      this.#tell('poses');
+    }
+    this.sorter.postMessage({ add: { means: chunk.means, importance: chunk.importance } }, [
+      chunk.means.buffer,
+      chunk.importance.buffer,
+    ]);
+    this.sortedFor = null;
+    this.refresh();
+  }
+
+  /** Take the place of a pose. */
+  setPose(index) {
+    const pose = this.poses[index];
+    if (!pose) return;
+    this.camera.setPose(pose, this.header.origin, this.#depthOf(pose));
+    this.pose = index;
+    this.refresh();
+  }
+
+  /** How far a pose is from the middle of the scene. */
+  #depthOf(pose) {
+    if (!this.box) return 1;
+    const eye = subtract(pose.position, this.header.origin);
+    const middle = times(add(this.box.low, this.box.high), 0.5);
+    const across = Math.hypot(...subtract(this.box.high, this.box.low));
+    return Math.max(dot(subtract(middle, eye), pose.rotation[2]), 0.1 * across, 1e-3);
+  }
+
+  setShare(share) {
+    this.sorter?.postMessage({ share });
+    this.sortedFor = null;
+    this.refresh();
+  }
+
+  /** Draw soon. */
+  refresh() {
+    if (this.wanted) return;
+    this.wanted = true;
+    requestAnimationFrame((now) => this.#frame(now));
+  }
+
+  #frame(now) {
+    this.wanted = false;
+    const seconds = Math.min((now - (this.lastFrame ?? now)) / 1000, 0.1);
+    this.lastFrame = this.controls.active ? now : undefined;
+    if (this.controls.active) {
+      this.controls.step(seconds);
+      this.refresh();
+    }
+    if (!this.header) return;
+    const start = performance.now();
+    this.#sortIfNeeded();
+    const ratio = (globalThis.devicePixelRatio || 1) * this.scale;
+    const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio));
+    const height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
+    this.renderer.draw(this.camera.view(width, height), this.look);
+    this.stats.frameMs = performance.now() - start;
+    this.stats.drawn = this.renderer.drawn;
+    if (this.renderer.drawn && !this.stats.firstMs) {
+      this.stats.firstMs = performance.now() - this.started;
+      this.#tell('first');
+    }
+    this.#tell('frame');
+  }
+
+  #sortIfNeeded() {
+    const key = [...this.camera.depth, this.look.near, this.rows].join();
+    if (this.sorting || this.sortedFor === key || !this.rows) return;
+    this.sortedFor = key;
+    this.sorting = ++this.ticket;
+    const buffer = this.order;
+    this.order = null;
+    const message = { view: this.camera.depth, near: this.look.near, buffer, ticket: this.ticket };
+    this.sorter.postMessage(message, buffer ? [buffer] : []);
+  }
+
+  #sorted({ order, count, ms }) {
+    this.sorting = null;
+    this.renderer.setOrder(order, count);
+    this.order = order.buffer;
+    this.stats.sortMs = ms;
+    this.#tell('sorted');
+    this.refresh();
+  }
+
+  /** When the order belongs to the camera, as far as the camera stands still. */
+  async settled() {
+    for (;;) {
+      this.#sortIfNeeded();
+      if (!this.sorting) return;
+      await new Promise((resolve) => this.addEventListener('sorted', resolve, { once: true }));
+    }
+  }
+
+  /** A PNG of the view in this size. */
+  async picture(width = this.canvas.width, height = this.canvas.height) {
+    await this.settled();
+    this.renderer.draw(this.camera.view(width, height), this.look);
+    const blob = await new Promise((resolve) => this.canvas.toBlob(resolve, 'image/png'));
+    this.refresh();
+    return blob;
+  }
+
+  /** What was drawn is taken back: a damaged file is no scene. */
+  #fail(message) {
+    this.renderer.drawn = 0;
+    this.rows = 0;
+    this.refresh();
+    this.dispatchEvent(new CustomEvent('failed', { detail: message }));
+  }
+
+  #tell(name) {
+    this.dispatchEvent(new Event(name));
+  }
+}

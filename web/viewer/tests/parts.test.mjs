@@ -1,0 +1,110 @@
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+import { boxOf, Camera, outsidePose, upOf } from '../src/camera.js';
+import { toHalf } from '../src/half.js';
+import { NO_SH, packChunk, shPerLine, shTexels } from '../src/pack.js';
+import { Sorter } from '../src/sort.js';
+import { cross, dot } from '../src/vectors.js';
+
+function fromHalf(bits) {
+  const [sign, exponent, fraction] = [bits & 0x8000 ? -1 : 1, (bits >> 10) & 31, bits & 1023];
+  return exponent ? sign * 2 ** (exponent - 15) * (1 + fraction / 1024) : sign * 2 ** -14 * (fraction / 1024);
+}
+
+test('half floats are the nearest ones', () => {
+  for (let bits = 0; bits < 0x7c00; bits++) assert.equal(toHalf(fromHalf(bits)), bits);
+  assert.equal(toHalf(-1.5), 0xbe00);
+  assert.equal(toHalf(1 + 2 ** -11), 0x3c00, 'a tie goes to the even one');
+  assert.equal(toHalf(1 + 3 * 2 ** -11), 0x3c02);
+  assert.equal(toHalf(1e9), 0x7bff);
+  assert.equal(toHalf(2 ** -24), 1);
+  assert.equal(toHalf(1e-12), 0);
+});
+
+test('rows are sorted back to front, ties by the row, and hidden ones are left out', () => {
+  const sorter = new Sorter();
+  const z = [3, 1, 2, -1, 2, 0.1];
+  sorter.add(Float32Array.from([...z.map(() => 0), ...z.map(() => 0), ...z]), Float32Array.from(z, () => 1));
+  const out = new Uint32Array(6);
+  assert.equal(sorter.sort([0, 0, 1, 0], 0.2, out), 4);
+  assert.deepEqual([...out.subarray(0, 4)], [0, 4, 2, 1]);
+  assert.equal(sorter.sort([0, 0, 1, 10], 0.2, out), 6);
+  assert.deepEqual([...out], [0, 4, 2, 1, 5, 3]);
+});
+
+test('a share of the splats is that of the most important, in several chunks', () => {
+  const sorter = new Sorter();
+  for (const base of [0, 100]) {
+    const rows = 50;
+    const means = new Float32Array(3 * rows).fill(1);
+    sorter.add(means, Float32Array.from({ length: rows }, (_, i) => base + i));
+  }
+  sorter.setShare(0.25);
+  const out = new Uint32Array(100);
+  assert.equal(sorter.sort([0, 0, 1, 0], 0.2, out), 25);
+  assert.ok([...out.subarray(0, 25)].every((row) => row >= 75));
+});
+
+test('chunks are packed: rows with SH lie apart', () => {
+  const rows = 3;
+  const each = 3;
+  const shRest = new Float32Array(3 * each * rows);
+  shRest[1] = 0.5; // red, coefficient 0, row 1
+  shRest[(2 * each + 2) * rows + 2] = -2; // blue, coefficient 2, row 2
+  const values = {
+    means: Float32Array.from({ length: 9 }, (_, i) => i),
+    shDc: new Float32Array(9),
+    shRest,
+    opacityLogits: new Float32Array(3),
+    logScales: new Float32Array(9),
+    quats: new Float32Array(12),
+  };
+  const { data, sh, shRows } = packChunk(values, rows, 1, 10);
+  assert.equal(shRows, 2);
+  assert.deepEqual([data[3], data[19], data[35]], [NO_SH, 10, 11]);
+  assert.deepEqual([data[15], data[31], data[47]], [0, 1, 1]);
+  const halves = new Uint16Array(sh.buffer);
+  const width = 8 * shTexels(1);
+  assert.equal(fromHalf(halves[0]), 0.5);
+  assert.equal(fromHalf(halves[width + 8]), -2);
+  assert.deepEqual([new Float32Array(data.buffer)[16], new Float32Array(data.buffer)[18]], [1, 7]);
+  assert.equal(shPerLine(3) * shTexels(3) <= 2048, true);
+});
+
+function axesAreRight(camera) {
+  const [right, down, forward] = camera.axes;
+  for (const axis of camera.axes) assert.ok(Math.abs(dot(axis, axis) - 1) < 1e-9);
+  cross(right, down).forEach((value, i) => assert.ok(Math.abs(value - forward[i]) < 1e-9));
+}
+
+test('a pose fills the canvas of its own size exactly, and fits into others', () => {
+  const pose = { position: [1, 2, 3], rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], width: 40, height: 30, fx: 35, fy: 36, cx: 18, cy: 15 }; // prettier-ignore
+  const camera = new Camera([0, -1, 0]);
+  camera.setPose(pose, [1, 1, 1], 5);
+  const view = camera.view(40, 30);
+  assert.deepEqual([view.fx, view.fy, view.cx, view.cy], [35, 36, 18, 15]);
+  assert.deepEqual(view.eye, [0, 1, 2]);
+  const wide = camera.view(120, 60);
+  assert.deepEqual([wide.fx, wide.cx], [70, 59.5 + 2 * (18 - 19.5)]);
+});
+
+test('turning keeps the axes square and the distance', () => {
+  const camera = new Camera([0, -1, 0]);
+  const pose = outsidePose({ low: [-1, -1, -1], high: [1, 1, 1] }, [5, 5, 5]);
+  camera.setPose(pose, [5, 5, 5], 4);
+  axesAreRight(camera);
+  const distance = camera.distance;
+  for (let i = 0; i < 400; i++) {
+    camera.orbit(0.1, 0.07);
+    axesAreRight(camera);
+  }
+  assert.ok(Math.abs(camera.distance - distance) < 1e-6);
+  for (let i = 0; i < 100; i++) camera.look(0.2, -0.3);
+  axesAreRight(camera);
+  camera.zoom(0.5);
+  assert.ok(Math.abs(camera.distance - distance / 2) < 1e-6);
+  const up = upOf([pose]);
+  assert.ok(up[1] < 0);
+  const box = boxOf(Float32Array.from({ length: 300 }, (_, i) => i % 100), 100);
+  assert.ok(box.low[0] > 0 && box.high[0] < 99);
+});
