@@ -3,7 +3,7 @@
 It reports fidelity at the training poses, and at the held-out views from other distances. It also reports the drop of the
 held-out views (mean and worst), bytes and processor seconds.
 
-python -m benchmarks.guards [--scene fox|sample] [--effort fast|balanced|thorough|max] [--only off|on]
+python -m benchmarks.guards [--scene fox|sample] [--effort fast|balanced|max] [--only off|on]
     [--max-drop DB | --max-size BYTES] [--distil STEPS]
 """
 

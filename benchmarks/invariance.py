@@ -3,7 +3,7 @@
 `--method best` chooses by squared errors of pixels. So both runs should keep the same Gaussians in about as many bytes. Only
 --near has a unit; it follows the scale.
 
-python -m benchmarks.invariance [SCENE] [--factor F] [--effort fast|balanced|thorough] [--max-drop DB] [--resolution WIDTH]
+python -m benchmarks.invariance [SCENE] [--factor F] [--effort fast|balanced|max] [--max-drop DB] [--resolution WIDTH]
 """
 
 from __future__ import annotations

@@ -125,10 +125,10 @@ Several scenes:
     EFFORT,
     "--effort",
     metavar="WORD",
-    type=click.Choice(["fast", "balanced", "thorough", "max"]),
+    type=click.Choice(["fast", "balanced", "max", "thorough"]),
     default="balanced",
     show_default=True,
-    help="fast, balanced, thorough or max (.fgs only). More effort: smaller files, slower.",
+    help="fast, balanced or max. More effort: smaller files, slower. thorough has become max.",
 )
 @option(
     MACHINES,

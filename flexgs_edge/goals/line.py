@@ -20,7 +20,7 @@ NEAREST = 0.1
 smooth."""
 CLOSE = 0.03
 """The search stops at a point whose excess (log of loss or size over its limit) is below the target by at most this."""
-LINE_STEPS = {"fast": 4, "balanced": 6, "thorough": 10}
+LINE_STEPS = {"fast": 4, "balanced": 6, "max": 10}
 """Measured points on a line for each `--effort`, beyond those that are known already."""
 START = 300
 """Prune rate, in thousandths, at which a search for a quality starts."""

@@ -13,7 +13,7 @@ from flexgs_edge.goals.target import Measurement, Target
 Phase = Literal["list", "refine", "confirm", "fixed", "line", "multiplier"]
 MAX_PRUNE = 980
 """Largest prune rate of the refinement, in thousandths; something must be left to draw."""
-REFINE_STEPS = {"fast": 4, "balanced": 10, "thorough": 32}
+REFINE_STEPS = {"fast": 4, "balanced": 10, "max": 32}
 """Measured points of the refinement for each `--effort`."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from flexgs_edge.io.reading import Reading, Writing
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.quality.psnr import modelled_drop, mse_of_psnr
 
+LOG = logging.getLogger("flexgs_edge")
+
 NO_PHOTOS = "none"
 """`--images none`: do not use the photos beside the scene."""
 AUTO_CAMERAS = "auto"
@@ -24,7 +27,9 @@ AUTO_CAMERAS = "auto"
 NO_CAMERAS = "none"
 """`--cameras none`: no views at all. Only fixed rates work then."""
 METHODS = ("best", "paper")
-EFFORT_WORDS = (*REFINE_STEPS, "max")
+EFFORT_WORDS = tuple(REFINE_STEPS)
+RETIRED_EFFORTS = {"thorough": "max"}
+"""Words for `--effort` that are still accepted, and what they became."""
 """`max` always distils. Only the method `best` knows it, and only for a `.fgs`."""
 SELECTS = ("test", "train")
 PROMISES = ("whole", "mean")
@@ -181,9 +186,9 @@ class CompressOptions(ViewOptions):
         Quantization groups per channel (`paper`). Default: one group for about 512 rows.
     base_psnr : float
         Assumed PSNR of the original against its photos, for the modelled drop, dB.
-    effort : {"fast", "balanced", "thorough", "max"}
+    effort : {"fast", "balanced", "max"}
         More effort makes smaller files and takes longer. `balanced` (10 000 to 500 000 Gaussians) and `max` also distil (`best`,
-        `.fgs`). Default: `balanced`.
+        `.fgs`). `thorough` has become `max`. Default: `balanced`.
     best_effort : bool
         If the target cannot be met, write the closest result. Default: raise `TargetError`.
     unseen : str
@@ -249,6 +254,10 @@ class CompressOptions(ViewOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.effort in RETIRED_EFFORTS:
+            now = RETIRED_EFFORTS[self.effort]
+            LOG.warning("--effort %s has become --effort %s", self.effort, now)
+            object.__setattr__(self, "effort", now)
         for word, value, known in (
             ("--method", self.method, METHODS),
             ("--select", self.select, SELECTS),
@@ -264,8 +273,6 @@ class CompressOptions(ViewOptions):
         if self.groups is not None and self.groups < 1:
             raise InputError(f"--groups {self.groups}: expected 1 or more")
         check_method(self.method, [name for name in METHOD_ONLY if getattr(self, name) != METHOD_ONLY[name][1]])
-        if self.effort == "max" and self.method != "best":
-            raise InputError(f"--effort max distils, which --method {self.method} does not: take --effort thorough")
         if not self.refit and (self.distil or (self.effort == "max" and self.distil is None)):
             word = f"--distil {self.distil}" if self.distil else "--effort max"
             raise InputError(f"--no-refit with {word}: distilling is the larger refit; give one or the other")

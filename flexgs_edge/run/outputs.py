@@ -61,10 +61,10 @@ def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOpti
     for name in FORMAT_BITS:
         if getattr(options, name) != CompressOptions.__dataclass_fields__[name].default:
             raise InputError(f"--{name}: {format.suffix} has precisions of its own; leave it out, or write a .fgs")
-    if options.distil or options.effort == "max":
-        word = f"--distil {options.distil}" if options.distil else "--effort max"
+    if options.distil:
         raise InputError(
-            f"{word}: distilling ends on the grid of a .fgs, {format.suffix} has its own; leave it out, or write a .fgs"
+            f"--distil {options.distil}: distilling ends on the grid of a .fgs, {format.suffix} has its own; "
+            "leave it out, or write a .fgs"
         )
     if options.layers > 1:
         raise InputError(f"--layers {options.layers}: {format.suffix} has no layers; leave it out, or write a .fgs")

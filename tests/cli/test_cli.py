@@ -19,10 +19,11 @@ import pytest
 from flexgs_edge import cli
 from flexgs_edge.cli import app, value_types
 from flexgs_edge.errors import BudgetError, DeviceError, InputError, TargetError
+from flexgs_edge.goals.line import LINE_STEPS
 from flexgs_edge.goals.steps import REFINE_STEPS
 from flexgs_edge.methods.best.effort import EFFORTS
 from flexgs_edge.methods.paper.scores import SCORES
-from flexgs_edge.run.options import EFFORT_WORDS, METHODS, SELECTS, CompressOptions, ViewOptions
+from flexgs_edge.run.options import EFFORT_WORDS, METHODS, RETIRED_EFFORTS, SELECTS, CompressOptions, ViewOptions
 from interruptible import running
 from tiny_project import COUNT, make_project
 
@@ -85,7 +86,8 @@ def test_words_of_the_options_are_those_of_the_library() -> None:
     given = {parameter.name: parameter for parameter in command.params}
     fields = set(CompressOptions.__dataclass_fields__)
     assert fields <= set(given), fields - set(given)
-    assert tuple(given["effort"].type.choices) == EFFORT_WORDS == tuple(EFFORTS) and set(REFINE_STEPS) < set(EFFORTS)
+    assert tuple(given["effort"].type.choices) == (*EFFORT_WORDS, *RETIRED_EFFORTS)
+    assert EFFORT_WORDS == tuple(EFFORTS) == tuple(REFINE_STEPS) == tuple(LINE_STEPS)
     assert tuple(given["method"].type.choices) == METHODS and tuple(given["select"].type.choices) == SELECTS
     score = importlib.import_module("flexgs_edge.cli.score").command
     assert tuple({p.name: p for p in score.params}["score"].type.choices) == SCORES

@@ -31,7 +31,7 @@ RATIOS = RatiosType()
 
 def effort_option(name: str, default: str, text: str) -> Callable[[help_page.Decorated], help_page.Decorated]:
     """A choice of effort."""
-    efforts = click.Choice(["fast", "balanced", "thorough"])
+    efforts = click.Choice(["fast", "balanced", "max"])
     return help_page.option("Points", name, type=efforts, default=default, show_default=True, help=text)
 
 
@@ -91,7 +91,7 @@ def command(
     Examples:
       flexgs-edge study rate point_cloud.ply -o rate
       flexgs-edge study rate point_cloud.ply -o rate --ratios 10,20,40 --ablations none
-      flexgs-edge study rate scene.ply -o rate --effort thorough --ablation-effort balanced
+      flexgs-edge study rate scene.ply -o rate --effort max --ablation-effort balanced
     """
     progress = talk.start(quiet, json_path, options["force"])
     from flexgs_edge.run.options import CompressOptions

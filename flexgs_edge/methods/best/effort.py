@@ -189,10 +189,9 @@ EFFORTS = {
         passes=4.0,
         descends=(10_000, 500_000),
     ),
-    "thorough": Effort(keep=0.9, refit_rounds=2, subsets=7, steps=5, close=0.02, few=400, views=400, pixels=24),
     "max": Effort(
         keep=0.8,
-        refit_rounds=1,
+        refit_rounds=2,
         subsets=7,
         steps=2,
         close=0.05,

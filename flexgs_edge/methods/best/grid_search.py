@@ -230,7 +230,7 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _piloted(self, multiplier: float, target: Target) -> float:
         """Change of the excess by a descent, as a shorter one tells. Scenes differ in it by more than sizes may be off."""
         kept, step_sizes = self._choice(multiplier)
-        grid = self._distilled(kept, step_sizes, math.ceil(PILOT * self.steps))
+        grid = self._distilled(kept, step_sizes, Schedule(math.ceil(PILOT * self.steps), self._rate(kept.planes)))
         found = target.excess(0, self.measure(values_of(grid, self.rounds.storage)))
         return found - self._probe(multiplier, target) - PILOT_POWER * math.log(PILOT)
 
@@ -263,7 +263,10 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, GridScene]:
         started = time.perf_counter()
         kept, step_sizes = self._choice(multiplier)
-        grid = self._distilled(kept, step_sizes, self.steps) if self.steps else self._finish(kept, step_sizes)
+        if self.steps:
+            grid = self._distilled(kept, step_sizes, Schedule(self.steps, self._rate(kept.planes)))
+        else:
+            grid = self._finish(kept, step_sizes)
         grid = lowered(grid, self.rounds.storage)
         size = self.size_of(grid)
         measurement = self.measure(values_of(grid, self.rounds.storage))
@@ -272,9 +275,9 @@ class GridSearch(MultiplierSearch[GridScene]):
         found = Candidate(multiplier, len(kept.rows), grid.sh_count, size, measurement, excess, seconds, kept.left_out)
         return found, grid
 
-    def _distilled(self, kept: Kept, step_sizes: StepSizes, count: int) -> GridScene:
+    def _distilled(self, kept: Kept, step_sizes: StepSizes, schedule: Schedule) -> GridScene:
         """Move all values towards the references, put them on the grid, and refit the constant colour."""
-        moved = self._distil(kept, Schedule(count, self._rate(kept.planes)), step_sizes)
+        moved = self._distil(kept, schedule, step_sizes)
         grid, order = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
         if not self.refit:
             return grid

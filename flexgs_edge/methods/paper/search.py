@@ -70,7 +70,7 @@ def adapt(
         Answers for sizes, estimates and measurements. No question is asked twice.
     target : Target
         What must hold.
-    effort : {"fast", "balanced", "thorough"}
+    effort : {"fast", "balanced", "max"}
         Number of refinement steps (`REFINE_STEPS`). Default: `balanced`.
     best_effort : bool
         Return the closest point with `reached` False when nothing holds.

@@ -17,7 +17,7 @@ from flexgs_edge.studies.speed.front import front
 
 LOG = logging.getLogger("flexgs_edge")
 
-PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"), ("best", "thorough"), ("best", "max"))
+PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"), ("best", "max"))
 """Method and effort of each run."""
 
 

@@ -234,7 +234,6 @@ def test_distilled_files_lose_less_in_the_same_bytes(project: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ({"effort": "max", "method": "paper"}, "--effort max distils, which --method paper does not"),
         ({"distil": 10, "method": "paper"}, "--distil belongs to --method best"),
         ({"distil": -1}, "--distil -1: expected 0"),
         ({"distil": 10, "refit": False}, "--no-refit with --distil 10"),
@@ -246,7 +245,11 @@ def test_words_that_make_no_sense(words: dict[str, Any], message: str) -> None:
         CompressOptions(**words)
 
 
-@pytest.mark.parametrize("words", [{"distil": 10}, {"effort": "max"}])
-def test_other_formats_have_grids_of_their_own(project: Path, tmp_path: Path, words: dict[str, Any]) -> None:
+def test_other_formats_have_grids_of_their_own(project: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="distilling ends on the grid of a .fgs"):
-        compress(project / "point_cloud.ply", tmp_path / "a.spz", **words)
+        compress(project / "point_cloud.ply", tmp_path / "a.spz", distil=10)
+
+
+def test_a_retired_effort_says_what_it_became(caplog: pytest.LogCaptureFixture) -> None:
+    assert CompressOptions(effort="thorough") == CompressOptions(effort="max")
+    assert "--effort thorough has become --effort max" in caplog.text

@@ -76,9 +76,9 @@ def bounded(target: MaxDrop | MinFidelity, limit: float | None, figure: Any = "d
 
 
 def test_the_worst_view_stops_a_search() -> None:
-    plain = adapt(Uneven(3), MaxDrop(1.2), "thorough")
-    held = adapt(Uneven(3), bounded(MaxDrop(1.2), 1.8), "thorough")
-    loose = adapt(Uneven(3), bounded(MaxDrop(1.2), 9.0), "thorough")
+    plain = adapt(Uneven(3), MaxDrop(1.2), "max")
+    held = adapt(Uneven(3), bounded(MaxDrop(1.2), 1.8), "max")
+    loose = adapt(Uneven(3), bounded(MaxDrop(1.2), 9.0), "max")
     assert loose.chosen.size == plain.chosen.size < held.chosen.size
     worst = held.chosen.measurement.worst if held.chosen.measurement else None
     assert worst is not None and worst.drop is not None and 1.5 < worst.drop <= 1.8
@@ -94,7 +94,7 @@ def test_the_usual_bound_of_the_worst_view_follows_the_mean() -> None:
     """3 times the mean is within 1.5 times and 0.2 dB up to a mean of 0.133 dB; the least that can be had is 0.2."""
     with pytest.raises(TargetError, match=r"worst view 0\.600 of 0\.500 dB"):
         adapt(Uneven(3), bounded(MaxDrop(1.2), None))
-    held = adapt(Uneven(2), bounded(MaxDrop(1.2), None), "thorough").chosen.measurement
+    held = adapt(Uneven(2), bounded(MaxDrop(1.2), None), "max").chosen.measurement
     assert held is not None and held.drop is not None and 0.3 < held.drop <= 0.4
 
 

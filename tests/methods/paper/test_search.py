@@ -95,8 +95,8 @@ def test_refinement_comes_close_to_the_best_point_of_its_box(limit: float) -> No
     assert result.reached and result.chosen.holds
     assert result.chosen.size <= answer.size
     assert result.chosen.size <= 1.02 * best
-    thorough = adapt(Fake(smooth_drop), MaxDrop(limit), "thorough")
-    assert thorough.chosen.size <= result.chosen.size
+    longest = adapt(Fake(smooth_drop), MaxDrop(limit), "max")
+    assert longest.chosen.size <= result.chosen.size
 
 
 def test_effort_counts_steps_and_more_is_never_worse() -> None:
@@ -174,7 +174,7 @@ def test_flat_quality_takes_the_smallest_point_at_once() -> None:
 
 
 def test_same_questions_every_time() -> None:
-    first, second = (adapt(Fake(ragged), MaxDrop(1.0), "thorough") for _ in range(2))
+    first, second = (adapt(Fake(ragged), MaxDrop(1.0), "max") for _ in range(2))
     assert [(s.choice, s.size, s.excess, s.phase) for s in first.steps] == [
         (s.choice, s.size, s.excess, s.phase) for s in second.steps
     ]
