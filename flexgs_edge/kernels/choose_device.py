@@ -30,7 +30,17 @@ __kernel void self_test(__global const float *a, __global const float *b, __glob
   vstore16(x * y - y, 0, out + 64 + i);
   vstore16(1.0f / sqrt(x), 0, out + 128 + i);
 }
+// Mesa's llvmpipe leaves loops after 65535 steps, without a word.
+__kernel void count_steps(const uint steps, __global const uint *ones, __global uint *out) {
+  uint sum = 0;
+  for (uint i = 0; i < steps; ++i) sum += ones[i & 3];
+  out[0] = sum;
+}
 """
+PROBED_STEPS = 1 << 20
+"""Steps of the loop that looks for a limit. A limit beyond it would not be noticed; none is known."""
+LEAST_STEPS = 65535
+"""With fewer steps of all loops together, no work-item of ours could do its part: such devices are refused."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +63,8 @@ class DeviceInfo:
     global_bytes: int
     max_alloc_bytes: int
     self_test: str
+    loop_steps: int = 0
+    """Steps after which the runtime leaves loops, counted over all loops of a work-item; 0 if it does not."""
     handle: cl.Device | None = field(default=None, repr=False, compare=False)
     context: cl.Context | None = field(default=None, repr=False, compare=False)
     """The context of the self-test, kept alive: after the last context is gone, PoCL starts its compiler anew for the
@@ -98,11 +110,11 @@ def list_devices(self_test: bool = True) -> list[DeviceInfo]:
 def _describe(index: int, platform: Any, device: Any, self_test: bool) -> DeviceInfo:
     import pyopencl as cl
 
-    context, verdict = None, "not run"
+    context, verdict, steps = None, "not run", 0
     if self_test:
         try:
             context = cl.Context([device])
-            verdict = run_self_test(context)
+            verdict, steps = run_self_test(context)
         except cl.Error as error:
             verdict = f"no context: {_first_line(str(error))}"
     kind = "gpu" if device.type & cl.device_type.GPU else "cpu" if device.type & cl.device_type.CPU else "other"
@@ -120,13 +132,14 @@ def _describe(index: int, platform: Any, device: Any, self_test: bool) -> Device
         global_bytes=device.global_mem_size,
         max_alloc_bytes=device.max_mem_alloc_size,
         self_test=verdict,
+        loop_steps=steps,
         handle=device,
         context=context,
     )
 
 
-def run_self_test(context: cl.Context, source: str = SELF_TEST) -> str:
-    """Run the self-test of this source; returns `ok`, or one line about the failure."""
+def run_self_test(context: cl.Context, source: str = SELF_TEST) -> tuple[str, int]:
+    """Run the self-test of this source; returns `ok`, or one line about the failure, and `DeviceInfo.loop_steps`."""
     import pyopencl as cl
 
     a = np.linspace(0.5, 3.0, 64, dtype=np.float32)
@@ -142,18 +155,24 @@ def run_self_test(context: cl.Context, source: str = SELF_TEST) -> str:
         output = cl.Buffer(context, flags.WRITE_ONLY, got.nbytes)
         cl.Kernel(program, "self_test")(queue, (4,), (1,), *inputs, output)
         cl.enqueue_copy(queue, got, output)
+        steps = np.ones(4, np.uint32)
+        ones = cl.Buffer(context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=steps)
+        cl.Kernel(program, "count_steps")(queue, (1,), (1,), np.uint32(PROBED_STEPS), ones, output)
+        cl.enqueue_copy(queue, steps, output)
         queue.finish()
     except cl.Error as error:
-        return f"kernel does not build or run: {_first_line(str(error))}"
+        return f"kernel does not build or run: {_first_line(str(error))}", 0
     exact = a.astype(np.float64) * b
     fused, separate = (exact - b).astype(np.float32), exact.astype(np.float32) - b
     if not np.array_equal(got[:64], fused):
-        return "fma() is not exact"
+        return "fma() is not exact", 0
     if not np.array_equal(got[64:128], separate):
-        return "multiply and add are fused although FP_CONTRACT is off"
+        return "multiply and add are fused although FP_CONTRACT is off", 0
     if np.abs(got[128:] * np.sqrt(a) - 1).max() > 1e-6:
-        return "1/sqrt() is wrong"
-    return "ok"
+        return "1/sqrt() is wrong", 0
+    if steps[0] < LEAST_STEPS:
+        return f"loops end after {steps[0]} steps, {LEAST_STEPS} are needed", 0
+    return "ok", 0 if steps[0] == PROBED_STEPS else int(steps[0])
 
 
 def _first_line(text: str) -> str:
