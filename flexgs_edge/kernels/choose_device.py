@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 import warnings
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +21,8 @@ HINT = (
     "install an OpenCL runtime (Debian, Ubuntu, Jetson: `apt install pocl-opencl-icd`) or run the NumPy twins with "
     "`--device numpy` (same results, far slower)"
 )
+
+RETEST = "A new version of its driver is tested anew by itself; `flexgs-edge devices --self-test` tests all devices now"
 
 # Fused and separate multiply-add on vectors of 16. It catches runtimes that cannot build for this processor, such as
 # PoCL's wheels on newer CPUs. It also catches those that fuse operations they must not fuse, or that miss lanes.
@@ -88,7 +93,8 @@ def list_devices(self_test: bool = True) -> list[DeviceInfo]:
     Parameters
     ----------
     self_test : bool
-        Build and run a small kernel on each device, and compare its result with NumPy's.
+        Build and run a small kernel on each device, and compare its result with NumPy's. Before a device is used, it must
+        pass more than this: `flexgs_edge.kernels.tested`.
     """
     import pyopencl as cl
 
@@ -110,15 +116,8 @@ def list_devices(self_test: bool = True) -> list[DeviceInfo]:
 def _describe(index: int, platform: Any, device: Any, self_test: bool) -> DeviceInfo:
     import pyopencl as cl
 
-    context, verdict, steps = None, "not run", 0
-    if self_test:
-        try:
-            context = cl.Context([device])
-            verdict, steps = run_self_test(context)
-        except cl.Error as error:
-            verdict = f"no context: {_first_line(str(error))}"
     kind = "gpu" if device.type & cl.device_type.GPU else "cpu" if device.type & cl.device_type.CPU else "other"
-    return DeviceInfo(
+    info = DeviceInfo(
         index=index,
         name=device.name.strip(),
         platform=platform.name.strip(),
@@ -131,11 +130,23 @@ def _describe(index: int, platform: Any, device: Any, self_test: bool) -> Device
         local_bytes=device.local_mem_size,
         global_bytes=device.global_mem_size,
         max_alloc_bytes=device.max_mem_alloc_size,
-        self_test=verdict,
-        loop_steps=steps,
+        self_test="not run",
         handle=device,
-        context=context,
     )
+    return probed(info) if self_test else info
+
+
+def probed(info: DeviceInfo) -> DeviceInfo:
+    """`info` with the verdict of `run_self_test`, and its context."""
+    import pyopencl as cl
+
+    assert info.handle is not None
+    try:
+        context = cl.Context([info.handle])
+    except cl.Error as error:
+        return replace(info, self_test=f"no context: {_first_line(str(error))}")
+    verdict, steps = run_self_test(context)
+    return replace(info, self_test=verdict, loop_steps=steps, context=context)
 
 
 def run_self_test(context: cl.Context, source: str = SELF_TEST) -> tuple[str, int]:
@@ -198,11 +209,11 @@ def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceIn
     """
     listing = "; ".join(f"[{d.index}] {d.name} ({d.platform}, {d.type}): {d.self_test}" for d in devices)
     if not devices:
-        raise DeviceError(f"no OpenCL device found: {HINT}")
+        raise DeviceError(f"no OpenCL device found{_broken_runtimes()}: {HINT}")
     if spec is None:
         usable = [d for d in devices if d.usable]
         if not usable:
-            raise DeviceError(f"no OpenCL device passed the self-test: {listing}. To go on, {HINT}")
+            raise DeviceError(f"no OpenCL device passed the self-test: {listing}. {RETEST}. To go on, {HINT}")
         ranked = sorted(
             usable, key=lambda d: (d.type != "gpu", "portable computing" not in d.platform.lower(), d.index)
         )
@@ -219,5 +230,27 @@ def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceIn
         raise DeviceError(f"--device {spec}: no such OpenCL device; there are: {listing}")
     for device in matches:
         if device.usable:
-            return device, f"asked for by --device {spec}"
-    raise DeviceError(f"--device {spec}: failed the self-test: {listing}. To go on, {HINT}")
+            others = [f"{d.index}" for d in matches if d is not device and d.usable]
+            more = (
+                f"; the first of {len(others) + 1} that match, --device {', '.join(others)} for others"
+                if others
+                else ""
+            )
+            return device, f"asked for by --device {spec}{more}"
+    raise DeviceError(f"--device {spec}: failed the self-test: {listing}. {RETEST}. To go on, {HINT}")
+
+
+def _broken_runtimes() -> str:
+    """Words about runtimes that are installed, but whose library cannot be loaded. The loader passes over them in silence."""
+    named = os.environ.get("OCL_ICD_VENDORS") or "/etc/OpenCL/vendors"
+    found = []
+    for file in sorted(Path(named).glob("*.icd")) if os.path.isdir(named) else [Path(named)]:
+        try:
+            library = file.read_text(encoding="utf-8").strip()
+        except (OSError, ValueError):
+            continue
+        try:
+            ctypes.CDLL(library)
+        except OSError as error:
+            found.append(f"{file} names {library}, which cannot be loaded ({error})")
+    return f" ({'; '.join(found)})" if found else ""

@@ -1,0 +1,166 @@
+"""What the self-test of a device draws and codes: small scenes with all that kernels tell apart."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.codec.v2.container import write_grid
+from flexgs_edge.codec.v2.grid_source import GridSource
+from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.methods.best.costs import measure_costs
+from flexgs_edge.methods.best.refit.colour import refit_colours
+from flexgs_edge.methods.best.refit.descent import Descent
+from flexgs_edge.methods.best.refit.distil import FIELD_RATES
+from flexgs_edge.methods.paper.prune import nonzero_sh
+from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.packed.quantize import quantize_scene
+from flexgs_edge.quality.flip import flips
+from flexgs_edge.quality.ssim import ssims
+from flexgs_edge.render.fit import Fit
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
+from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.original import Original
+
+PAIRS = 1 << 12
+"""Room for pairs, where a scene is drawn in one batch: the self-test clears and compares all of it."""
+STEPS = StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04, 0.05, 0.06, 0.07))
+
+
+def camera(width: int, height: int, turn: float = 0.0, off: float = 0.0) -> Camera:
+    """Looks along z, turned about y; the principal point is off the centre by `off` pixels."""
+    rotation = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+    return Camera(
+        width=width, height=height, fx=0.9 * width, fy=0.95 * width, cx=(width - 1) / 2 + off, cy=(height - 1) / 2 - off,
+        rotation=rotation, translation=np.array([0.02, -0.03, 0.1]), name="self-test",
+    )  # fmt: skip
+
+
+def short(values: np.ndarray) -> np.ndarray:
+    """Values with few bits, so that the record is small."""
+    return np.clip(values, -6e4, 6e4).astype(np.float16).astype(np.float32)
+
+
+def scene(count: int, degree: int, seed: int, size: float = -2.2, opacity: float = 0.0) -> MemorySource:
+    """A cloud before the camera. Its first rows are the ones that are easy to get wrong."""
+    rng = np.random.default_rng([seed, count])
+    means = np.stack([rng.uniform(-2.6, 2.6, count), rng.uniform(-2, 2, count), rng.uniform(1.5, 6, count)])
+    logits, scales = rng.normal(opacity, 2.5, (1, count)), rng.normal(size, 0.8, (3, count))
+    quats = rng.normal(size=(4, count)) * rng.uniform(0.4, 1.8, count)
+    odd = np.arange(count) % 7 == 3
+    means[2, odd] = means[2, np.roll(odd, 1)]  # equal depths
+    means[2, :6] = -1, 0.15, 0.1, 0.5, 0.25, 40  # behind, before and about the near plane, far
+    scales[:, 6:9] = np.array([[-9.0, 2.0, -9.0]]).T  # needles
+    scales[:, 9:12], scales[:, 12:14] = -12, 1.5  # below a pixel; fills the screen
+    scales[:, 14:16] = np.array([[-1.0, -20.0, -1.0]]).T  # flat
+    logits[0, 12:14] = -2, -4
+    logits[0, 16:22] = -5.5412636, -5.55, 40, -40, 9, 12  # about 1/255, and at both ends
+    quats[:, 22:26] *= 1e-18, 1e18, 1e-3, 1
+    quats[:3, 25] = 0
+    means[:2, 26:30] = [[-2.5, 2.5, 0, 0], [0, 0, -2.0, 2.0]]  # beyond the edges
+    scales[:, 26:30] = -0.5
+    rest = rng.normal(0, 0.35, (3 * sh_rest_count(degree), count))
+    rest[:, 30:34] = 0
+    arrays = {
+        "means": means, "sh_dc": rng.normal(0, 1.2, (3, count)), "sh_rest": rest, "opacity_logits": logits,
+        "log_scales": scales, "quats": quats,
+    }  # fmt: skip
+    short_arrays = {name: short(values) for name, values in arrays.items() if name != "quats"}
+    return MemorySource(short_arrays | {"quats": quats.astype(np.float32)}, degree)
+
+
+def draw_all(backend: Any) -> None:
+    """Every kernel that draws, sums, compares or descends."""
+    budget = MemoryBudget(1 << 40)
+    rng = np.random.default_rng(5)
+    # More rows than a work-group, edges in mid-tile, tiles without splats.
+    big, wide = scene(330, 3, 1), camera(75, 53, 0.1)
+    drawer = Renderer(backend, budget, background=(0.1, 0.2, 0.3), fit=Fit(pairs=PAIRS))
+    with drawer.load(big) as loaded:
+        image = drawer.render_planes(loaded, wide)
+        drawer.add_statistics(loaded, wide, Statistics.zeros(big.count))
+        drawer.removal_sums(loaded, wide)
+        target = (image + rng.uniform(-0.2, 0.2, image.shape).astype(np.float32)).astype(np.float16)
+        target = np.round(target * 32) / np.float16(32)
+        drawer.residual_sums(loaded, wide, target)
+        drawer.residual_and_removal_sums(loaded, wide, target)
+        drawer.gradient_sums(loaded, wide, target, 0.3)
+    drawer.release()
+    similar = np.round(image[:, :34, :45].transpose(1, 2, 0) * 32) / np.float32(32)
+    ssims(backend, [(similar, similar[::-1])])
+    flips(backend, [(similar, np.clip(similar * 1.25 - 0.125, 0, 1))])
+    for degree in (0, 1, 2, 4):
+        for_degree(backend, budget, degree)
+    for extent, antialiased, pairs in (("inria", False, 1 << 8), ("exact", True, 1), ("inria", True, PAIRS)):
+        small = scene(60, 1, 9, opacity=-1)
+        drawer = Renderer(backend, budget, 0.3, (0.3, 0.0, 0.9), extent, antialiased, Fit(pairs=pairs, chunk_rows=37))
+        view = camera(40, 35, -0.2, 3.0)
+        with drawer.load(small) as loaded:
+            drawer.render_planes(loaded, view)
+            drawer.add_statistics(loaded, view, Statistics.zeros(small.count))
+        drawer.release()
+    for bits in (PAPER, BitSpec(13, 7, 8, 11, 16, 3)):
+        has_sh = nonzero_sh(small)
+        quantized = quantize_scene(small, np.flatnonzero(has_sh), np.flatnonzero(~has_sh), bits, 3)
+        drawer = Renderer(backend, budget, fit=Fit(pairs=PAIRS, chunk_rows=37))
+        with drawer.load_quantized(quantized) as loaded:
+            drawer.render_planes(loaded, camera(20, 18))
+        drawer.release()
+
+
+def for_degree(backend: Any, budget: MemoryBudget, degree: int) -> None:
+    """Costs, a round of the colour refit, and steps of a descent of a scene of one SH degree."""
+    source, view = scene(64, degree, 3 + degree), camera(33, 30, 0.3, 1.5)
+    drawer = Renderer(backend, budget, antialiased=degree == 2, fit=Fit(pairs=PAIRS))
+    bench = Bench(drawer)
+    with drawer.load(source) as loaded:
+        measure_costs(bench, loaded, [view])
+        image = drawer.render_planes(loaded, view)
+        target: Any = (np.round(image * 16) / 16 + 0.125).astype(np.float16)
+    planes, targets = source.read(slice(0, source.count), list(FIELD)), cast(Any, [target])
+    degrees = np.full(source.count, degree)
+    planes = refit_colours(planes, degrees, Original(bench, source.origin, [view], targets), rounds=1)
+    # Short again: what comes next does not depend on all bits of the refit.
+    planes = {name: short(values) for name, values in planes.items()}
+    with Descent(drawer, planes, degrees, source.origin, view, 0.01) as descent:
+        for put in (False, True):
+            if put:
+                descent.put_on(STEPS)
+            for _ in range(2):
+                descent.step(view, target, {"means": 1e-2, **FIELD_RATES})
+            descent.follow(0.5)
+        descent.planes()
+    drawer.release()
+
+
+def code_all(backend: Any) -> None:
+    """Write a file, and read it back: two chunks' worth of rows of all SH degrees, raw bits, repeats."""
+    rng = np.random.default_rng(8)
+    count, degree = 272, 2
+    planes = {f.name: rng.normal(size=(f.width(degree), count)).astype(np.float32) for f in FIELDS}
+    for name in ("sh_dc", "log_scales", "opacity_logits"):
+        planes[name] += 3 * planes["means"][:1]
+    planes["means"][:, 5:9] = planes["means"][:, 4:5]  # in one cell
+    steps = StepSizes(0.05, 2.0**-11, 0.05, 0.4, 0.1, (2.0**-9, 0.25, 0.3, 0.3))
+    grid = to_grid(planes, rng.integers(0, degree + 1, count), steps, (1234.5, -0.1, 1e-7), np.zeros(count, np.int64))[
+        0
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.fgs"
+        write_grid(path, grid, {})
+        write_grid(path.with_name("b.fgs"), grid, {}, device=backend)
+        assert path.read_bytes() == path.with_name("b.fgs").read_bytes()
+        plain, source = GridSource(path), GridSource(path)
+        table = np.zeros((count, 17 + 24), np.float32)
+        with source.on_device(backend, 1):
+            got = source.read_table(slice(0, count), table).tobytes()
+        assert got == plain.read_table(slice(0, count), table).tobytes()
