@@ -9,14 +9,18 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.harness import ROOT
+from benchmarks.self_test_faults import Fault, faults, judge, judge_all
 from benchmarks.self_test_scene import code_all, draw_all
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.choose_device import choose_device, list_devices
@@ -25,6 +29,9 @@ from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.kernels.self_test import PATTERN, Arrays, verdict
 from flexgs_edge.memory.budget import MemoryBudget
 
+TABLE = ROOT / "docs" / "results" / "self_test.md"
+LEAST_REFUSED = 0.95
+"""Share of the faults that the self-test must refuse."""
 BLOCKS = 5
 """Work-items of the serial passes: enough that some have no splats, and no divisor of the rows."""
 FORMS = {"w16": (16, "cpu"), "w8": (8, "cpu"), "w4": (4, "cpu"), "w1": (1, "cpu"), "gpu": (1, "gpu")}
@@ -188,11 +195,72 @@ def check(record: Record) -> int:
     return int(wrong)
 
 
+REASONS: dict[tuple[str, str, str], str] = {}
+"""Why faults pass, by file, function and changed line."""
+
+
+def mutations(only: str | None, workers: int, verbose: bool) -> int:
+    """Plant every fault, and write the page; returns 1 if fewer are refused than asked for."""
+    chosen = [fault for fault in faults() if only is None or only in f"{fault.file} {fault.function}"]
+    with tempfile.TemporaryDirectory(prefix="self-test-") as name:
+        for form in FORMS:
+            healthy = judge(None, Path(name) / "0", (form,))
+            if healthy[1] != "passed":
+                print(f"the self-test refuses sound kernels: {healthy}", file=sys.stderr)
+                return 2
+        rows = judge_all(chosen, Path(name), workers, verbose)
+    passed = [fault for fault, _, said in rows if said == "passed"]
+    share = 1 - len(passed) / max(len(rows), 1)
+    print(f"{len(rows)} faults, {len(rows) - len(passed)} refused ({share:.1%})")
+    for fault in passed:
+        print(f"  {fault.file}:{fault.line} {fault.function}: {fault.words()}")
+    if only is None:
+        TABLE.write_text(page(rows))
+    return int(share < LEAST_REFUSED)
+
+
+def page(rows: list[tuple[Fault, str, str]]) -> str:
+    """The page about all faults."""
+    passed = [fault for fault, _, said in rows if said == "passed"]
+    files = sorted({fault.file for fault, _, _ in rows})
+    lines = [
+        "# Faults that the self-test sees",
+        "",
+        f"{len(rows)} faults were planted in a copy of the kernels, one at a time: one operator of every helper and three of every",
+        f"kernel, at even distances in its text. The [self-test](../devices.md#the-self-test) refuses {len(rows) - len(passed)} of them",
+        f"({(1 - len(passed) / len(rows)):.1%}). A fault counts as refused if a form that has the code refuses it.",
+        "",
+        "`nice python -m benchmarks.self_test mutations` makes this page.",
+        "",
+        "| file | faults | refused |",
+        "|---|---|---|",
+    ]
+    for file in files:
+        own = [fault for fault, _, _ in rows if fault.file == file]
+        lines.append(f"| `{file}` | {len(own)} | {len(own) - sum(fault.file == file for fault in passed)} |")
+    lines += ["", "## Those that pass", "", "| kernel or helper | change | why |", "|---|---|---|"]
+    for fault in passed:
+        words = fault.words().replace("|", "\\|")
+        lines.append(
+            f"| `{fault.function}` | {words} | {REASONS.get((fault.file, fault.function, fault.old), 'unknown')} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
 def main() -> int:
     """Record, check or mutate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("record", "check"))
+    parser.add_argument("what", choices=("record", "check", "mutations", "play"))
+    parser.add_argument("--form", default="w16", choices=FORMS, help="for play: the form of the kernels")
+    parser.add_argument("--only", metavar="WORD", help="for mutations: files and functions with this word; no page")
+    parser.add_argument("--workers", type=int, default=1, help="for mutations: faults judged side by side")
+    parser.add_argument("-v", "--verbose", action="store_true", help="for mutations: a line for each fault")
     options = parser.parse_args()
+    if options.what == "play":
+        print(verdict(load_record(), open_form(options.form)))
+        return 0
+    if options.what == "mutations":
+        return mutations(options.only, options.workers, options.verbose)
     if options.what == "record":
         record = make_record()
         missing = {*KERNELS, *CODEC_KERNELS} - record.kernels
