@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.harness import ROOT
 from benchmarks.self_test_faults import Fault, faults, judge, judge_all
-from benchmarks.self_test_scene import code_all, draw_all
+from benchmarks.self_test_scene import BLOCKS, code_all, draw_all
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.choose_device import choose_device, list_devices
 from flexgs_edge.kernels.launch_record import RECORD, Record, checksum, load_record
@@ -32,8 +32,6 @@ from flexgs_edge.memory.budget import MemoryBudget
 TABLE = ROOT / "docs" / "results" / "self_test.md"
 LEAST_REFUSED = 0.95
 """Share of the faults that the self-test must refuse."""
-BLOCKS = 5
-"""Work-items of the serial passes: enough that some have no splats, and no divisor of the rows."""
 FORMS = {"w16": (16, "cpu"), "w8": (8, "cpu"), "w4": (4, "cpu"), "w1": (1, "cpu"), "gpu": (1, "gpu")}
 
 
@@ -222,13 +220,14 @@ def mutations(only: str | None, workers: int, verbose: bool) -> int:
 def page(rows: list[tuple[Fault, str, str]]) -> str:
     """The page about all faults."""
     passed = [fault for fault, _, said in rows if said == "passed"]
+    share = 1 - len(passed) / len(rows)
     files = sorted({fault.file for fault, _, _ in rows})
     lines = [
         "# Faults that the self-test sees",
         "",
-        f"{len(rows)} faults were planted in a copy of the kernels, one at a time: one operator of every helper and three of every",
-        f"kernel, at even distances in its text. The [self-test](../devices.md#the-self-test) refuses {len(rows) - len(passed)} of them",
-        f"({(1 - len(passed) / len(rows)):.1%}). A fault counts as refused if a form that has the code refuses it.",
+        f"{len(rows)} faults were planted in a copy of the kernels, one at a time: one operator of every helper and",
+        "three of every kernel, at even distances in its text. The [self-test](../devices.md#the-self-test) refuses",
+        f"{len(rows) - len(passed)} of them ({share:.1%}). A fault counts as refused if a form that has the code refuses it.",
         "",
         "`nice python -m benchmarks.self_test mutations` makes this page.",
         "",

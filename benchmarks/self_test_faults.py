@@ -21,7 +21,7 @@ OTHER = {
 _OPERATOR = re.compile(
     r"(?<= )(?:" + "|".join(re.escape(op) for op in sorted(OTHER, key=len, reverse=True)) + r")(?= )"
 )
-_START = re.compile(r"^(?:__kernel|inline)\b.*", re.MULTILINE)
+_START = re.compile(r"^(?:__kernel|inline|#define FOR_EACH\w+\()", re.MULTILINE)
 _NAME = re.compile(r"(\w+)\s*\(")
 SECONDS = 240
 """Time for one fault. A loop that does not end is refused too."""
@@ -64,9 +64,11 @@ def faults(kernel: int = 3, helper: int = 1) -> list[Fault]:
         for start, end in zip(starts, [*starts[1:], len(text)], strict=True):
             head = text[start:end]
             brace = head.find("{")
+            if head.startswith("#define"):
+                head = head.removeprefix("#define ")
             named = _NAME.findall(re.sub(r"__attribute__\(\(.*?\)\)\)", "", head[:brace]))
-            places = [place for place in _places(text, start + brace, end)]
-            many = kernel if head.startswith("__kernel") else helper
+            places = _places(text, start + brace, end)
+            many = kernel if head.startswith(("__kernel", "FOR_EACH")) else helper
             chosen = {places[(2 * k + 1) * len(places) // (2 * many)] for k in range(many)} if places else set()
             for place in sorted(chosen):
                 old = _OPERATOR.match(text, place)
@@ -114,7 +116,7 @@ def judge(fault: Fault | None, place: Path, forms: tuple[str, ...]) -> tuple[str
 
 def forms_of(fault: Fault) -> tuple[str, ...]:
     """Forms whose program has the file."""
-    return ("gpu",) if fault.file == "blend_gpu.cl" else ("w16", "w1", "w4")
+    return ("gpu",) if fault.file == "blend_gpu.cl" else ("w16", "gpu", "w4")
 
 
 def judge_all(chosen: list[Fault], place: Path, workers: int, verbose: bool) -> list[tuple[Fault, str, str]]:

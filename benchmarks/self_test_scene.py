@@ -11,6 +11,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
+from flexgs_edge.constants import LOG2_ALPHA_MAX, LOG2_ALPHA_MIN, ROW_BLOCK, SUM_LANES, TILE
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.memory.budget import MemoryBudget
@@ -31,6 +32,8 @@ from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.original import Original
 
+BLOCKS = 5
+"""Work-items of the serial passes: enough that some have no splats, and no divisor of the rows."""
 PAIRS = 1 << 12
 """Room for pairs, where a scene is drawn in one batch: the self-test clears and compares all of it."""
 STEPS = StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04, 0.05, 0.06, 0.07))
@@ -97,7 +100,9 @@ def draw_all(backend: Any) -> None:
     drawer.release()
     similar = np.round(image[:, :34, :45].transpose(1, 2, 0) * 32) / np.float32(32)
     ssims(backend, [(similar, similar[::-1])])
-    flips(backend, [(similar, np.clip(similar * 1.25 - 0.125, 0, 1))])
+    similar[:4, :4] = 0.04045  # where the curve of sRGB has its knee
+    flips(backend, [(similar, np.clip(similar * 1.25 - 0.125, 0, 1)), (similar, 1 - np.clip(similar, 0, 1))])
+    edges(backend)
     for degree in (0, 1, 2, 4):
         for_degree(backend, budget, degree)
     for extent, antialiased, pairs in (("inria", False, 1 << 8), ("exact", True, 1), ("inria", True, PAIRS)):
@@ -115,6 +120,63 @@ def draw_all(backend: Any) -> None:
         with drawer.load_quantized(quantized) as loaded:
             drawer.render_planes(loaded, camera(20, 18))
         drawer.release()
+
+
+def call(backend: Any, name: str, size: int, *args: Any) -> None:
+    """Launch a kernel on arrays of the host."""
+    plain = [backend.array(arg.shape, arg.dtype) if isinstance(arg, np.ndarray) else arg for arg in args]
+    for array, values in zip(plain, args, strict=True):
+        if isinstance(values, np.ndarray):
+            backend.write(array, values)
+    backend.launch(name, (size,), *plain)
+    for array, values in zip(plain, args, strict=True):
+        if isinstance(values, np.ndarray):
+            array.release()
+
+
+def edges(backend: Any) -> None:
+    """Numbers that scenes hardly reach: sums about to overflow, values at a limit, gradients near zero."""
+    f32, rows = np.float32, 64
+    some = np.arange(rows)
+    # Adam: gradients and means about the least, rows that no view touched.
+    gradient = np.where(some % 3, 10.0 ** (some % 7 - 18.0), -0.5).astype(f32)
+    ones = np.ones((1, rows), f32)
+    powers = np.stack([some % 2 + 0.5, some % 2 + 0.25]).astype(f32) * f32(0.4)
+    call(
+        backend, "adam", rows, rows, 1, 0.9, 0.999, np.array([0.01], f32), (some % 5 > 0).astype(f32), gradient[None],
+        powers, gradient[::-1][None] * f32(1e-3), ones * f32(1e-29), ones,
+    )  # fmt: skip
+    # Costs: both words, sums at the ends of their range.
+    sums = np.empty((rows, 2), np.int64)
+    sums[:, 0], sums[:, 1] = (
+        (some.astype(np.int64) << 57) + 12345,
+        np.where(some % 4, (some.astype(np.int64) + 1) << 40, 0),
+    )
+    costs = np.zeros((rows // SUM_LANES, 8, SUM_LANES), np.int64)
+    costs[:, :4] = -1
+    costs[:, 4:] = np.where(some.reshape(-1, 1, SUM_LANES) % 2, 2**63 - 1000, -(2**63) + 1000)
+    places = np.stack([some % 8 - 3.5, some % 5 - 2.0, some % 3 + 1.0]).astype(f32)
+    bands = (np.stack([(some * k) % 11 - 5 for k in range(1, 10)]) * 0.25).astype(f32)
+    record = np.zeros(32, f32)
+    blocks = np.arange(-(-rows // ROW_BLOCK), dtype=np.uint32)
+    words = sums.view(np.uint32).reshape(rows, 2, 2)
+    call(backend, "add_costs", rows, rows, rows, 0, 0, 1, 2, 0, blocks, record, places, bands, words, costs)
+    # A pixel that a splat reaches with the least alpha that shows, and sums whose low words are full.
+    splats = np.zeros((3, 16), f32)
+    splats[:, 2:5] = 0.02, 0.0, 0.02
+    splats[:, :2] = [[3, 3], [8, 8], [12, 4]]
+    splats[:, 5] = LOG2_ALPHA_MIN, LOG2_ALPHA_MAX, -3.0
+    splats[:, 6:9] = 0.25, 0.5, 1.0
+    pairs = np.array([[0, 0xFFFF], [1, 0xFFFF], [2, 0xFFFF]], np.uint32)
+    image, ends = np.zeros((3, TILE, TILE), f32), np.full(BLOCKS, 3, np.uint32)
+    full = np.full((3, 9, 2), 0xFFFFFFFF, np.uint32)
+    for name, planes in (("blend", 0), ("blend_stats", 1), ("blend_removal", 2), ("blend_backward", 9)):
+        extra: list[np.ndarray] = [np.full(3, 7, np.uint32), np.ascontiguousarray(full[:, :planes])] if planes else []
+        extra += [np.full((3, TILE, TILE), 0.5, f32)] if planes == 9 else []
+        call(
+            backend, name, 1, 1, BLOCKS, TILE, TILE, 0, 1, 0.5, 0.25, 0.0, ends, pairs, splats, np.zeros((1, 4, 256), f32), image,
+            *extra,
+        )  # fmt: skip
 
 
 def for_degree(backend: Any, budget: MemoryBudget, degree: int) -> None:
@@ -143,9 +205,14 @@ def for_degree(backend: Any, budget: MemoryBudget, degree: int) -> None:
 
 
 def code_all(backend: Any) -> None:
-    """Write a file, and read it back: two chunks' worth of rows of all SH degrees, raw bits, repeats."""
+    """Write files, and read them back: rows of all SH degrees in several passes, raw bits, repeats."""
+    for count, degree in ((272, 3), (1100, 0)):
+        code(backend, count, degree)
+
+
+def code(backend: Any, count: int, degree: int) -> None:
+    """One file, on the device as by NumPy."""
     rng = np.random.default_rng(8)
-    count, degree = 272, 2
     planes = {f.name: rng.normal(size=(f.width(degree), count)).astype(np.float32) for f in FIELDS}
     for name in ("sh_dc", "log_scales", "opacity_logits"):
         planes[name] += 3 * planes["means"][:1]
@@ -160,7 +227,7 @@ def code_all(backend: Any) -> None:
         write_grid(path.with_name("b.fgs"), grid, {}, device=backend)
         assert path.read_bytes() == path.with_name("b.fgs").read_bytes()
         plain, source = GridSource(path), GridSource(path)
-        table = np.zeros((count, 17 + 24), np.float32)
+        table = np.zeros((count, 17 + 3 * sh_rest_count(degree)), np.float32)
         with source.on_device(backend, 1):
             got = source.read_table(slice(0, count), table).tobytes()
         assert got == plain.read_table(slice(0, count), table).tobytes()
