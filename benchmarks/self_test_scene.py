@@ -11,7 +11,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
-from flexgs_edge.constants import LOG2_ALPHA_MAX, LOG2_ALPHA_MIN, ROW_BLOCK, SUM_LANES, TILE
+from flexgs_edge.constants import LOG2_ALPHA_MAX, LOG2_ALPHA_MIN, ROW_BLOCK, SUM_LANES, TILE, TRANSMITTANCE_MIN
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.memory.budget import MemoryBudget
@@ -87,7 +87,8 @@ def draw_all(backend: Any) -> None:
     rng = np.random.default_rng(5)
     # More rows than a work-group, edges in mid-tile, tiles without splats.
     big, wide = scene(330, 3, 1), camera(75, 53, 0.1)
-    drawer = Renderer(backend, budget, background=(0.1, 0.2, 0.3), fit=Fit(pairs=PAIRS))
+    # Black in one channel, so that some values are 0 exactly.
+    drawer = Renderer(backend, budget, background=(0.1, 0.0, 0.3), fit=Fit(pairs=PAIRS))
     with drawer.load(big) as loaded:
         image = drawer.render_planes(loaded, wide)
         drawer.add_statistics(loaded, wide, Statistics.zeros(big.count))
@@ -170,6 +171,29 @@ def edges(backend: Any) -> None:
     pairs = np.array([[0, 0xFFFF], [1, 0xFFFF], [2, 0xFFFF]], np.uint32)
     image, ends = np.zeros((3, TILE, TILE), f32), np.full(BLOCKS, 3, np.uint32)
     full = np.full((3, 9, 2), 0xFFFFFFFF, np.uint32)
+    # Pixels that a flat splat of alpha 1/2 brings to the least transmittance, exactly, and close to it on both sides.
+    state, flat = np.zeros((1, 4, 256), f32), np.zeros((1, 16), f32)
+    state[0, 3] = f32(2 * TRANSMITTANCE_MIN) * (1 + (np.arange(256) % 3 - 1) * f32(2.0**-20))
+    flat[:, 5:9] = -1.0, 0.25, 0.5, 1.0
+    call(
+        backend,
+        "blend",
+        1,
+        1,
+        BLOCKS,
+        TILE,
+        TILE,
+        1,
+        1,
+        0.5,
+        0.25,
+        0.0,
+        np.full(BLOCKS, 1, np.uint32),
+        pairs[:1],
+        flat,
+        state,
+        image,
+    )
     for name, planes in (("blend", 0), ("blend_stats", 1), ("blend_removal", 2), ("blend_backward", 9)):
         extra: list[np.ndarray] = [np.full(3, 7, np.uint32), np.ascontiguousarray(full[:, :planes])] if planes else []
         extra += [np.full((3, TILE, TILE), 0.5, f32)] if planes == 9 else []
