@@ -195,7 +195,6 @@ def check(record: Record) -> int:
 
 REASONS = {
     ("blend_cpu.cl", "any_alive", ">"): "a transmittance is never 0: pixels end before",
-    ("blend_cpu.cl", "load_blocks", "<"): "one turn more reads and writes beside the arrays, where nobody looks",
     ("blend_gpu.cl", "BLEND", "<"): "a 17th item writes a part that no sum reads",
     ("common.clh", "smaller", "<"): "of two equal numbers it does not matter which is taken",
     ("common.clh", "larger", ">"): "of two equal numbers it does not matter which is taken",

@@ -14,6 +14,7 @@ from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.constants import LOG2_ALPHA_MAX, LOG2_ALPHA_MIN, ROW_BLOCK, SUM_LANES, TILE, TRANSMITTANCE_MIN
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.kernels.twins.arithmetic import fexp2
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
@@ -173,7 +174,8 @@ def edges(backend: Any) -> None:
     full = np.full((3, 9, 2), 0xFFFFFFFF, np.uint32)
     # Pixels that a flat splat of alpha 1/2 brings to the least transmittance, exactly, and close to it on both sides.
     state, flat = np.zeros((1, 4, 256), f32), np.zeros((1, 16), f32)
-    state[0, 3] = f32(2 * TRANSMITTANCE_MIN) * (1 + (np.arange(256) % 3 - 1) * f32(2.0**-20))
+    about = np.array(TRANSMITTANCE_MIN / (1 - fexp2(np.full(1, -1, f32))), f32).view(np.uint32)
+    state[0, 3] = (about + np.arange(256, dtype=np.uint32) - 128).view(f32)
     flat[:, 5:9] = -1.0, 0.25, 0.5, 1.0
     call(
         backend,
@@ -201,6 +203,29 @@ def edges(backend: Any) -> None:
             backend, name, 1, 1, BLOCKS, TILE, TILE, 0, 1, 0.5, 0.25, 0.0, ends, pairs, splats, np.zeros((1, 4, 256), f32), image,
             *extra,
         )  # fmt: skip
+
+    # Pixels at the ends of what a screen shows, where the structural term has a gradient.
+    pixels = np.array([0, 1, -0.5, 0.5, 1.5], f32)[some % 5]
+    taps, sums_of = (
+        np.array([0.25, 0.5, 0.25], f32),
+        np.stack([some % 3 + 1, some % 4 - 2, some % 5 + 0.5, some]).astype(f32)[:3],
+    )
+    wide = np.pad(sums_of, ((0, 0), (0, 4)))
+    call(
+        backend,
+        "dssim_residual",
+        rows,
+        rows,
+        0,
+        rows + 4,
+        0.5,
+        3,
+        taps,
+        wide,
+        pixels,
+        pixels.astype(np.float16),
+        pixels / 4,
+    )
 
 
 def for_degree(backend: Any, budget: MemoryBudget, degree: int) -> None:

@@ -116,6 +116,24 @@ def test_a_compiler_that_ends_the_process(
     assert all(word in said for word in [*words, "devices --self-test", "--device numpy"])
 
 
+def test_testing_anew(info: DeviceInfo, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """`devices` believes what it knows; `devices --self-test` does not."""
+    monkeypatch.setattr(module, "list_devices", lambda self_test: [info])
+
+    def devices(*arguments: str) -> tuple[object, str]:
+        with pytest.raises(SystemExit) as left:
+            app.main(["devices", *arguments])
+        return left.value.code, capsys.readouterr().err
+
+    child(monkeypatch, says(GOOD))
+    assert devices()[0] == 0
+    child(monkeypatch, CRASH)
+    assert devices()[0] == 0
+    code, said = devices("--self-test")
+    assert code == 4 and "SIGSEGV" in said and "chosen:" not in said
+    assert devices()[0] == 4  # the newest verdict holds
+
+
 def test_a_test_that_does_not_end(info: DeviceInfo, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MOST_SECONDS", 0.3)
     child(monkeypatch, f"import time; print({MARK + 'sort_count'!r}, flush=True); time.sleep(60)")
