@@ -96,6 +96,7 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
     const uint size = min((uint)BATCH, last - start);
     if (p < (int)size) {
       list[p] = pairs[start + p];
+#pragma unroll
       for (int f = 0; f < 9; ++f) splats[p][f] = records[(size_t)list[p].x * 16 + f];
     }
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -151,21 +152,26 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
       if (hit) atomic_inc(&counts);
       // Each lane sums over the blocks in order, then the pairwise tree over lanes: the order and fused steps of blend_cpu.cl.
       float sum[SUMS];
+#pragma unroll
       for (int c = 0; c < SUMS; ++c) sum[c] = 0.0f;
-      if (p < 16)
-        for (int k = p; k < 256; k += 16) {
+      if (p < 16) {
+#pragma unroll
+        for (int j = 0; j < 256; j += 16) {
+          const int k = j + p;
 #if STATS != 5
           sum[0] += parts[0][k];
 #endif
 #if STATS == 2
           sum[1] = fma(parts[1][k], parts[1][k], sum[1]);
 #elif STATS == 3 || STATS == 4
+#pragma unroll
           for (int c = 1; c < 4; ++c) sum[c] = fma(parts[0][k], parts[c][k], sum[c]);
 #endif
 #if STATS == 4
           sum[4] += parts[4][k];
           sum[5] = fma(parts[0][k], parts[0][k], sum[5]);
 #elif STATS == 5
+#pragma unroll
           for (int c = 0; c < 3; ++c) sum[c] = fma(parts[0][k], parts[c + 1][k], sum[c]);
           const float kx = (float)((int)(tile % tiles_x) * TILE + BLOCK * (k >> 4 & 3) + (k & 3)) - splats[n][0];
           const float ky = (float)((int)(tile / tiles_x) * TILE + BLOCK * (k >> 6) + (k >> 2 & 3)) - splats[n][1];
@@ -178,8 +184,10 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
           sum[8] = fma(slope_y, ky, sum[8]);
 #endif
         }
+      }
       barrier(CLK_LOCAL_MEM_FENCE);
       if (p < 16)
+#pragma unroll
         for (int c = 0; c < SUMS; ++c) parts[c][p] = sum[c];
       barrier(CLK_LOCAL_MEM_FENCE);
       if (p == 0 && counts) {
@@ -187,9 +195,12 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
 #if STATS == 1
         atomic_add(hits + row, counts);
 #endif
+#pragma unroll
         for (int c = 0; c < SUMS; ++c) {
           __local float *s = parts[c];
+#pragma unroll
           for (int l = 0; l < 8; ++l) s[l] += s[l + 8];
+#pragma unroll
           for (int l = 0; l < 4; ++l) s[l] += s[l + 4];
           add_fixed(sums + ((size_t)row * SUMS + c) * 2, (s[0] + s[2]) + (s[1] + s[3]), SUM_UNIT,
                     tile_largest((uint)get_num_groups(0)));

@@ -22,6 +22,11 @@ if ! command -v oclgrind >/dev/null; then
   apt_install oclgrind 2>/dev/null || say "no oclgrind here: its tests are skipped"
 fi
 
+# A second OpenCL runtime, which tests turn on by themselves (RUSTICL_ENABLE). Without it, they are skipped.
+if [ ! -e /etc/OpenCL/vendors/rusticl.icd ]; then
+  apt_install mesa-opencl-icd 2>/dev/null || say "no mesa-opencl-icd here: the tests of a second OpenCL runtime are skipped"
+fi
+
 # The tests of report pages need a browser. Without one they are skipped.
 if ! command -v chromium >/dev/null && ! command -v google-chrome >/dev/null; then
   apt_install chromium 2>/dev/null || say "no browser here: the tests of report pages are skipped"

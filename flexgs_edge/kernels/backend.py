@@ -110,6 +110,8 @@ class Backend(Protocol):
     GPU."""
     sort_blocks: int
     tile_blocks: int
+    most_pairs: int
+    """Most pairs of splats and tiles that the device may list at once, unless the view has more tiles; 0: any number."""
     startup_seconds: float
     profile: defaultdict[str, float] | None
 
@@ -176,6 +178,7 @@ class TwinBackend:
     threads = 0
     sort_blocks = 4
     tile_blocks = 4
+    most_pairs = 0
 
     def __init__(self, budget: MemoryBudget) -> None:
         start = time.perf_counter()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 import warnings
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +22,8 @@ HINT = (
     "`--device numpy` (same results, far slower)"
 )
 
+RETEST = "A new version of its driver is tested anew by itself; `flexgs-edge devices --self-test` tests all devices now"
+
 # Fused and separate multiply-add on vectors of 16. It catches runtimes that cannot build for this processor, such as
 # PoCL's wheels on newer CPUs. It also catches those that fuse operations they must not fuse, or that miss lanes.
 SELF_TEST = """
@@ -30,7 +35,17 @@ __kernel void self_test(__global const float *a, __global const float *b, __glob
   vstore16(x * y - y, 0, out + 64 + i);
   vstore16(1.0f / sqrt(x), 0, out + 128 + i);
 }
+// Mesa's llvmpipe leaves loops after 65535 steps, without a word.
+__kernel void count_steps(const uint steps, __global const uint *ones, __global uint *out) {
+  uint sum = 0;
+  for (uint i = 0; i < steps; ++i) sum += ones[i & 3];
+  out[0] = sum;
+}
 """
+PROBED_STEPS = 1 << 20
+"""Steps of the loop that looks for a limit. A limit beyond it would not be noticed; none is known."""
+LEAST_STEPS = 65535
+"""With fewer steps of all loops together, no work-item of ours could do its part: such devices are refused."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +68,8 @@ class DeviceInfo:
     global_bytes: int
     max_alloc_bytes: int
     self_test: str
+    loop_steps: int = 0
+    """Steps after which the runtime leaves loops, counted over all loops of a work-item; 0 if it does not."""
     handle: cl.Device | None = field(default=None, repr=False, compare=False)
     context: cl.Context | None = field(default=None, repr=False, compare=False)
     """The context of the self-test, kept alive: after the last context is gone, PoCL starts its compiler anew for the
@@ -76,7 +93,8 @@ def list_devices(self_test: bool = True) -> list[DeviceInfo]:
     Parameters
     ----------
     self_test : bool
-        Build and run a small kernel on each device, and compare its result with NumPy's.
+        Build and run a small kernel on each device, and compare its result with NumPy's. Before a device is used, it must
+        pass more than this: `flexgs_edge.kernels.tested`.
     """
     import pyopencl as cl
 
@@ -98,15 +116,8 @@ def list_devices(self_test: bool = True) -> list[DeviceInfo]:
 def _describe(index: int, platform: Any, device: Any, self_test: bool) -> DeviceInfo:
     import pyopencl as cl
 
-    context, verdict = None, "not run"
-    if self_test:
-        try:
-            context = cl.Context([device])
-            verdict = run_self_test(context)
-        except cl.Error as error:
-            verdict = f"no context: {_first_line(str(error))}"
     kind = "gpu" if device.type & cl.device_type.GPU else "cpu" if device.type & cl.device_type.CPU else "other"
-    return DeviceInfo(
+    info = DeviceInfo(
         index=index,
         name=device.name.strip(),
         platform=platform.name.strip(),
@@ -119,14 +130,27 @@ def _describe(index: int, platform: Any, device: Any, self_test: bool) -> Device
         local_bytes=device.local_mem_size,
         global_bytes=device.global_mem_size,
         max_alloc_bytes=device.max_mem_alloc_size,
-        self_test=verdict,
+        self_test="not run",
         handle=device,
-        context=context,
     )
+    return probed(info) if self_test else info
 
 
-def run_self_test(context: cl.Context, source: str = SELF_TEST) -> str:
-    """Run the self-test of this source; returns `ok`, or one line about the failure."""
+def probed(info: DeviceInfo) -> DeviceInfo:
+    """`info` with the verdict of `run_self_test`, and its context."""
+    import pyopencl as cl
+
+    assert info.handle is not None
+    try:
+        context = cl.Context([info.handle])
+    except cl.Error as error:
+        return replace(info, self_test=f"no context: {_first_line(str(error))}")
+    verdict, steps = run_self_test(context)
+    return replace(info, self_test=verdict, loop_steps=steps, context=context)
+
+
+def run_self_test(context: cl.Context, source: str = SELF_TEST) -> tuple[str, int]:
+    """Run the self-test of this source; returns `ok`, or one line about the failure, and `DeviceInfo.loop_steps`."""
     import pyopencl as cl
 
     a = np.linspace(0.5, 3.0, 64, dtype=np.float32)
@@ -142,18 +166,24 @@ def run_self_test(context: cl.Context, source: str = SELF_TEST) -> str:
         output = cl.Buffer(context, flags.WRITE_ONLY, got.nbytes)
         cl.Kernel(program, "self_test")(queue, (4,), (1,), *inputs, output)
         cl.enqueue_copy(queue, got, output)
+        steps = np.ones(4, np.uint32)
+        ones = cl.Buffer(context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=steps)
+        cl.Kernel(program, "count_steps")(queue, (1,), (1,), np.uint32(PROBED_STEPS), ones, output)
+        cl.enqueue_copy(queue, steps, output)
         queue.finish()
     except cl.Error as error:
-        return f"kernel does not build or run: {_first_line(str(error))}"
+        return f"kernel does not build or run: {_first_line(str(error))}", 0
     exact = a.astype(np.float64) * b
     fused, separate = (exact - b).astype(np.float32), exact.astype(np.float32) - b
     if not np.array_equal(got[:64], fused):
-        return "fma() is not exact"
+        return "fma() is not exact", 0
     if not np.array_equal(got[64:128], separate):
-        return "multiply and add are fused although FP_CONTRACT is off"
+        return "multiply and add are fused although FP_CONTRACT is off", 0
     if np.abs(got[128:] * np.sqrt(a) - 1).max() > 1e-6:
-        return "1/sqrt() is wrong"
-    return "ok"
+        return "1/sqrt() is wrong", 0
+    if steps[0] < LEAST_STEPS:
+        return f"loops end after {steps[0]} steps, {LEAST_STEPS} are needed", 0
+    return "ok", 0 if steps[0] == PROBED_STEPS else int(steps[0])
 
 
 def _first_line(text: str) -> str:
@@ -179,11 +209,11 @@ def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceIn
     """
     listing = "; ".join(f"[{d.index}] {d.name} ({d.platform}, {d.type}): {d.self_test}" for d in devices)
     if not devices:
-        raise DeviceError(f"no OpenCL device found: {HINT}")
+        raise DeviceError(f"no OpenCL device found{_broken_runtimes()}: {HINT}")
     if spec is None:
         usable = [d for d in devices if d.usable]
         if not usable:
-            raise DeviceError(f"no OpenCL device passed the self-test: {listing}. To go on, {HINT}")
+            raise DeviceError(f"no OpenCL device passed the self-test: {listing}. {RETEST}. To go on, {HINT}")
         ranked = sorted(
             usable, key=lambda d: (d.type != "gpu", "portable computing" not in d.platform.lower(), d.index)
         )
@@ -200,5 +230,27 @@ def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceIn
         raise DeviceError(f"--device {spec}: no such OpenCL device; there are: {listing}")
     for device in matches:
         if device.usable:
-            return device, f"asked for by --device {spec}"
-    raise DeviceError(f"--device {spec}: failed the self-test: {listing}. To go on, {HINT}")
+            others = [f"{d.index}" for d in matches if d is not device and d.usable]
+            more = (
+                f"; the first of {len(others) + 1} that match, --device {', '.join(others)} for others"
+                if others
+                else ""
+            )
+            return device, f"asked for by --device {spec}{more}"
+    raise DeviceError(f"--device {spec}: failed the self-test: {listing}. {RETEST}. To go on, {HINT}")
+
+
+def _broken_runtimes() -> str:
+    """Words about runtimes that are installed, but whose library cannot be loaded. The loader passes over them in silence."""
+    named = os.environ.get("OCL_ICD_VENDORS") or "/etc/OpenCL/vendors"
+    found = []
+    for file in sorted(Path(named).glob("*.icd")) if os.path.isdir(named) else [Path(named)]:
+        try:
+            library = file.read_text(encoding="utf-8").strip()
+        except (OSError, ValueError):
+            continue
+        try:
+            ctypes.CDLL(library)
+        except OSError as error:
+            found.append(f"{file} names {library}, which cannot be loaded ({error})")
+    return f" ({'; '.join(found)})" if found else ""

@@ -24,8 +24,8 @@ def open_backend(device: str | None, budget: MemoryBudget) -> Backend:
     """
     if device == "numpy":
         return TwinBackend(budget)
-    from flexgs_edge.kernels.choose_device import choose_device, list_devices
     from flexgs_edge.kernels.opencl import OpenCLBackend
+    from flexgs_edge.kernels.tested import choose_tested
 
-    info, _ = choose_device(device, list_devices())
+    info, _ = choose_tested(device)
     return OpenCLBackend(info, budget)

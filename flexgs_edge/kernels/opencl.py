@@ -15,6 +15,7 @@ from flexgs_edge.errors import DeviceError
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.cl_sources import load_source
+from flexgs_edge.kernels.loop_limit import LIMITED_BLOCKS, STEPS_A_PAIR, check_steps
 from flexgs_edge.kernels.session import DeviceArray, Session
 from flexgs_edge.memory.budget import MemoryBudget
 
@@ -45,19 +46,24 @@ class OpenCLBackend:
     ) -> None:
         start = time.perf_counter()
         self.session = Session(info, budget)
-        self.form = form or ("gpu" if info.type == "gpu" else "cpu")
+        # A pixel takes fewer steps than a tile, so the GPU form serves devices that end loops.
+        self.form = form or ("gpu" if info.type == "gpu" or info.loop_steps else "cpu")
         native = max(w for w in (16, 8, 4, 1) if w <= max(info.native_width, 1))
         self.width = width or (1 if self.form == "gpu" else native)
         if self.width not in (16, 8, 4, 1) or (self.form == "gpu" and self.width != 1):
             raise DeviceError(f"vector width {self.width} of the {self.form} form: expected 16, 8, 4 or 1 (gpu: 1)")
         self.name = f"{info.name} ({info.platform})"
-        # Oclgrind's interpreter stops at instructions that are only hints.
-        self._simulated = "oclgrind" in info.platform.lower()
+        # Hints and conversions that are not OpenCL C: only PoCL's compiler is known to take them, and only it gains by them.
+        self._builtins = "portable computing" in info.platform.lower()
         # Blocks of the serial passes: enough to keep all compute units busy, few enough for short scans.
         self.sort_blocks = self.tile_blocks = max(8 * info.compute_units, 16) if self.form == "cpu" else 64
+        self.most_pairs = 0
+        if info.loop_steps:
+            self.sort_blocks = self.tile_blocks = LIMITED_BLOCKS
+            self.most_pairs = info.loop_steps // STEPS_A_PAIR
         # The codec's kernels take f64, and join two numbers in one of twice the width, which needs little endian.
         able = info.handle is not None and info.handle.double_fp_config != 0 and info.handle.endian_little
-        self.threads = info.compute_units if self.form == "cpu" and able else 0
+        self.threads = info.compute_units if self.form == "cpu" and able and not info.loop_steps else 0
         self._kernels: dict[str, cl.Kernel] = {}
         self.startup_seconds = time.perf_counter() - start
 
@@ -108,8 +114,8 @@ class OpenCLBackend:
         spec = KERNELS.get(name) or CODEC_KERNELS[name]
         if name not in self._kernels:
             options = [f"-DW={min(self.width, spec.widest)}"]
-            if self._simulated:
-                options.append("-DNO_FETCH")
+            if self._builtins:
+                options.append("-DCLANG_BUILTINS")
             source = load_source(spec.file.format(form=self.form), spec.stats, self.form)
             self._kernels[name] = self.session.kernel(source, name, tuple(options), spec.signature)
         local: tuple[int, ...] = (1,) * len(size)
@@ -118,6 +124,8 @@ class OpenCLBackend:
             local = (GPU_GROUP if self.form == "gpu" else 1,)
         elif spec.per == "tile" and self.form == "gpu":
             size, local = (size[0] * 256,), (256,)
+        if self.session.info.loop_steps:
+            check_steps(self.session.info, name, size, args)
         if size[0]:
             self.session.launch(name, self._kernels[name], size, local, args)
 

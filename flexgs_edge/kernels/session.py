@@ -64,10 +64,16 @@ class Session:
         self.info = info
         self.budget = budget
         assert info.handle is not None
-        self.context = info.context or cl.Context([info.handle])
-        self.queue = cl.CommandQueue(self.context)
-        # A queue of its own: writing to an array that no kernel uses must not wait for other kernels.
-        self._maps = cl.CommandQueue(self.context)
+        try:
+            self.context = info.context or cl.Context([info.handle])
+            self.queue = cl.CommandQueue(self.context)
+            # A queue of its own: writing to an array that no kernel uses must not wait for other kernels.
+            self._maps = cl.CommandQueue(self.context)
+        except cl.Error as error:
+            raise DeviceError(
+                f"{info.name} ({info.platform}) does not open ({error}): it is gone, or its driver is broken; "
+                "`flexgs-edge devices` shows what is there"
+            ) from error
         self.compile_seconds = 0.0
         self.profile: defaultdict[str, float] | None = None
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
@@ -103,10 +109,23 @@ class Session:
     ) -> None:
         """Enqueue `kernel`; with `profile` set, also wait for it, and add its wall seconds under `label`."""
         start = time.perf_counter() if self.profile is not None else 0.0
-        kernel(self.queue, size, local, *(a.buffer if isinstance(a, DeviceArray) else a for a in args))
+        try:
+            kernel(self.queue, size, local, *(a.buffer if isinstance(a, DeviceArray) else a for a in args))
+        except cl.Error as error:
+            raise self._failure(f"running kernel {label}", error) from error
         if self.profile is not None:
             self.queue.finish()
             self.profile[label] += time.perf_counter() - start
+
+    def _failure(self, task: str, error: cl.Error) -> BudgetError | DeviceError:
+        """What a runtime says when its device fails, as an error that a user understands."""
+        device = f"{self.info.name} ({self.info.platform})"
+        if isinstance(error, cl.MemoryError):
+            return BudgetError(f"{device} ran out of memory while {task} ({error}): use a smaller --memory-limit")
+        return DeviceError(
+            f"{device} failed while {task} ({error}): it is gone, or its driver is broken; "
+            "`flexgs-edge devices --self-test` tests it"
+        )
 
     def array(self, shape: tuple[int, ...], dtype: Any) -> DeviceArray:
         """A new array on the device, not initialised."""
@@ -116,9 +135,12 @@ class Session:
         """Copy C-contiguous `values` to the flat element `offset` of `array`."""
         values = np.ascontiguousarray(values, array.dtype)
         if values.size:
-            cl.enqueue_copy(
-                self.queue, array.buffer, values, dst_offset=offset * array.dtype.itemsize, is_blocking=True
-            )
+            try:
+                cl.enqueue_copy(
+                    self.queue, array.buffer, values, dst_offset=offset * array.dtype.itemsize, is_blocking=True
+                )
+            except cl.Error as error:
+                raise self._failure("writing an array", error) from error
 
     @contextmanager
     def mapped(self, array: DeviceArray) -> Iterator[np.ndarray]:
@@ -140,7 +162,11 @@ class Session:
         """Copy `array` to the host, from the flat element `offset` on, as much as `out` holds; waits for the queue."""
         out = np.empty(array.shape, array.dtype) if out is None else out
         if out.size:
-            cl.enqueue_copy(self.queue, out, array.buffer, src_offset=offset * array.dtype.itemsize, is_blocking=True)
+            at = offset * array.dtype.itemsize
+            try:
+                cl.enqueue_copy(self.queue, out, array.buffer, src_offset=at, is_blocking=True)
+            except cl.Error as error:
+                raise self._failure("reading an array", error) from error
         return out
 
     def fill(self, array: DeviceArray, value: int, count: int | None = None) -> None:

@@ -75,7 +75,8 @@ class ViewBuffers:
             if scene.structure:
                 self.structure_arrays()
             later -= target_bytes(scene, self.size)
-            share, most = PAIR_SHARE, max(scene.fit.pairs, self.tiles)
+            pairs = min(scene.fit.pairs, backend.most_pairs or scene.fit.pairs)
+            share, most = PAIR_SHARE, max(pairs, self.tiles)
             if rows is not None:
                 share = COMPACT_PAIR_SHARE
                 # Chunks that stay use what the tile lists leave. Buffers for views that show more rows need their room.

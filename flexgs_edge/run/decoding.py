@@ -9,7 +9,8 @@ from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS
 from flexgs_edge.codec.v2.device.encode_kernels import device_bytes
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.kernels.backend import Backend
-from flexgs_edge.kernels.choose_device import DeviceInfo, list_devices
+from flexgs_edge.kernels.choose_device import DeviceInfo
+from flexgs_edge.kernels.tested import processors_with_verdicts
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.clock import Stopwatch
@@ -29,7 +30,7 @@ def decoder(
     budget: MemoryBudget,
     clock: Stopwatch,
     least: int = DEVICE_ROWS,
-    devices: Callable[[], list[DeviceInfo]] = list_devices,
+    devices: Callable[[], list[DeviceInfo]] = processors_with_verdicts,
 ) -> Backend | None:
     """Open the OpenCL device that decodes a scene.
 

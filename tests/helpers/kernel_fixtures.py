@@ -161,6 +161,7 @@ class PairedBackend:
     is_numpy = False
     startup_seconds = 0.0
     compile_seconds = 0.0
+    most_pairs = 0
 
     def __init__(self, device: Backend, blocks: int, pattern: int = 0xAB) -> None:
         self.device, self.twin, self.pattern = device, TwinBackend(large_budget()), pattern

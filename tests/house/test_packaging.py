@@ -54,9 +54,9 @@ def kernel_files(repository: Path) -> set[str]:
 
 
 def python_files(repository: Path) -> set[str]:
-    """Modules, the stub of the face, and the mark that says that types are shipped."""
+    """Modules, the stub of the face, the mark that says that types are shipped, and what the self-test plays."""
     modules = {str(path.relative_to(repository)) for path in (repository / "flexgs_edge").rglob("*.py")}
-    return modules | {"flexgs_edge/__init__.pyi", "flexgs_edge/py.typed"}
+    return modules | {"flexgs_edge/__init__.pyi", "flexgs_edge/py.typed", "flexgs_edge/kernels/self_test.bin"}
 
 
 def template_files(repository: Path) -> set[str]:

@@ -1,0 +1,141 @@
+"""Play recorded launches back on a device, and compare every result with the twins' bits."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.errors import BudgetError, DeviceError
+from flexgs_edge.kernels.backend import CODEC_KERNELS, Backend, TwinBackend
+from flexgs_edge.kernels.launch_record import Record, canonical, checksum
+from flexgs_edge.memory.budget import MemoryBudget
+
+PATTERN = 0xAB
+"""Every byte of a new array, so that elements that are not written are known."""
+
+
+class WrongResult(Exception):
+    """A kernel gave other bits than its twin."""
+
+
+class Arrays:
+    """The arrays of a record on one backend, and the steps that change them."""
+
+    def __init__(self, record: Record, backend: Backend) -> None:
+        self.record, self.backend = record, backend
+        self.held: dict[int, Any] = {}
+
+    def do(self, step: list[Any]) -> None:
+        """Take one step."""
+        kind, name = step[:2]
+        if kind == "array":
+            array = self.held[name] = self.backend.array(tuple(step[2]), np.dtype(step[3]))
+            self.backend.write(array, np.full(array.nbytes, PATTERN, np.uint8).view(array.dtype))
+        elif kind == "write":
+            self.backend.write(self.held[name], self.record.blobs[step[3]], step[2])
+        elif kind == "fill":
+            self.backend.fill(self.held[name], step[2], step[3])
+        elif kind == "release":
+            self.held.pop(name).release()
+        else:
+            args = [self.held[arg[0]] if isinstance(arg, list) else arg for arg in step[3]]
+            self.backend.launch(name, tuple(step[2]), *args)
+
+    def output(self, step: list[Any], place: int) -> np.ndarray:
+        """The array that is the argument `place` of a launch, as it is now."""
+        values: np.ndarray = self.backend.read(self.held[step[3][place][0]])
+        return values
+
+    def release(self) -> None:
+        """Free what is left."""
+        for array in self.held.values():
+            with contextlib.suppress(Exception):  # after a failure, a runtime may refuse this as well
+                array.release()
+
+
+def play(record: Record, backend: Backend, watch: Callable[[str], None] = lambda kernel: None) -> None:
+    """Play `record` on `backend`. A device without threads is spared the kernels of the coder, which no run starts there.
+
+    Parameters
+    ----------
+    record : Record
+    backend : Backend
+    watch : callable, optional
+        Called with the name of each kernel before its first launch, which builds it.
+
+    Raises
+    ------
+    WrongResult
+        With the kernel, the first wrong value, and what was expected.
+    DeviceError, BudgetError
+        From the backend.
+    """
+    arrays, seen = Arrays(record, backend), set[str]()
+    try:
+        for number, step in enumerate(record.steps):
+            if step[0] != "launch":
+                arrays.do(step)
+                continue
+            name = step[1]
+            if name in CODEC_KERNELS and not backend.threads:
+                continue
+            if name not in seen:
+                seen.add(name)
+                watch(name)
+            arrays.do(step)
+            for place, wanted, _ in step[4]:
+                got = arrays.output(step, place)
+                if checksum(name, got) != wanted:
+                    raise WrongResult(_explain(record, number, place, got))
+    finally:
+        arrays.release()
+
+
+def _explain(record: Record, number: int, place: int, got: np.ndarray) -> str:
+    """One line about the first wrong value of a launch."""
+    _, name, size, _, outputs = record.steps[number]
+    expected = _expected(record, number, place, outputs)
+    got, expected = (canonical(name, values).reshape(-1) for values in (got, expected))
+    raw = f"u{got.dtype.itemsize}"
+    wrong = np.flatnonzero(got.view(raw) != expected.view(raw))
+    where = f"argument {place + 1}, launch {number} over {'x'.join(map(str, size))}"
+    if not len(wrong):  # the record does not fit the twins: a fault of ours
+        return f"kernel {name} ({where}): the checksum of the self-test is out of date"
+    first = int(wrong[0])
+    return (
+        f"kernel {name} computes {_shown(got[first])} where {_shown(expected[first])} is right "
+        f"(element {first}, the first of {len(wrong)} wrong ones; {where})"
+    )
+
+
+def _expected(record: Record, number: int, place: int, outputs: list[Any]) -> np.ndarray:
+    blob = next(blob for at, _, blob in outputs if at == place)
+    if blob is not None:
+        kept: np.ndarray = record.blobs[blob]
+        return kept
+    twins = Arrays(record, TwinBackend(MemoryBudget(1 << 40)))
+    for step in record.steps[: number + 1]:
+        if step[0] != "launch" or step[1] not in CODEC_KERNELS:
+            twins.do(step)
+    values: np.ndarray = twins.output(record.steps[number], place)
+    return values
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.9g}" if isinstance(value, np.floating) else str(value)
+
+
+def verdict(record: Record, backend: Backend, watch: Callable[[str], None] = lambda kernel: None) -> str:
+    """`ok`, or one line about the first fault."""
+    try:
+        play(record, backend, watch)
+    except WrongResult as error:
+        return str(error)
+    except (DeviceError, BudgetError) as error:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        reasons = [line for line in lines[1:] if "error" in line.lower()]
+        return " ".join([lines[0], *reasons[:1]])[:400]
+    return "ok"
