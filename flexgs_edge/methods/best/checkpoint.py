@@ -15,7 +15,7 @@ from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.files import DISK_FULL
 from flexgs_edge.memory.rows import blocks, read_rows
 from flexgs_edge.memory.storage import Storage
-from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
+from flexgs_edge.methods.best.effort import distil_steps, effort_of
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.fingerprint import fingerprint
 from flexgs_edge.run.options import CompressOptions
@@ -114,8 +114,11 @@ def open_checkpoint(
     """Open the folder for the rounds of a search. Its name holds a fingerprint of all that they depend on."""
     options = run.options
     # Rounds that lead to a descent also keep references from between the scored poses.
-    distils = distil_steps(options, len(scored), run.source.count) > 0
-    words = f"path {EFFORTS[options.effort].keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r} {distils}"
+    steps, plan = distil_steps(options, len(scored), run.source.count), effort_of(options)
+    words = f"path {plan.keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r} {steps > 0}"
+    if steps and plan.warming:
+        # The target says between which rounds a descent comes.
+        words += f" {plan.warming!r} {steps} {run.target!r}"
     assert options.near is not None and options.extent is not None
     key = fingerprint(run.source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
     checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")

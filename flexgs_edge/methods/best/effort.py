@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -202,6 +202,12 @@ EFFORTS = {
         warming=(Warming(loss=0.8, size=2.2, share=1 / 3), Warming(loss=0.7, size=1.6, share=1 / 3)),
     ),
 }
+
+
+def effort_of(options: CompressOptions) -> Effort:
+    """The effort of a run. Whoever sets the steps of a descent gets one descent for each candidate, and no others."""
+    plan = EFFORTS[options.effort]
+    return plan if options.distil is None else replace(plan, warming=())
 
 
 def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool = False) -> int:

@@ -28,7 +28,7 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import values_of
 from flexgs_edge.methods.best.candidates import Candidate, Product, RateResult
 from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
-from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
+from flexgs_edge.methods.best.effort import distil_steps, effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.keep import LAYERS_COST, kept_as_it_is
@@ -156,9 +156,7 @@ def grid_search(
         size = coder.size(grid)
         return size if options.layers == 1 else round(LAYERS_COST * size)
 
-    plan = EFFORTS[options.effort]
-    if options.distil is not None:
-        plan = replace(plan, warming=())
+    plan = effort_of(options)
 
     def make(rounds: PruneRounds, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
         return search(rounds, size_of, measure, plan, options.refit, report, rounds.original.steps)

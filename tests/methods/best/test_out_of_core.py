@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import itertools
+import math
 import os
 import subprocess
 import sys
@@ -22,9 +23,13 @@ from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.storage import ScratchStorage
+from flexgs_edge.methods.best import grid_search
 from flexgs_edge.methods.best import method as best_method
 from flexgs_edge.methods.best.costs import measure_costs
+from flexgs_edge.methods.best.effort import EFFORTS, LEAST_STEPS
+from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
+from flexgs_edge.methods.best.refit.distil import Schedule
 from flexgs_edge.methods.best.rounds import sum_row_bytes
 from flexgs_edge.render.camera_record import camera_record
 from flexgs_edge.render.chunk_bounds import ChunkBounds
@@ -311,8 +316,11 @@ def test_a_run_goes_on_from_its_last_round(
     (kept,) = (tmp_path / "kept").iterdir()
     rounds = len(list(kept.glob("round-*/done")))
     assert rounds >= 2
-    # Other poses, or a descent to follow, which wants views from between them: not what was kept.
-    for folders, change in enumerate(({"holdout": 3}, {"distil": 10, "layers": 1}), start=2):
+    # Other poses, a descent to follow, which wants views from between them, or descents between the rounds, whose place depends
+    # on the target: not what was kept.
+    most = {"effort": "max", "layers": 1}
+    changes = ({"holdout": 3}, {"distil": 10, "layers": 1}, most, {**most, "min_fidelity": 36.0})
+    for folders, change in enumerate(changes, start=2):
         stop_after(0)
         with pytest.raises(Stop):
             compress(project / "point_cloud.ply", tmp_path / "b.fgs", **{**words, **change})
@@ -324,6 +332,34 @@ def test_a_run_goes_on_from_its_last_round(
     drawn.clear()
     compress(project / "point_cloud.ply", tmp_path / "a.fgs", **{**words, "force": True})
     assert (tmp_path / "a.fgs").read_bytes() == expected and len(drawn) > resumed
+
+
+def test_descents_between_the_rounds_are_not_done_again(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words: dict[str, Any] = {**TINY, "effort": "max"}
+    compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
+    words = {**words, "resume": True, "scratch": str(tmp_path)}
+    moved: list[int] = []
+    whole, descend = GridSearch._whole, grid_search.distil
+
+    def distil(planes: Any, degrees: Any, original: Original, schedule: Schedule, *more: Any) -> Any:
+        moved.append(schedule.iterations)
+        return descend(planes, degrees, original, schedule, *more)
+
+    def stop(*_: Any) -> Any:
+        raise Stop
+
+    monkeypatch.setattr(grid_search, "distil", distil)
+    monkeypatch.setattr(GridSearch, "_whole", stop)
+    with pytest.raises(Stop):
+        compress(project / "point_cloud.ply", tmp_path / "b.fgs", **words)
+    between = [math.ceil(warming.share * LEAST_STEPS) for warming in EFFORTS["max"].warming]
+    assert moved == between and len(moved) > 1
+    monkeypatch.setattr(GridSearch, "_whole", whole)
+    compress(project / "point_cloud.ply", tmp_path / "b.fgs", **words)
+    assert set(moved[len(between) :]) == {LEAST_STEPS}
+    assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
 
 
 def test_a_full_disk_leaves_nothing_behind(
