@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.goals.line import AIM, next_point
+from flexgs_edge.goals.promise import mean_alone, means
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
@@ -197,7 +198,7 @@ class GridSearch(MultiplierSearch[GridScene]):
                     self._drift = DECAY * (self._drift + steps[-1].excess - self._expected)
                 # If candidates keep missing, for whatever reason, aim farther each time.
                 offset += self._drift + FARTHER * max(misses(steps) - 1, 0)
-        elif not by_size:
+        elif not by_size and means(target) is not mean_alone(target):
             self._learn_lead(values_of(self._before_refit(multiplier), self.rounds.storage), target)
         low, high = bounds(steps, by_size)
         place = min(max(math.log(multiplier), low), high)

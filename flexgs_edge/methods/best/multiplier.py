@@ -164,7 +164,7 @@ class MultiplierSearch(ABC, Generic[Product]):
                     break
             elif len(self.rounds.snapshots) > 1:
                 excess, end = self._guess(last.planes, target), math.log(part)
-                if self._lead == 0.0 and excess >= end - LEAD_FROM:
+                if means(target) is not mean_alone(target) and self._lead == 0.0 and excess >= end - LEAD_FROM:
                     self._learn_lead(last.planes, target)
                     excess += self._lead
                 if excess >= end:

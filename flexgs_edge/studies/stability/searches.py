@@ -134,7 +134,7 @@ class _Pretended(GridSearch):
     def _start(self, target: Target) -> float:
         return MIDDLE / 3
 
-    def _probe(self, multiplier: float, target: Target, anew: bool = False) -> float:
+    def _probe(self, multiplier: float, target: Target) -> float:
         return target.excess(self.world.size_at(multiplier), self.world.measure_at(multiplier))
 
     def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, GridScene]:
