@@ -191,9 +191,17 @@ def mean_alone(target: Target) -> Target:
 
 def means(target: Target) -> Target:
     """The target with those parts of the promise that are means over the views, which a first guess can tell."""
-    if not isinstance(target, Promised):
-        return target
-    return promised(target.target, [part for part in target.parts if isinstance(part, MeanSsim)])
+    return promised(mean_alone(target), _ssim_parts(target))
+
+
+def bounds_ssim(target: Target) -> bool:
+    """Whether SSIM is among the parts of the promise."""
+    return bool(_ssim_parts(target))
+
+
+def _ssim_parts(target: Target) -> list[Part]:
+    parts = target.parts if isinstance(target, Promised) else ()
+    return [part for part in parts if isinstance(part, MeanSsim)]
 
 
 def in_the_way(target: Target, size: int, measurement: Measurement | None) -> str:

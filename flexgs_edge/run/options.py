@@ -30,7 +30,6 @@ METHODS = ("best", "paper")
 EFFORT_WORDS = tuple(REFINE_STEPS)
 RETIRED_EFFORTS = {"thorough": "max"}
 """Words for `--effort` that are still accepted, and what they became."""
-"""`max` always distils. Only the method `best` knows it, and only for a `.fgs`."""
 SELECTS = ("test", "train")
 PROMISES = ("whole", "mean")
 NONE = "none"

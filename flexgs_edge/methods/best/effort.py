@@ -54,7 +54,7 @@ class Effort:
     Parameters
     ----------
     keep : float
-        Share of the Gaussians that stays in each round of pruning.
+        Share of the Gaussians that stays in each round of pruning: docs/results/tuning.md#keep
     refit_rounds : int
         Rounds of the refit on all coefficients before SH are put on their grid. One round on the constant follows. `fast`
         has none, because they cost more time there than their bytes are worth: docs/results/tuning.md#refit_rounds
@@ -65,7 +65,8 @@ class Effort:
     close : float
         The search ends when a candidate is no farther than this below the target (log of limit over loss).
     far : float
-        After `steps` candidates, the search goes on only if the best one is farther than this below the target.
+        After `steps` candidates, the search goes on only if the best one is farther than this below the target:
+        docs/results/tuning.md#far
     few : int
         Least scored poses, if there are as many: docs/results/tuning.md#few
     views : int
@@ -199,7 +200,7 @@ EFFORTS = {
         views=400,
         pixels=24,
         passes=12.0,
-        warming=(Warming(loss=0.8, size=2.2, share=1 / 3), Warming(loss=0.7, size=1.6, share=1 / 3)),
+        warming=(Warming(loss=0.8, size=1.35, share=1 / 3), Warming(loss=0.7, size=1.2, share=1 / 3)),
     ),
 }
 

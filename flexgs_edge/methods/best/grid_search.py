@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.goals.line import AIM, next_point
-from flexgs_edge.goals.promise import mean_alone, means
+from flexgs_edge.goals.promise import bounds_ssim
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
@@ -59,8 +59,8 @@ docs/results/tuning.md#decay"""
 FARTHER = 0.05
 """How much farther below the target we aim for each candidate in a row that missed it, from the second on."""
 PILOT, PILOT_POWER = 0.5, -0.33
-"""Steps of the descent that tells how much a candidate's will mend, as a share of these, and the power by which the loss
-changes with the steps. Behind descents between the rounds, no pilot is needed: docs/results/tuning.md#pilot"""
+"""A pilot is a shorter descent, which tells how much a candidate's will mend: its steps as a share of the candidate's, and the
+power by which the loss changes with the steps. After descents between the rounds there is none: docs/results/tuning.md#pilot"""
 PROBES = 4
 """Most probes between two candidates."""
 FARTHEST = 2.0
@@ -198,7 +198,7 @@ class GridSearch(MultiplierSearch[GridScene]):
                     self._drift = DECAY * (self._drift + steps[-1].excess - self._expected)
                 # If candidates keep missing, for whatever reason, aim farther each time.
                 offset += self._drift + FARTHER * max(misses(steps) - 1, 0)
-        elif not by_size and means(target) is not mean_alone(target):
+        elif not by_size and bounds_ssim(target):
             self._learn_lead(values_of(self._before_refit(multiplier), self.rounds.storage), target)
         low, high = bounds(steps, by_size)
         place = min(max(math.log(multiplier), low), high)
@@ -229,7 +229,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         return place
 
     def _piloted(self, multiplier: float, target: Target) -> float:
-        """Change of the excess by a descent, as a shorter one tells. Scenes differ in it by more than sizes may be off."""
+        """Expected change of the excess by a descent, learned from a pilot. Scenes differ too much for a constant."""
         kept, step_sizes = self._choice(multiplier)
         grid = self._distilled(kept, step_sizes, Schedule(math.ceil(PILOT * self.steps), self._rate(kept.planes)))
         found = target.excess(0, self.measure(values_of(grid, self.rounds.storage)))

@@ -17,7 +17,7 @@ import numpy as np
 
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
-from flexgs_edge.goals.promise import mean_alone, means
+from flexgs_edge.goals.promise import bounds_ssim, mean_alone, means
 from flexgs_edge.goals.steps import better, obstacle
 from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.methods.best.allocation import BitModel, choose, drop_bands, keep_one
@@ -44,7 +44,8 @@ MOST_ROUNDS = 24
 EXTRA_STEPS = 4
 """Most candidates beyond the effort's own, while none holds or the best is far below the target."""
 LEAD_FROM = 1.0
-"""Rounds of pruning measure SSIM once, from this far below their end on, in logs of the loss. Before, it means little."""
+"""Rounds of pruning measure SSIM once, as soon as the log of the loss is this near to their end. Where less is lost, SSIM says
+little about the end: docs/results/tuning.md#lead"""
 
 
 class MultiplierSearch(ABC, Generic[Product]):
@@ -164,7 +165,7 @@ class MultiplierSearch(ABC, Generic[Product]):
                     break
             elif len(self.rounds.snapshots) > 1:
                 excess, end = self._guess(last.planes, target), math.log(part)
-                if means(target) is not mean_alone(target) and self._lead == 0.0 and excess >= end - LEAD_FROM:
+                if bounds_ssim(target) and self._lead == 0.0 and excess >= end - LEAD_FROM:
                     self._learn_lead(last.planes, target)
                     excess += self._lead
                 if excess >= end:
@@ -174,10 +175,10 @@ class MultiplierSearch(ABC, Generic[Product]):
             self.rounds.descend(self.effort.keep)
 
     def _guess(self, planes: dict[str, np.ndarray], target: Target) -> float:
-        """Excess of planes by a target for quality, from its mean alone.
+        """Excess of planes by a target for quality, guessed from the mean drop.
 
-        Where SSIM is the nearer bound, it is so by a share that changes little with compression or by a refit. We measure
-        it once: docs/results/tuning.md#lead
+        Where SSIM is nearer to its bound, we add by how much. That changes little with compression or by a refit, so it is not
+        measured each time: docs/results/tuning.md#lead
         """
         return mean_alone(target).excess(0, self.measure(planes, estimate=True)) + self._lead
 
