@@ -20,6 +20,7 @@ from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
+from flexgs_edge.methods.best.refit.prices import bit_prices
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.packed.quantize import quantize_scene
@@ -37,6 +38,8 @@ BLOCKS = 5
 """Work-items of the serial passes: enough that some have no splats, and no divisor of the rows."""
 PAIRS = 1 << 12
 """Room for pairs, where a scene is drawn in one batch: the self-test clears and compares all of it."""
+WORTH = 0.01
+"""Squared error that a bit is worth, for descents."""
 STEPS = StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04, 0.05, 0.06, 0.07))
 
 
@@ -246,6 +249,7 @@ def for_degree(backend: Any, budget: MemoryBudget, degree: int) -> None:
         for put in (False, True):
             if put:
                 descent.put_on(STEPS)
+                descent.price(bit_prices(planes, degrees, STEPS, WORTH))
             for _ in range(2):
                 descent.step(view, target, {"means": 1e-2, **FIELD_RATES})
             descent.follow(0.5)

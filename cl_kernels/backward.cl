@@ -13,6 +13,15 @@
 #define AT_DC 11
 #define AT_SH 14
 
+inline UW degrees_at(__global const uint *degrees, size_t i)
+{
+#if W == 1
+  return degrees[i];
+#else
+  return CAT(vload, W)(0, degrees + i);
+#endif
+}
+
 // Stores into the rows that have a gradient; the other rows stay as they are.
 #define KEEP(plane, value)                                         \
   {                                                                \
@@ -78,12 +87,7 @@ __kernel void project_backward(
   const uint bands = (degree + 1) * (degree + 1) - 1;
   FW tx = (FW)0.0f, ty = (FW)0.0f, tz = (FW)0.0f;
   if (degree) {
-    UW own;
-#if W == 1
-    own = degrees[i];
-#else
-    own = CAT(vload, W)(0, degrees + i);
-#endif
+    const UW own = degrees_at(degrees, i);
 #define ADD_GRADIENT(k, value)                                                                             \
     {                                                                                                      \
       const uint level = (k) < 3 ? 1 : (k) < 8 ? 2 : (k) < 15 ? 3 : 4;                                     \
@@ -193,6 +197,59 @@ __kernel void project_backward(
   KEEP(0, dot3(CAM(0), CAM(3), CAM(6), cx, cy, cz) + tx);
   KEEP(1, dot3(CAM(1), CAM(4), CAM(7), cx, cy, cz) + ty);
   KEEP(2, dot3(CAM(2), CAM(5), CAM(8), cx, cy, cz) + tz);
+}
+
+// What a bit-priced value adds to its gradient: the price times its sign, less within a width of zero.
+inline FW pull(FW away, float price, float width) { return (FW)price * away / (fabs(away) + (FW)width); }
+
+#define ADD(plane, value)                                                                            \
+  {                                                                                                  \
+    __global float *at = gradient + (size_t)(plane) * s + i;                                         \
+    const FW old = LOADF(at, 0);                                                                     \
+    STOREF(pick(moves, old + (value), old), at, 0);                                                  \
+  }
+
+// Adds to the gradients of the touched rows what the bits of their values cost, but for positions. Values then move towards those
+// that are frequent, which take few bits, unless pictures need them where they are.
+__kernel void price_bits(
+    const uint stride,
+    const uint degree,
+    __global const float *prices,          // [33] price and width of scale, rotation, opacity, then of luma and of chroma of the
+                                           // constant and of every SH degree; centres of 3 scales, opacity, Y, Co, Cg
+    __global const uint *degrees,          // [stride] SH degree of each row: no gradient above it
+    __global const float *touched,         // [stride]
+    __global const float *values,          // [14 + 3 K, stride]
+    __global float *gradient)              // [14 + 3 K, stride]
+{
+  const size_t i = get_global_id(0) * W, s = stride;
+  const IW seen = MASK(LOADF(touched, i) > (FW)0.0f);
+  if (!ANY(seen)) return;
+  const UW own_degree = degrees_at(degrees, i);
+  IW moves = seen;
+#define VALUE(plane) LOADF(values, (size_t)(plane) * s + i)
+  for (int k = 0; k < 3; ++k) {
+    ADD(AT_SCALE + k, pull(VALUE(AT_SCALE + k) - (FW)prices[26 + k], prices[0], prices[1]));
+    ADD(AT_QUAT + 1 + k, pull(VALUE(AT_QUAT + 1 + k), prices[2], prices[3]));
+  }
+  ADD(AT_LOGIT, pull(VALUE(AT_LOGIT) - (FW)prices[29], prices[4], prices[5]));
+  const uint bands = (degree + 1) * (degree + 1) - 1;
+  for (uint k = 0; k <= bands; ++k) {
+    const uint level = k == 0 ? 0 : k < 4 ? 1 : k < 9 ? 2 : k < 16 ? 3 : 4;
+    moves = seen & MASK(own_degree >= (UW)level);
+    __global const float *own = prices + 6 + 4 * level;
+    const size_t from = k ? AT_SH + k - 1 : AT_DC, apart = k ? bands : 1;
+    const FW red = VALUE(from), green = VALUE(from + apart), blue = VALUE(from + 2 * apart), both = red + blue;
+    const FW luma = (both + (FW)2.0f * green) * (FW)0.25f - (FW)(k ? 0.0f : prices[30]);
+    const FW orange = red - blue - (FW)(k ? 0.0f : prices[31]);
+    const FW moss = ((FW)2.0f * green - both) * (FW)0.5f - (FW)(k ? 0.0f : prices[32]);
+    const FW by_luma = pull(luma, own[0], own[1]) * (FW)0.25f;
+    const FW by_orange = pull(orange, own[2], own[3]), by_moss = pull(moss, own[2], own[3]) * (FW)0.5f;
+    const FW rest = by_luma - by_moss;
+    ADD(from, rest + by_orange);
+    ADD(from + apart, (FW)2.0f * (by_luma + by_moss));
+    ADD(from + 2 * apart, rest - by_orange);
+  }
+#undef VALUE
 }
 
 // One step of Adam (Kingma & Ba 2015) for the rows that a view has touched; other rows keep their running means.

@@ -74,6 +74,7 @@ KERNELS: dict[str, KernelSpec] = {
     "dssim_columns_back": KernelSpec("similarity.cl", "uuuuubbb", "rows"),
     "dssim_residual": KernelSpec("similarity.cl", "uuufubbbbb", "rows"),
     "project_backward": KernelSpec("backward.cl", "uuuuibbbbbbbbbbb", "rows"),
+    "price_bits": KernelSpec("backward.cl", "uubbbbb", "rows"),
     "adam": KernelSpec("backward.cl", "uuffbbbbbbb", "rows"),
     "follow": KernelSpec("backward.cl", "uufbb", "rows"),
     "snap": KernelSpec("backward.cl", "uubbbbbbbb", "rows"),

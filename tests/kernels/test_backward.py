@@ -13,8 +13,10 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
+from flexgs_edge.kernels import twins
 from flexgs_edge.methods.best.refit.descent import ORDER, Descent
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
+from flexgs_edge.methods.best.refit.prices import RATE, WIDTH, bit_prices
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from kernel_fixtures import ALL_FORMS, FORMS, PairedBackend, large_budget, open_form, same_bits
@@ -117,6 +119,8 @@ def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: 
     with Descent(renderer, planes, degrees, np.zeros(3), cameras[0], 0.01) as descent:
         for k, steps in enumerate((None, STEPS)):
             descent.put_on(steps)
+            if steps:
+                descent.price(bit_prices(planes, degrees, steps, 0.01))
             descent.step(cameras[k], padded_target(cameras[k], k), RATES)
             descent.follow(1.0)
             descent.step(cameras[k], padded_target(cameras[k], k), RATES)
@@ -127,12 +131,71 @@ def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: 
     assert not same_bits(moved["means"], unaveraged["means"])
     renderer.release()
     assert paired.launched["blend_backward"] > 3 and paired.launched["adam"] == 4 * 3
+    assert paired.launched["price_bits"] == 2 * 3
     for name, before in planes.items():
         assert not same_bits(moved[name], before) and same_bits(moved[name][:, 50], before[:, 50]), name
     for degree in range(1, 5):
         lower = np.flatnonzero(degrees < degree)
         band = [c * 24 + k for c in range(3) for k in range(degree**2 - 1, (degree + 1) ** 2 - 1)]
         assert same_bits(moved["sh_rest"][band][:, lower], planes["sh_rest"][band][:, lower])
+
+
+def expected_bits(planes: Planes, degrees: np.ndarray, prices: np.ndarray) -> float:
+    """What the bits of a scene cost, by closed form: the integral of x / (|x| + w) is |x| - w ln(1 + |x| / w)."""
+
+    def cost(away: np.ndarray, place: int) -> float:
+        price, width = prices[place : place + 2].astype(np.float64)
+        return float((price * (abs(away) - width * np.log1p(abs(away) / width))).sum())
+
+    centres = prices[26:].astype(np.float64)[:, None]
+    total = cost(planes["log_scales"] - centres[:3], 0) + cost(planes["quats"][1:], 2)
+    total += cost(planes["opacity_logits"] - centres[3:4], 4)
+    rest = planes["sh_rest"].reshape(3, -1, len(degrees))
+    for level in range(5):
+        band = rest[:, level**2 - 1 : (level + 1) ** 2 - 1] if level else planes["sh_dc"][:, None]
+        red, green, blue = (values[:, degrees >= level] for values in band)
+        y, co, cg = centres[4:] if level == 0 else np.zeros((3, 1))
+        total += cost((red + 2 * green + blue) / 4 - y, 6 + 4 * level)
+        total += cost(red - blue - co, 8 + 4 * level) + cost(green - (red + blue) / 2 - cg, 8 + 4 * level)
+    return total
+
+
+def test_prices_are_slopes_of_bits() -> None:
+    """What the twin adds to a gradient is the derivative of what bits cost, in float64, for every value of a row."""
+    degrees, count = np.array([4, 4, 2, 0]), 4
+    planes = planes_of(count, 31, 4)
+    values = {name: planes[name].astype(np.float64) for name in ORDER}
+    prices = bit_prices(planes, degrees, STEPS, 0.01)
+    stacked = np.concatenate([planes[name] for name in ORDER])
+    gradient = np.ones_like(stacked)
+    twins.price_bits((count,), count, 4, prices, degrees, np.array([1, 1, 0, 1], np.float32), stacked, gradient)
+    assert (gradient[:, 2] == 1).all() and (gradient[:3] == 1).all()
+    at = 0
+    for name in ORDER:
+        for plane in range(len(values[name])):
+            for row in (0, 1):
+                ends = []
+                for change in (CHANGE, -CHANGE):
+                    moved = {**values, name: values[name].copy()}
+                    moved[name][plane, row] += change
+                    ends.append(expected_bits(moved, degrees, prices))
+                slope = (ends[0] - ends[1]) / (2 * CHANGE)
+                assert abs(gradient[at + plane, row] - 1 - slope) < 1e-4 * max(1.0, abs(slope)), (name, plane, row)
+        at += len(values[name])
+
+
+def test_a_bit_away_from_the_centre_costs_its_worth() -> None:
+    """Of a Laplace distribution, a value is a bit dearer for each b ln 2 that it lies farther away."""
+    planes, degrees = planes_of(4000, 32, 1), np.ones(4000, int)
+    prices = bit_prices(planes, degrees, replace(STEPS, sh=STEPS.sh[:1]), 0.25)
+    logits = planes["opacity_logits"][0].astype(np.float64)
+    assert prices[29] == np.float32(np.median(logits)) and prices[5] == np.float32(WIDTH * STEPS.opacity)
+    assert np.isclose(prices[4] * np.abs(logits - np.median(logits)).mean() * np.log(2), RATE * 0.25)
+    # Degrees that the grid does not have cost nothing, and values that are all alike no more than a quarter of a step says.
+    assert (prices[14:26] == 0).all()
+    alike = {name: np.full_like(values, 0.5) for name, values in planes.items()}
+    flat = bit_prices(alike, degrees * 0, replace(STEPS, sh=STEPS.sh[:1]), 0.25)
+    assert np.isclose(flat[0], RATE * 0.25 / (np.log(2) * STEPS.scale / 4)) and np.isfinite(flat).all()
 
 
 def test_views_are_drawn_from_what_a_file_gives_back() -> None:

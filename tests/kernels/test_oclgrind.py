@@ -30,6 +30,7 @@ from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
+from flexgs_edge.methods.best.refit.prices import bit_prices
 from flexgs_edge.quality.flip import flips
 from flexgs_edge.quality.ssim import ssims
 from flexgs_edge.render.fit import Fit
@@ -120,7 +121,9 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
     yield planes["sh_dc"]
     yield planes["sh_rest"]
     with Descent(drawer, planes, np.full(source.count, 4), source.origin, camera, 0.01) as descent:
-        descent.put_on(StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04,) * 4))
+        steps = StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04,) * 4)
+        descent.put_on(steps)
+        descent.price(bit_prices(planes, np.full(source.count, 4), steps, 0.01))
         descent.step(camera, references[0], {"means": 1e-2, **FIELD_RATES})
         descent.follow(0.5)
         yield from descent.planes().values()

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from flexgs_edge.kernels.twins.activate import activate
-from flexgs_edge.kernels.twins.backward import adam, follow, project_backward, snap
+from flexgs_edge.kernels.twins.backward import adam, follow, price_bits, project_backward, snap
 from flexgs_edge.kernels.twins.blend import (
     blend,
     blend_backward,
@@ -69,6 +69,7 @@ TWINS: dict[str, Callable[..., None]] = {
     "add_costs": add_costs,
     "sh_residual": sh_residual,
     "project_backward": project_backward,
+    "price_bits": price_bits,
     "adam": adam,
     "follow": follow,
     "snap": snap,

@@ -216,6 +216,50 @@ def _geometry(
     return np.stack([*centre, *scales, *rotation])
 
 
+def _pull(away: np.ndarray, price: np.float32, width: np.float32) -> np.ndarray:
+    pulled: np.ndarray = price * away / (np.abs(away) + width)
+    return pulled
+
+
+def price_bits(
+    size: tuple[int, ...],
+    stride: int,
+    degree: int,
+    prices: np.ndarray,
+    degrees: np.ndarray,
+    touched: np.ndarray,
+    values: np.ndarray,
+    gradient: np.ndarray,
+) -> None:
+    """Add to the gradients ([14 + 3 K, stride]) of the touched rows what the bits of their values cost.
+
+    `prices` is the record of `flexgs_edge.methods.best.refit.prices.bit_prices`.
+    """
+    rows = np.flatnonzero(touched > 0)
+    own = values[:, rows]
+    for k in range(3):
+        gradient[AT_SCALE + k, rows] += _pull(own[AT_SCALE + k] - prices[26 + k], *prices[:2])
+        gradient[AT_QUAT + 1 + k, rows] += _pull(own[AT_QUAT + 1 + k], *prices[2:4])
+    gradient[AT_LOGIT, rows] += _pull(own[AT_LOGIT] - prices[29], *prices[4:6])
+    bands = (degree + 1) ** 2 - 1
+    for k in range(bands + 1):
+        level = int(np.searchsorted((0, 3, 8, 15), k))
+        some, at = degrees[rows] >= level, 6 + 4 * level
+        centres = np.zeros(3, np.float32) if k else prices[30:33]
+        places = [AT_SH + k - 1 + channel * bands if k else AT_DC + channel for channel in range(3)]
+        red, green, blue = own[:, some][places]
+        both = red + blue
+        luma = (both + f32(2) * green) * f32(0.25) - centres[0]
+        orange = red - blue - centres[1]
+        moss = (f32(2) * green - both) * f32(0.5) - centres[2]
+        by_luma = _pull(luma, *prices[at : at + 2]) * f32(0.25)
+        by_orange, by_moss = _pull(orange, *prices[at + 2 : at + 4]), _pull(moss, *prices[at + 2 : at + 4]) * f32(0.5)
+        rest = by_luma - by_moss
+        gradient[places[0], rows[some]] += rest + by_orange
+        gradient[places[1], rows[some]] += f32(2) * (by_luma + by_moss)
+        gradient[places[2], rows[some]] += rest - by_orange
+
+
 def adam(
     size: tuple[int, ...],
     stride: int,

@@ -231,7 +231,8 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _piloted(self, multiplier: float, target: Target) -> float:
         """Expected change of the excess by a descent, learned from a pilot. Scenes differ too much for a constant."""
         kept, step_sizes = self._choice(multiplier)
-        grid = self._distilled(kept, step_sizes, Schedule(math.ceil(PILOT * self.steps), self._rate(kept.planes)))
+        schedule = Schedule(math.ceil(PILOT * self.steps), self._rate(kept.planes), multiplier=multiplier)
+        grid = self._distilled(kept, step_sizes, schedule)
         found = target.excess(0, self.measure(values_of(grid, self.rounds.storage)))
         return found - self._probe(multiplier, target) - PILOT_POWER * math.log(PILOT)
 
@@ -265,7 +266,8 @@ class GridSearch(MultiplierSearch[GridScene]):
         started = time.perf_counter()
         kept, step_sizes = self._choice(multiplier)
         if self.steps:
-            grid = self._distilled(kept, step_sizes, Schedule(self.steps, self._rate(kept.planes)))
+            schedule = Schedule(self.steps, self._rate(kept.planes), multiplier=multiplier)
+            grid = self._distilled(kept, step_sizes, schedule)
         else:
             grid = self._finish(kept, step_sizes)
         grid = lowered(grid, self.rounds.storage)

@@ -12,6 +12,7 @@ import pytest
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.generated import poses_between
+from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.grid.step_sizes import StepSizes
@@ -134,11 +135,24 @@ def test_steps_on_the_grid_repair_it(workshop: Workshop) -> None:
     assert workshop.fidelity(workshop.rounded(aware)) > workshop.fidelity(workshop.rounded(blind)) + 0.2
 
 
+def test_bits_that_cost_are_saved(workshop: Workshop) -> None:
+    """With a price on bits, the file is smaller and the error larger; without a grid there are no bits."""
+    free, priced = (workshop.distil(180, STEPS, multiplier=price) for price in (0.0, 0.05))
+    sizes = [
+        len(b"".join(encode_grid(to_grid(planes, workshop.degrees, STEPS, np.zeros(3))[0]).streams()))
+        for planes in (free, priced)
+    ]
+    assert sizes[1] < 0.97 * sizes[0], sizes
+    assert workshop.fidelity(workshop.rounded(priced)) < workshop.fidelity(workshop.rounded(free))
+    off, on = (workshop.distil(5, multiplier=price) for price in (0.0, 0.05))
+    assert all(same_bits(off[name], on[name]) for name in off)
+
+
 def test_every_run_and_width_gives_the_same_bits(workshop: Workshop) -> None:
-    first = workshop.distil(5, STEPS)
+    first = workshop.distil(5, STEPS, multiplier=0.05)
     for form in ("w16", "w4", "numpy"):
         other = Workshop(form)
-        again = other.distil(5, STEPS)
+        again = other.distil(5, STEPS, multiplier=0.05)
         other.close()
         assert all(same_bits(first[name], again[name]) for name in first), form
 

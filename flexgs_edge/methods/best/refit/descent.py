@@ -11,6 +11,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import LANES
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.methods.best.refit.prices import PRICES
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import GRADIENT_SUMS, sum_bytes
@@ -83,6 +84,7 @@ class Descent:
         self.count, self.widths = source.count, widths(source.sh_degree)
         self._parts: list[_Part] = []
         self._arrays: list[Any] = []
+        self._priced = False
         # Planes of the last chunk with SH and of the last without are padded.
         size = descent_bytes(source.sh_degree) * (self.count + 2 * LANES)
         self._scene = renderer.load(source, -(-size // max(self.count, 1)), references=True, structure=structure > 0)
@@ -93,7 +95,8 @@ class Descent:
                     f"distilling {source.count} Gaussians keeps all of them in memory at once with what their steps remember "
                     f"({format_mib(size)}), more than the memory limit leaves: use a larger --memory-limit, or --distil 0"
                 )
-            self._rates, self._steps = (self._array((n,)) for n in (sum(self.widths.values()), GRID_VALUES))
+            lengths = sum(self.widths.values()), GRID_VALUES, PRICES
+            self._rates, self._steps, self._prices = (self._array((n,)) for n in lengths)
             for chunk in self._scene.chunks():
                 self._parts.append(_Part(self._scene, chunk, planes, degrees))
             self.put_on(None)
@@ -111,6 +114,11 @@ class Descent:
         for part in self._parts:
             part.snap(self._steps)
 
+    def price(self, prices: np.ndarray) -> None:
+        """From now on, steps also go down what bits cost (record of `bit_prices`)."""
+        self.backend.write(self._prices, prices)
+        self._priced = True
+
     def differentiate(self, camera: Camera, target: np.ndarray) -> None:
         """Compute gradients of the loss of a view against `target` ([3, H, W] f16, as for `Renderer.residual_sums`)."""
         sums = self.renderer.gradient_sums(self._scene, camera, target, self.structure)
@@ -123,6 +131,8 @@ class Descent:
         per_plane = np.concatenate([np.full(width, rates[name], np.float32) for name, width in self.widths.items()])
         self.backend.write(self._rates, per_plane)
         for part in self._parts:
+            if self._priced:
+                part.price(self._prices)
             part.step(self._rates)
             part.snap(self._steps)
 
@@ -235,6 +245,12 @@ class _Part:
             renderer.camera_array, chunk.means, *self.stored, chunk.sh_rest, self.degrees, renderer.records_array, sums,
             self.touched, self.gradient,
         )  # fmt: skip
+
+    def price(self, prices: Any) -> None:
+        stride, degree = self.chunk.stride, self.chunk.degree
+        self.backend.launch(
+            "price_bits", (stride,), stride, degree, prices, self.degrees, self.touched, self.values, self.gradient
+        )
 
     def step(self, rates: Any) -> None:
         stride = self.chunk.stride

@@ -13,6 +13,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.methods.best.refit.descent import Descent
+from flexgs_edge.methods.best.refit.prices import bit_prices
 from flexgs_edge.scene.rotations import canonical_axes
 from flexgs_edge.views.original import Original
 
@@ -56,6 +57,8 @@ class Schedule:
         Rates at the end as a share of those at the beginning.
     on_grid, holding : float
         Share of the steps before values are put on their grids for drawing, and share before geometry is held there.
+    multiplier : float
+        Squared error over all scored poses that a bit on the grid is worth. 0 (default): bits cost nothing.
     """
 
     iterations: int
@@ -63,6 +66,7 @@ class Schedule:
     last: float = LAST
     on_grid: float = ON_GRID
     holding: float = HOLDING
+    multiplier: float = 0.0
 
     def parts(self, grid: bool) -> tuple[range, range, range]:
         """Steps off the grid, on it, and on it with geometry held. Without a grid, all steps are off it."""
@@ -143,6 +147,9 @@ def distil(
     rows = np.argsort(degrees == 0, kind="stable")
     ordered = {name: np.ascontiguousarray(values[:, rows]) for name, values in ordered.items()}
     with Descent(original.bench.renderer, ordered, degrees[rows], original.origin, largest, structure) as descent:
+        if step_sizes is not None and schedule.multiplier > 0 and len(degrees):
+            worth = schedule.multiplier / len(original.cameras)
+            descent.price(bit_prices(ordered, degrees[rows], step_sizes, worth))
         order = schedule.order(len(cameras), original.turns)
         parts = schedule.parts(step_sizes is not None)
         for place, part in enumerate(parts):
