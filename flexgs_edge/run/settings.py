@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from flexgs_edge._version import __version__
-from flexgs_edge.goals.steps import SearchResult
-from flexgs_edge.goals.target import Measurement
+from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import SearchResult, Step
+from flexgs_edge.goals.target import Covered, Measurement
 from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
+
+MARGIN = 16
+"""Bytes of a header beside the settings that may take more digits once they are in it."""
 
 
 def make_settings(
@@ -58,6 +63,15 @@ def make_settings(
         "extent": options.extent,
         "antialiased": options.antialiased,
     }
+
+
+def settings_room(run: Run[CompressOptions]) -> int:
+    """Most bytes that the settings of a searched file take in its header, before the search has found anything."""
+    widest = -99.999
+    quality = Measurement(widest, widest, widest, covered=Covered(widest, widest))
+    step = Step(Choice(prune=999, sh=1), 0, quality, 0.0, "multiplier", 0.0)
+    settings = {**make_settings(run, SearchResult(step, False, ())), "prune_rate": 0.999, "sh_rate": 0.999}
+    return len(json.dumps(settings)) + MARGIN
 
 
 def _means(found: Measurement) -> dict[str, float | None]:

@@ -200,6 +200,7 @@ EFFORTS = {
         views=400,
         pixels=24,
         passes=12.0,
+        far=0.06,
         warming=(Warming(loss=0.8, size=1.35, share=1 / 3), Warming(loss=0.7, size=1.2, share=1 / 3)),
     ),
 }

@@ -16,7 +16,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import coding_device
 
 SETTINGS_MOST = 1536
-"""Most bytes of the settings in the header. The search counts them before they are known."""
+"""Most bytes of the settings of any file in its header."""
 
 
 class GridCoder:
@@ -26,10 +26,12 @@ class GridCoder:
     ----------
     renderer : Renderer
         Its device codes if it can.
+    settings_room : int
+        Most bytes of the settings in the header. The search counts them before they are known.
     """
 
-    def __init__(self, renderer: Renderer) -> None:
-        self._renderer = renderer
+    def __init__(self, renderer: Renderer, settings_room: int = SETTINGS_MOST) -> None:
+        self._renderer, self._settings_room = renderer, settings_room
         self._last: tuple[GridScene, Encoded] | None = None
 
     def _encode(self, grid: GridScene) -> Encoded:
@@ -52,7 +54,7 @@ class GridCoder:
     def size(self, grid: GridScene, settings: Mapping[str, Any] | None = None) -> int:
         """Bytes of the file that `write` makes. A search does not know the `settings` yet: without them it is an upper bound."""
         size = coded_size(grid, settings or {}, encoded=self.encoded(grid))
-        return size + SETTINGS_MOST if settings is None else size
+        return size + self._settings_room if settings is None else size
 
     def write(self, path: str | os.PathLike[str], grid: GridScene, settings: Mapping[str, Any]) -> int:
         """See `write_grid`."""

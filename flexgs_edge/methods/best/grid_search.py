@@ -27,6 +27,7 @@ from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOP
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.kept import Kept, Refitted
+from flexgs_edge.methods.best.landing import land
 from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART, Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import Schedule, distil
@@ -42,6 +43,10 @@ DRIFT = -0.12
 DISTILLED, DISTILLED_POWER = 0.46, -0.2
 """Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
 the power by which it changes with the steps: docs/results/tuning.md#distilled"""
+PRICED = -0.035
+"""Log of the size after a descent over that before it: prices on bits make files smaller. docs/results/tuning.md#landing"""
+ABOVE = 0.02
+"""How far above a size we aim, since results that are too large can be landed: docs/results/tuning.md#landing"""
 WARMED = 1.35
 """Factor on it if descents between the rounds have mended a part already: docs/results/tuning.md#distilled"""
 PRUNED_DISTILLED = 1.6
@@ -61,6 +66,8 @@ FARTHER = 0.05
 PILOT, PILOT_POWER = 0.5, -0.33
 """A pilot is a shorter descent, which tells how much a candidate's will mend: its steps as a share of the candidate's, and the
 power by which the loss changes with the steps. After descents between the rounds there is none: docs/results/tuning.md#pilot"""
+ALL_LEFT = 0.97
+"""A candidate with this share of the Gaussians that there are gains hardly anything by the others."""
 PROBES = 4
 """Most probes between two candidates."""
 FARTHEST = 2.0
@@ -115,6 +122,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         # Without a refit of SH, a candidate takes nothing over from the one before. Descents begin anew as well.
         self._drift = DRIFT if effort.refit_rounds and not steps else 0.0
         self._expected = 0.0
+        self._warming = effort.warming if steps else ()
 
     def run(self, target: Target, best_effort: bool = False) -> RateResult[GridScene]:
         """As `MultiplierSearch.run`. Where no descent reaches a quality, colours are refitted instead.
@@ -123,19 +131,32 @@ class GridSearch(MultiplierSearch[GridScene]):
         """
         if not (self.steps and self.refit) or target.limit_bytes is not None:
             return super().run(target, best_effort)
-        descended = super().run(target, best_effort=True)
-        if descended.reached:
-            return descended
+        found = super().run(target, best_effort=True)
+        if not found.reached and self._used_up(found.chosen):
+            LOG.info("the rounds before the descents left too few Gaussians: descending without these rounds")
+            self._warming, self._begin, self._slopes = (), 0, None
+            found = self._also(found, super().run(target, best_effort=True), target)
+        if found.reached:
+            return found
         LOG.info("no descent reaches the target: colours are refitted instead")
-        self.steps, self.pruned_part, self.keeps_best, self._begin = 0, PRUNED_PART, False, 0
+        self._warming, self._begin = (), 0
+        self.steps, self.pruned_part, self.keeps_best = 0, PRUNED_PART, False
         self._refitted, self._slopes = None, None
         self._drift = DRIFT if self.effort.refit_rounds else 0.0
-        refitted = super().run(target, best_effort)
-        best = refitted if better(refitted.chosen, descended.chosen, target) else descended
-        return replace(best, steps=(*descended.steps, *refitted.steps))
+        return self._also(found, super().run(target, best_effort), target)
+
+    @staticmethod
+    def _also(one: RateResult[GridScene], other: RateResult[GridScene], target: Target) -> RateResult[GridScene]:
+        """The better one of two results, with the candidates of both."""
+        best = other if better(other.chosen, one.chosen, target) else one
+        return replace(best, steps=(*one.steps, *other.steps))
+
+    def _used_up(self, missed: Candidate) -> bool:
+        """Whether a candidate has nearly all Gaussians that the descents between the rounds have left."""
+        return self._begin > 0 and missed.count >= ALL_LEFT * self.rounds.snapshots[self._begin].count
 
     def _start(self, target: Target) -> float:
-        for warming in self.effort.warming if self.steps else ():
+        for warming in self._warming:
             self._prune(target, warming.loss, warming.size)
             self._warm(warming.share)
         return super()._start(target)
@@ -190,6 +211,9 @@ class GridSearch(MultiplierSearch[GridScene]):
         by_size = target.limit_bytes is not None
         slope = SIZE_SLOPE if by_size else SLOPE
         offset = math.log(self._refitted_part()) if self.refit and not by_size else 0.0
+        if by_size:
+            # A result that is a little too large can be landed, one that is too small cannot.
+            offset = (PRICED if self.steps else 0.0) - ABOVE
         if steps:
             offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
             if self.refit and not by_size:
@@ -232,7 +256,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         """Expected change of the excess by a descent, learned from a pilot. Scenes differ too much for a constant."""
         kept, step_sizes = self._choice(multiplier)
         schedule = Schedule(math.ceil(PILOT * self.steps), self._rate(kept.planes), multiplier=multiplier)
-        grid = self._distilled(kept, step_sizes, schedule)
+        grid, _ = self._distilled(kept, step_sizes, schedule)
         found = target.excess(0, self.measure(values_of(grid, self.rounds.storage)))
         return found - self._probe(multiplier, target) - PILOT_POWER * math.log(PILOT)
 
@@ -267,28 +291,49 @@ class GridSearch(MultiplierSearch[GridScene]):
         kept, step_sizes = self._choice(multiplier)
         if self.steps:
             schedule = Schedule(self.steps, self._rate(kept.planes), multiplier=multiplier)
-            grid = self._distilled(kept, step_sizes, schedule)
+            grid, order = self._distilled(kept, step_sizes, schedule)
         else:
-            grid = self._finish(kept, step_sizes)
-        grid = lowered(grid, self.rounds.storage)
+            grid, order = self._finish(kept, step_sizes)
+        storage = self.rounds.storage
+        grid = lowered(grid, storage)
         size = self.size_of(grid)
+        if target.limit_bytes is not None:
+            grid, size = self._landed(grid, kept.removal[order], size, target.limit_bytes)
         measurement = self.measure(values_of(grid, self.rounds.storage))
         excess = target.excess(size, measurement)
         seconds = time.perf_counter() - started
-        found = Candidate(multiplier, len(kept.rows), grid.sh_count, size, measurement, excess, seconds, kept.left_out)
+        found = Candidate(multiplier, grid.count, grid.sh_count, size, measurement, excess, seconds, kept.left_out)
         return found, grid
 
-    def _distilled(self, kept: Kept, step_sizes: StepSizes, schedule: Schedule) -> GridScene:
-        """Move all values towards the references, put them on the grid, and refit the constant colour."""
+    def _distilled(self, kept: Kept, step_sizes: StepSizes, schedule: Schedule) -> tuple[GridScene, np.ndarray]:
+        """Move all values towards the references, put them on the grid, and refit the constant colour.
+
+        Also returns the row of `kept` of each row of the grid.
+        """
         moved = self._distil(kept, schedule, step_sizes)
         grid, order = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
-        if not self.refit:
-            return grid
-        moved = self._refit_colours(values_of(grid), kept.degrees[order], 1, bands=False)
-        return recolour(grid, moved["sh_dc"], moved["sh_rest"])
+        return self._with_constants(grid) if self.refit else grid, order
 
-    def _finish(self, kept: Kept, step_sizes: StepSizes) -> GridScene:
-        """Put geometry on its grid, refit all colours, put SH on their grid, refit the constant colour, put it on its grid."""
+    def _with_constants(self, grid: GridScene, storage: Storage = IN_MEMORY) -> GridScene:
+        """The grid with its constant colours refitted once."""
+        moved = self._refit_colours(values_of(grid, storage), grid.sh_degrees, 1, bands=False)
+        return recolour(grid, moved["sh_dc"], moved["sh_rest"], storage)
+
+    def _landed(self, grid: GridScene, removal: np.ndarray, size: int, limit: int) -> tuple[GridScene, int]:
+        """`land`, and then the constant colours, which had been fitted to what is gone, once more."""
+        storage = self.rounds.storage
+        landed, less = land(grid, removal, size, limit, self.size_of, storage)
+        if landed is grid or not self.refit:
+            return landed, less
+        mended = self._with_constants(landed, storage)
+        final = self.size_of(mended)
+        return (mended, final) if final <= limit else (landed, less)
+
+    def _finish(self, kept: Kept, step_sizes: StepSizes) -> tuple[GridScene, np.ndarray]:
+        """Put geometry on its grid, refit all colours, put SH on their grid, refit the constant colour, put it on its grid.
+
+        Also returns the row of `kept` of each row of the grid.
+        """
         storage, planes = self.rounds.storage, kept.planes
         fine = replace(step_sizes, dc=step_sizes.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in step_sizes.sh))
         fine = holdable(fine, planes)
@@ -303,4 +348,4 @@ class GridSearch(MultiplierSearch[GridScene]):
             coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], storage), storage)
             moved = self._refit_colours(coarse, degrees, 1, bands=False)
         final = replace(grid.step_sizes, dc=step_sizes.dc, sh=step_sizes.sh[: grid.sh_degree])
-        return recolour(replace(grid, step_sizes=final), moved["sh_dc"], moved["sh_rest"], storage)
+        return recolour(replace(grid, step_sizes=final), moved["sh_dc"], moved["sh_rest"], storage), order

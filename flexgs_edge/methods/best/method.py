@@ -45,7 +45,7 @@ from flexgs_edge.run.judges import Judges
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
-from flexgs_edge.run.settings import make_settings
+from flexgs_edge.run.settings import make_settings, settings_room
 from flexgs_edge.scene.check import alive, invisible
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.source import MemorySource, read_all
@@ -95,7 +95,7 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
             with run.clock.stage("fingerprint"):
                 kept = open_checkpoint(run, bench.renderer, poses.cameras, folder)
         LOG.info("searching for %s", run.target.describe())
-        coder = GridCoder(bench.renderer)
+        coder = GridCoder(bench.renderer, settings_room(run))
         with run.clock.stage("search"):
             found = kept_as_it_is(run, bench, coder, judges.decide)
         grid, search = found or search_best(

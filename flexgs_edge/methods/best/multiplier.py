@@ -87,6 +87,10 @@ class MultiplierSearch(ABC, Generic[Product]):
         """Improve the guess `multiplier` for the next candidate, in less time than a candidate takes."""
         return multiplier
 
+    def _used_up(self, missed: Candidate) -> bool:
+        """Whether no other multiplier could do better than this candidate, which missed the target."""
+        return False
+
     def discard(self, product: Product) -> None:
         """Free a product that is not the best any more."""
         return
@@ -138,7 +142,7 @@ class MultiplierSearch(ABC, Generic[Product]):
                 self.discard(product)
             close = best[0].holds and best[0].excess > -self.effort.close
             enough = best[0].holds and best[0].excess > -self.effort.far and count + 1 >= self.effort.steps
-            if close or enough or step.multiplier < 1e-30:
+            if close or enough or step.multiplier < 1e-30 or (not best[0].holds and self._used_up(step)):
                 break
             multiplier = self._aim(next_multiplier(steps, target), steps, target)
         assert best is not None
@@ -216,5 +220,8 @@ class MultiplierSearch(ABC, Generic[Product]):
         snapshot = self.rounds.snapshots[index]
         rows, storage = np.flatnonzero(keep), self.rounds.storage
         planes = drop_bands(snapshot.planes, rows, degrees[rows], snapshot.costs.sh_mean, SH_C0, storage)
-        weight2 = storage.take(snapshot.costs.weight2, rows)
-        return Kept(index, storage.take(snapshot.rows, rows), planes, degrees[rows], weight2)
+        costs = snapshot.costs
+        some, weight2, removal = (
+            storage.take(values, rows) for values in (snapshot.rows, costs.weight2, costs.removal)
+        )
+        return Kept(index, some, planes, degrees[rows], weight2, removal)

@@ -1,0 +1,78 @@
+"""Results that are a little too large lose their cheapest Gaussians until they fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flexgs_edge.codec.v2.container import coded_size
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.memory.storage import IN_MEMORY
+from flexgs_edge.methods.best.landing import REACH, TRIES, land
+from flexgs_edge.scene.fields import FIELD
+from synthetic import random_scene
+
+COUNT = 2000
+JUMPS = 0.01
+"""With so few rows, a few more or less change the fit of the coder, and the size jumps by this share."""
+
+
+@pytest.fixture(scope="module")
+def grid() -> GridScene:
+    planes = random_scene(COUNT, 5, 1).read(slice(0, COUNT), list(FIELD))
+    return to_grid(planes, np.arange(COUNT) % 2, StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04,)), np.zeros(3))[0]
+
+
+def size_of(grid: GridScene) -> int:
+    return coded_size(grid, {})
+
+
+def landed(grid: GridScene, share: float, removal: np.ndarray) -> tuple[GridScene, int, int]:
+    size = size_of(grid)
+    return (*land(grid, removal, size, round(share * size), size_of, IN_MEMORY), round(share * size))
+
+
+@pytest.mark.parametrize("share", [0.999, 0.98, 0.97])
+def test_lands_just_below_the_limit(grid: GridScene, share: float) -> None:
+    removal = np.random.default_rng(1).random(COUNT)
+    found, size, limit = landed(grid, share, removal)
+    assert size == size_of(found) and (1 - JUMPS) * limit <= size <= limit
+    # The cheapest have gone, and no others: what is left is the same rows, in the order of a grid of their own.
+    assert found.count < COUNT
+    left = np.sort(removal)[COUNT - found.count :]
+    kept = np.flatnonzero(removal >= left[0])
+    for name in ("position", "scale", "dc"):
+        ours, theirs = (np.sort(values, axis=1) for values in (getattr(found, name), getattr(grid, name)[:, kept]))
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_outer_rows_may_go(grid: GridScene) -> None:
+    """The box around the rows shrinks, so that the order along the curve changes."""
+    removal = np.ones(COUNT)
+    removal[np.abs(grid.position - grid.position.mean(axis=1, keepdims=True)).max(axis=0).argsort()[-100:]] = 0
+    found, size, limit = landed(grid, 0.97, removal)
+    assert size <= limit and (found.position.min(axis=1) > grid.position.min(axis=1)).any()
+
+
+@pytest.mark.parametrize("share", [1.0, 1.02, np.exp(-REACH) - 0.01, 0.3])
+def test_others_stay_as_they_are(grid: GridScene, share: float) -> None:
+    found, size, _ = landed(grid, share, np.zeros(COUNT))
+    assert found is grid and size == size_of(grid)
+
+
+def test_sizes_that_do_not_fall_end_it(grid: GridScene) -> None:
+    asked: list[int] = []
+
+    def stubborn(smaller: GridScene) -> int:
+        asked.append(smaller.count)
+        return 1010
+
+    found, size = land(grid, np.zeros(COUNT), 1010, 1000, stubborn, IN_MEMORY)
+    assert found is grid and size == 1010 and len(asked) == TRIES and asked == sorted(set(asked), reverse=True)
+
+
+def test_one_gaussian_stays(grid: GridScene) -> None:
+    one = grid.take(np.arange(1))
+    assert land(one, np.zeros(1), 101, 100, size_of, IN_MEMORY) == (one, 101)
