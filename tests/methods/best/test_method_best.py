@@ -159,7 +159,7 @@ def test_fidelity_and_modelled_drop_decide_without_photos(project: Path, tmp_pat
 
 
 def test_the_refit_pays(project: Path, tmp_path: Path) -> None:
-    """With it most files as near to the original's renders are smaller (`fast` refits the constant alone, which is nothing here)."""
+    """With it most files as near to the original's renders are smaller. (`fast` refits the constant alone: nothing here.)"""
     sizes = []
     for fidelity in (34, 37, 40, 43, 46):
         words = {**TINY, "effort": "balanced", "images": "none", "min_fidelity": fidelity, "max_drop": None}
