@@ -62,6 +62,7 @@ class CompressWords(TypedDict, total=False):
     max_ssim_drop: float | str | None
     max_size: int | None
     min_ratio: float | None
+    max_gaussians: int | None
     prune_rate: float | None
     sh_rate: float | None
     bits: str

@@ -108,6 +108,7 @@ Several scenes:
     type=float,
     help="Best quality in 1/R of the scene's bytes as a .ply.",
 )
+@option(REACH, "--max-gaussians", metavar="N", type=int, help="Keep at most N Gaussians, whatever the target allows.")
 @option(REACH, "--best-effort", is_flag=True, help="If the target cannot be met, write the closest result.")
 @shared_options.reading_options
 @shared_options.photos_options

@@ -46,6 +46,7 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "score_cache": ("paper", None),
     "bits": ("paper", "paper"),
     "groups": ("paper", None),
+    "max_gaussians": ("best", None),
     "unseen": ("best", "keep"),
     "refit": ("best", True),
     "distil": ("best", None),
@@ -177,6 +178,8 @@ class CompressOptions(ViewOptions):
         Size target: most bytes of the file.
     min_ratio : float, optional
         Size target: bytes of the scene as a PLY divided by file bytes, whatever format the scene was read from.
+    max_gaussians : int, optional
+        Most Gaussians of the result, whatever the target allows, for programs that draw only so many (`best`).
     prune_rate, sh_rate : float, optional
         Fixed rates from 0 to 1, instead of a search (`paper`). Give both or none.
     bits : str
@@ -231,6 +234,7 @@ class CompressOptions(ViewOptions):
     max_ssim_drop: float | str | None = None
     max_size: int | None = None
     min_ratio: float | None = None
+    max_gaussians: int | None = None
     prune_rate: float | None = None
     sh_rate: float | None = None
     bits: str = "paper"
@@ -269,6 +273,8 @@ class CompressOptions(ViewOptions):
             raise InputError(
                 f"--base-psnr {self.base_psnr:g}: expected decibels between 0 and 200 (most scenes: 22 to 36)"
             )
+        if self.max_gaussians is not None and self.max_gaussians < 1:
+            raise InputError(f"--max-gaussians {self.max_gaussians}: expected 1 or more")
         if self.groups is not None and self.groups < 1:
             raise InputError(f"--groups {self.groups}: expected 1 or more")
         check_method(self.method, [name for name in METHOD_ONLY if getattr(self, name) != METHOD_ONLY[name][1]])

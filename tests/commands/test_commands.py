@@ -306,6 +306,7 @@ def test_a_score_file_of_another_scene(project: Path, tmp_path: Path) -> None:
         ({"bits": "rtnx"}, "--bits rtnx"),
         ({"bits": "xyz=99"}, "bits of xyz"),
         ({"groups": 0}, "--groups 0"),
+        ({"max_gaussians": 0}, "--max-gaussians 0"),
         ({"base_psnr": -3.0}, "--base-psnr -3"),
         ({"near": -1.0}, "--near -1"),
         ({"background": (0.0, 2.0, 0.0)}, "--background"),

@@ -94,6 +94,25 @@ def keep_one(keep: np.ndarray, costs: RemovalCosts) -> None:
         keep[dearest] = True
 
 
+def keep_most(keep: np.ndarray, costs: RemovalCosts, most: int) -> None:
+    """Keep no more than `most` rows: first go those that no pose sees, then those whose removal costs least.
+
+    Parameters
+    ----------
+    keep : np.ndarray
+        [n] bool, from `choose` or `choose_one_degree`; changed in place.
+    costs : RemovalCosts
+        Squared errors.
+    most : int
+        Most rows.
+    """
+    over = int(np.count_nonzero(keep)) - most
+    if over > 0:
+        rows = np.flatnonzero(keep)
+        worth = np.where(costs.weight2[rows] > 0, costs.removal[rows], -1.0)
+        keep[rows[np.argsort(worth, kind="stable")[:over]]] = False
+
+
 def choose_one_degree(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
     """As `choose`, but with one SH degree for all rows, for formats in which zero SH take as many bytes as others."""
     top = len(costs.sh)

@@ -132,7 +132,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         if not (self.steps and self.refit) or target.limit_bytes is not None:
             return super().run(target, best_effort)
         found = super().run(target, best_effort=True)
-        if not found.reached and self._used_up(found.chosen):
+        if not found.reached and self._left_too_few(found.chosen):
             LOG.info("the rounds before the descents left too few Gaussians: descending without these rounds")
             self._warming, self._begin, self._slopes = (), 0, None
             found = self._also(found, super().run(target, best_effort=True), target)
@@ -151,7 +151,10 @@ class GridSearch(MultiplierSearch[GridScene]):
         best = other if better(other.chosen, one.chosen, target) else one
         return replace(best, steps=(*one.steps, *other.steps))
 
-    def _used_up(self, missed: Candidate) -> bool:
+    def _used_up(self, steps: Sequence[Candidate]) -> bool:
+        return self._left_too_few(steps[-1]) or super()._used_up(steps)
+
+    def _left_too_few(self, missed: Candidate) -> bool:
         """Whether a candidate has nearly all Gaussians that the descents between the rounds have left."""
         return self._begin > 0 and missed.count >= ALL_LEFT * self.rounds.snapshots[self._begin].count
 

@@ -55,8 +55,15 @@ def kept_as_it_is(
     """
     source, target = run.source, run.target
     limit, steps = target.limit_bytes, steps_of(source.comments)
+    most = source.count if run.options.max_gaussians is None else run.options.max_gaussians
     held = KEPT_COPIES * source.count * sum(4 * field.width(source.sh_degree) for field in FIELD.values())
-    if limit is None or steps is None or run.options.unseen_share < 1.0 or held > run.budget.free:
+    if (
+        limit is None
+        or steps is None
+        or source.count > most
+        or run.options.unseen_share < 1.0
+        or held > run.budget.free
+    ):
         return None
     started = time.perf_counter()
     grid = on_grid(source.read(slice(0, source.count), list(FIELD)), steps, source.origin)

@@ -285,6 +285,7 @@ def search_rounds(
             on_step(as_step(step, source.count))
 
     search = make(rounds, measure, report)
+    search.most = run.options.max_gaussians
     found = search.run(run.target, run.options.best_effort)
     if found.chosen.left_out:
         LOG.warning(

@@ -20,7 +20,7 @@ from flexgs_edge.errors import TargetError
 from flexgs_edge.goals.promise import bounds_ssim, mean_alone, means
 from flexgs_edge.goals.steps import better, obstacle
 from flexgs_edge.goals.target import Measurement, Target
-from flexgs_edge.methods.best.allocation import BitModel, choose, drop_bands, keep_one
+from flexgs_edge.methods.best.allocation import BitModel, choose, drop_bands, keep_most, keep_one
 from flexgs_edge.methods.best.candidates import Candidate, Product, RateResult, next_multiplier
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.effort import Effort
@@ -43,6 +43,8 @@ MOST_ROUNDS = 24
 """Most rounds of pruning."""
 EXTRA_STEPS = 4
 """Most candidates beyond the effort's own, while none holds or the best is far below the target."""
+FLAT = 0.1
+"""If two candidates have the most Gaussians allowed, and the log of the loss differs by less, the search ends."""
 LEAD_FROM = 1.0
 """Rounds of pruning measure SSIM once, as soon as the log of the loss is this near to their end. Where less is lost, SSIM says
 little about the end: docs/results/tuning.md#lead"""
@@ -61,6 +63,11 @@ class MultiplierSearch(ABC, Generic[Product]):
         How much work to spend.
     on_step : callable, optional
         Called with each candidate.
+
+    Attributes
+    ----------
+    most : int or None
+        Most Gaussians of a candidate (`--max-gaussians`).
     """
 
     pruned_part = PRUNED_PART
@@ -77,6 +84,7 @@ class MultiplierSearch(ABC, Generic[Product]):
     ) -> None:
         self.rounds, self.measure, self.effort, self.on_step = rounds, measure, effort, on_step
         self.bits = BitModel()
+        self.most: int | None = None
         self._lead, self._begin = 0.0, 0
 
     @abstractmethod
@@ -87,9 +95,10 @@ class MultiplierSearch(ABC, Generic[Product]):
         """Improve the guess `multiplier` for the next candidate, in less time than a candidate takes."""
         return multiplier
 
-    def _used_up(self, missed: Candidate) -> bool:
-        """Whether no other multiplier could do better than this candidate, which missed the target."""
-        return False
+    def _used_up(self, steps: Sequence[Candidate]) -> bool:
+        """Whether no other multiplier could do much better than the last of these candidates, which all missed the target."""
+        full = [step.excess for step in steps[-2:] if step.count == self.most]
+        return len(full) == 2 and abs(full[1] - full[0]) < FLAT
 
     def discard(self, product: Product) -> None:
         """Free a product that is not the best any more."""
@@ -142,13 +151,15 @@ class MultiplierSearch(ABC, Generic[Product]):
                 self.discard(product)
             close = best[0].holds and best[0].excess > -self.effort.close
             enough = best[0].holds and best[0].excess > -self.effort.far and count + 1 >= self.effort.steps
-            if close or enough or step.multiplier < 1e-30 or (not best[0].holds and self._used_up(step)):
+            if close or enough or step.multiplier < 1e-30 or (not best[0].holds and self._used_up(steps)):
                 break
             multiplier = self._aim(next_multiplier(steps, target), steps, target)
         assert best is not None
         chosen, product = best
         if not chosen.holds and not best_effort:
             last = ", with one Gaussian left" if target.limit_bytes is not None and chosen.count == 1 else ""
+            if chosen.count == self.most:
+                last += f", with as many Gaussians as --max-gaussians {self.most} allows"
             raise TargetError(
                 f"{target.describe()} is out of reach; the closest point has {target.report(chosen.size, chosen.measurement)}"
                 f"{last} (--best-effort writes it){obstacle(target, chosen)}"
@@ -210,6 +221,8 @@ class MultiplierSearch(ABC, Generic[Product]):
             snapshot = self.rounds.snapshots[index]
             keep, degrees = self.choose(snapshot.costs, multiplier)
             keep_one(keep, snapshot.costs)
+            if self.most is not None:
+                keep_most(keep, snapshot.costs, self.most)
             if keep.mean() >= self.effort.keep or snapshot.count < 16:
                 break
         return index, keep, degrees

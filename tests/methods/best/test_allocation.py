@@ -16,6 +16,7 @@ from flexgs_edge.methods.best.allocation import (
     choose,
     choose_one_degree,
     drop_bands,
+    keep_most,
     keep_one,
 )
 from flexgs_edge.methods.best.costs import RemovalCosts
@@ -203,3 +204,19 @@ def test_one_that_a_pose_sees_is_always_kept() -> None:
     worthless = np.zeros(2, bool)
     keep_one(worthless, costs_of([0, 0], [], [1.0, 1.0]))
     assert worthless.tolist() == [True, False]
+
+
+def test_no_more_than_the_most_stay() -> None:
+    """Rows that no pose sees go first, then the cheapest of those that stay; of equal ones the first."""
+    removal, weight2 = np.array([5.0, 1, 3, 3, 9, 0, 2]), np.array([1.0, 1, 1, 1, 1, 0, 1])
+    costs = RemovalCosts(removal, weight2, np.zeros((0, 7)), np.zeros((0, 3, 7), np.float32))
+    for most, left in (
+        (7, [0, 2, 3, 4, 5, 6]),
+        (6, [0, 2, 3, 4, 5, 6]),
+        (5, [0, 2, 3, 4, 6]),
+        (3, [0, 3, 4]),
+        (1, [4]),
+    ):
+        keep = np.array([1, 0, 1, 1, 1, 1, 1], bool)
+        keep_most(keep, costs, most)
+        assert np.flatnonzero(keep).tolist() == left

@@ -285,6 +285,30 @@ def test_few_gaussians(count: int, target: Target) -> None:
     assert found.reached and found.product.count <= count
 
 
+@pytest.mark.parametrize("target", [MaxDrop(1.0), MaxSize(3000, "drop")])
+def test_no_more_gaussians_than_allowed(target: Target) -> None:
+    rounds = FakeRounds(600)
+    world = powers()
+    world.rounds = rounds
+    finder = KnownSearch(rounds, world.size_of, world.measure, EFFORT, refit=False)
+    finder.world, finder.most = world, 100
+    found = finder.run(target)
+    assert found.reached and all(step.count <= 100 for step in found.steps)
+    assert search(powers(), target, FakeRounds(600)).chosen.count > 100
+
+
+def test_a_limit_of_gaussians_ends_what_cannot_get_better() -> None:
+    """Where all that is allowed stays and finer grids gain nothing, the second candidate is the last."""
+    rounds, world = FakeRounds(600), World(lambda m: 3.0, lambda m: BYTES * (m / AT) ** -0.45)
+    world.rounds = rounds
+    finder = KnownSearch(rounds, world.size_of, world.measure, EFFORT, refit=False)
+    finder.world, finder.most = world, 20
+    with pytest.raises(TargetError, match=r"as many Gaussians as --max-gaussians 20 allows"):
+        finder.run(MaxDrop(1.0))
+    found = finder.run(MaxDrop(1.0), best_effort=True)
+    assert len(found.steps) == 2 and found.chosen.count == 20
+
+
 def test_nothing_that_any_pose_sees() -> None:
     found = search(powers(), MaxDrop(1.0), FakeRounds(40, unseen=40), best_effort=True)
     assert found.product.count == 40 and found.product.sh_count == 0
