@@ -8,9 +8,8 @@ from flexgs_edge.errors import InputError
 
 PAGE = "viewer/index.html"
 STYLE = "viewer/style.css"
-MAIN = "viewer/src/page.js"
-WORKERS = {"load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
-"""Workers of the page by the name that `startWorker` knows."""
+ENTRIES = {"page": "viewer/src/page.js", "load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
+"""The modules that are run: the page's, and those of the workers by the name that `startWorker` knows."""
 _PATTERNS = ("viewer/*.html", "viewer/*.css", "viewer/src/*.js", "decoder/src/*.js")
 
 

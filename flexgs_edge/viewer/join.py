@@ -17,9 +17,10 @@ _EXPORT = re.compile(r"^export (?=(?:async )?(?:function\*?|class|const) (\w+))"
 _LEFT = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
 
 
-def join_modules(files: Mapping[str, str], entry: str) -> str:
-    """One script that does what the module `entry` does, without comments and spaces.
+def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:
+    """One script that does what one of several modules does, without comments and spaces.
 
+    On a page it is the entry `page`, in a worker the one with the worker's name. So page and workers share one text.
     Each module becomes a function, so that names in two modules do not meet. What it exports has the same name for all others:
     no two modules may export one name, and none may import under another name.
 
@@ -27,8 +28,8 @@ def join_modules(files: Mapping[str, str], entry: str) -> str:
     ----------
     files : mapping
         Texts by path.
-    entry : str
-        Path of the module to run.
+    entries : mapping
+        Paths of the modules to run, by name.
 
     Raises
     ------
@@ -36,9 +37,13 @@ def join_modules(files: Mapping[str, str], entry: str) -> str:
         For an import or export of a form that is not understood, and for a name that two modules export.
     """
     parts: dict[str, str] = {}
-    _add(files, entry, parts, {})
-    body = "\n".join(parts.values())
-    return strip_script(f"(() => {{\n'use strict';\n{body}\n}})();") + "\n"
+    owners: dict[str, str] = {}
+    for path in entries.values():
+        _add(files, path, parts, owners)
+    begin = [f"{name}() {{\n{parts.pop(path)}\n}}," for name, path in entries.items()]
+    body = "\n".join([*parts.values(), "const entries = {", *begin, "};"])
+    chosen = "entries[globalThis.document ? 'page' : globalThis.name]();"
+    return strip_script(f"(() => {{\n'use strict';\n{body}\n{chosen}\n}})();") + "\n"
 
 
 def _add(files: Mapping[str, str], path: str, parts: dict[str, str], owners: dict[str, str]) -> None:
@@ -58,6 +63,8 @@ def _add(files: Mapping[str, str], path: str, parts: dict[str, str], owners: dic
             raise ValueError(f"{path} and {owners[name]} both export {name}")
         owners[name] = path
     text = _EXPORT.sub("", _EXPORT_FROM.sub("", _IMPORT.sub("", text)))
+    # A page from disk may start workers from a script only, and scripts have no `import.meta`.
+    text = text.replace("import.meta.url", "document.baseURI")
     if left := _LEFT.search(text):
         raise ValueError(f"{path}: cannot join {left[0]!r}")
     if exported:

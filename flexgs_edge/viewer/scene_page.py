@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.viewer.assets import MAIN, PAGE, STYLE, WORKERS
+from flexgs_edge.viewer.assets import ENTRIES, PAGE, STYLE
 from flexgs_edge.viewer.join import join_modules
 
 _CONFIG = '<script type="application/json" id="scene">{}</script>'
@@ -70,7 +70,7 @@ class Page:
 def viewer_page(files: Mapping[str, str], config: Mapping[str, Any], scene: bytes | None = None) -> Page:
     """The viewer and the decoder in one file.
 
-    With one request, everything but the scene is there. Workers start from texts in the page. The policy lets only the page's
+    With one request, everything but the scene is there. Workers run the page's own script. The policy lets only the page's
     own script and style in, by their checksums.
 
     Parameters
@@ -82,27 +82,22 @@ def viewer_page(files: Mapping[str, str], config: Mapping[str, Any], scene: byte
     scene : bytes, optional
         A `.fgs` to put into the page, which then opens from disk without a network.
     """
-    script = join_modules(files, MAIN)
-    workers = {name: join_modules(files, path) for name, path in WORKERS.items()}
-    for text in (script, *workers.values()):
-        if "</script" in text.lower() or "<!--" in text:
-            raise AssertionError("a script that would end in the middle")
+    script = join_modules(files, ENTRIES)
+    if "</script" in script.lower() or "<!--" in script:
+        raise AssertionError("a script that would end in the middle")
     style = _short_style(files[STYLE])
     policy = (
         f"default-src 'none'; script-src {_digest(script)} blob:; worker-src blob:; style-src {_digest(style)}; "
         f"img-src data: blob:; base-uri 'none'; form-action 'none'"
     )
-    inside = "".join(
-        f'<script type="text/plain" id="{name}-worker">{text}</script>\n' for name, text in workers.items()
-    )
-    changes = {_STYLE_LINK: f"<style>{style}</style>", _CONFIG: _config(config)}
+    made = f'<script type="module" id="script">{script}</script>'
+    changes = {_SCRIPT: made, _STYLE_LINK: f"<style>{style}</style>", _CONFIG: _config(config)}
     if scene is None:
         policy += "; connect-src 'self'"
     else:
         changes[_CHARSET] = f'{_CHARSET}\n<meta http-equiv="Content-Security-Policy" content="{policy}">'
         data = base64.b64encode(scene).decode()
-        inside += f'<script type="application/octet-stream" id="scene-bytes">{data}</script>\n'
-    changes[_SCRIPT] = f'{inside}<script type="module">{script}</script>'
+        changes[_SCRIPT] = f'<script type="application/octet-stream" id="scene-bytes">{data}</script>\n{made}'
     return Page(_replaced(files[PAGE], changes), policy)
 
 

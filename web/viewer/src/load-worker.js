@@ -1,7 +1,7 @@
 import { FgsError, open } from '../../decoder/src/index.js';
 import { packChunk } from './pack.js';
 
-/** Decode a scene and pack it for the textures. In: { source, name }. Out: { header }, { chunk }, { done } or { error }. */
+/** Decode a scene and pack it for the textures. In: { source, name } or { error }. Out: { header }, { chunk }, { done } or { error }. */
 async function load(source, name) {
   const file = await open(source, { name });
   const { count, shDegree, origin, settings, layers, size, version, header } = file;
@@ -21,7 +21,8 @@ async function load(source, name) {
 }
 
 self.onmessage = ({ data }) => {
-  load(data.source, data.name).catch((error) => {
+  const loaded = data.error ? Promise.reject(new Error(data.error)) : load(data.source, data.name);
+  loaded.catch((error) => {
     const advice = error instanceof FgsError ? '' : 'Cannot load the scene: ';
     self.postMessage({ error: advice + error.message });
   });

@@ -4,7 +4,6 @@ import { Viewer } from './viewer.js';
 const find = (id) => document.getElementById(id);
 const config = JSON.parse(find('scene')?.textContent || '{}');
 const status = find('status');
-const numbers = new Intl.NumberFormat('en');
 
 function say(text, isError = false) {
   status.textContent = text;
@@ -127,7 +126,11 @@ async function save(viewer) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
 
+/** Made when it is needed: it takes as long as a worker to start. */
+let numbers = null;
+
 function showNumbers({ stats, canvas, renderer }) {
+  numbers ??= new Intl.NumberFormat('en');
   const rows = {
     splats: `${numbers.format(stats.drawn)} of ${numbers.format(stats.splats)}`,
     file: stats.bytes ? `${numbers.format(Math.round(stats.bytes / 1000))} kB` : '',

@@ -2,7 +2,7 @@ import { boxOf, Camera, outsidePose, upOf } from './camera.js';
 import { Controls } from './controls.js';
 import { Renderer } from './renderer.js';
 import { subtract, dot, times, add } from './vectors.js';
-import { startWorker } from './workers.js';
+import { sendScene, startWorker } from './workers.js';
 
 const GRID = 256 * 2 ** 20;
 
@@ -21,7 +21,7 @@ export class Viewer extends EventTarget {
     super();
     this.canvas = canvas;
     this.fresh = { load: startWorker('load'), sort: startWorker('sort'), first, started: performance.now() };
-    if (first) this.fresh.load.postMessage(first);
+    if (first) sendScene(this.fresh.load, first.source, first.name);
     this.renderer = new Renderer(canvas, { half });
     this.camera = new Camera([0, -1, 0]);
     this.controls = new Controls(canvas, () => this.camera, () => this.refresh());
@@ -70,7 +70,7 @@ export class Viewer extends EventTarget {
       await new Promise((resolve, reject) => {
         this.loader.onerror = (event) => reject(new Error(event.message || 'The worker that decodes did not start.'));
         this.loader.onmessage = ({ data }) => this.#loaded(data, agree).then((done) => done && resolve(), reject);
-        if (!begun) this.loader.postMessage({ source, name });
+        if (!begun) sendScene(this.loader, source, name);
       });
     } catch (error) {
       this.loader.terminate();
@@ -128,6 +128,8 @@ export class Viewer extends EventTarget {
       chunk.importance.buffer,
     ]);
     this.sortedFor = null;
+    // Not with the next frame: a frame of what is there may take longer than the sort.
+    this.#sortIfNeeded();
     this.refresh();
   }
 
