@@ -10,6 +10,8 @@ PAGE = "viewer/index.html"
 STYLE = "viewer/style.css"
 ENTRIES = {"page": "viewer/src/page.js", "load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
 """The modules that are run: the page's, and those of the workers by the name that `startWorker` knows."""
+LIVE = {**ENTRIES, "page": "viewer/src/live.js"}
+"""The same for the live scenes of a report."""
 _PATTERNS = ("viewer/*.html", "viewer/*.css", "viewer/src/*.js", "decoder/src/*.js")
 
 

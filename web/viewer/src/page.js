@@ -1,4 +1,5 @@
 // The page: its buttons and texts. All text of files reaches it as text, never as HTML.
+import { bytesInside } from './inside.js';
 import { Viewer } from './viewer.js';
 
 const find = (id) => document.getElementById(id);
@@ -31,14 +32,8 @@ function start() {
 
 /** The scene of the page: bytes that lie in it, or an address. */
 function firstScene() {
-  const inside = find('scene-bytes');
-  if (inside) {
-    const text = atob(inside.textContent.trim());
-    const bytes = new Uint8Array(text.length);
-    for (let i = 0; i < bytes.length; i++) bytes[i] = text.charCodeAt(i);
-    inside.remove();
-    return { source: bytes, name: config.name };
-  }
+  const bytes = bytesInside('scene-bytes');
+  if (bytes) return { source: bytes, name: config.name };
   const address = config.scene ?? new URLSearchParams(location.search).get('scene');
   return address ? { source: new URL(address, location.href).href, name: config.name ?? address } : null;
 }

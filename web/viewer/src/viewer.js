@@ -50,14 +50,15 @@ export class Viewer extends EventTarget {
    * Load a scene.
    *
    * @param {string | Uint8Array | Blob} source an absolute address, or bytes
-   * @param {{name: string, poses: object[], look?: object, agree?: (bytes: number) => Promise<boolean>}} options
+   * @param {{name: string, poses: object[], pose?: number, look?: object, agree?: (bytes: number) => Promise<boolean>}} options
    * @returns {Promise<void>} when all is there
    */
-  async load(source, { name, poses = [], look = {}, agree = async () => true }) {
+  async load(source, { name, poses = [], pose = 0, look = {}, agree = async () => true }) {
     this.loader?.terminate();
     this.sorter?.terminate();
     this.#reset();
     this.poses = poses;
+    this.pose = pose;
     this.asked = look;
     const begun = this.fresh?.first?.source === source && this.fresh;
     const { load, sort } = this.fresh ?? { load: startWorker('load'), sort: startWorker('sort') };
@@ -109,7 +110,7 @@ export class Viewer extends EventTarget {
     Object.assign(this.look, this.asked);
     Object.assign(this.stats, { splats: header.count, bytes: header.size, layers: header.layers.length });
     this.camera = new Camera(upOf(this.poses));
-    if (this.poses.length) this.setPose(0);
+    if (this.poses.length) this.setPose(this.pose);
     this.#tell('begun');
     return false;
   }
@@ -120,7 +121,7 @@ export class Viewer extends EventTarget {
     if (!this.box) {
       this.box = boxOf(chunk.means, chunk.rows);
       if (!this.poses.length) this.poses = [outsidePose(this.box, this.header.origin)];
-      this.setPose(0);
+      this.setPose(this.pose);
       this.#tell('poses');
     }
     this.sorter.postMessage({ add: { means: chunk.means, importance: chunk.importance } }, [
