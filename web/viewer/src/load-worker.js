@@ -9,7 +9,7 @@ async function load(source, name) {
   self.postMessage({ header: { count, shDegree, origin, settings, layers, size, version, shRows } });
   let shBefore = 0;
   for await (const chunk of file.chunks()) {
-    const packed = packChunk(chunk.values(), chunk.rows, shDegree, shBefore);
+    const packed = packChunk(chunk.values(), chunk.rows, shDegree, shBefore, chunk.codes.degrees);
     shBefore += packed.shRows;
     // The header's count of them is not checked by a decoder, and our room was made for it.
     if (shBefore > shRows) throw new Error(`The header says that ${shRows} splats have SH, but more have.`);

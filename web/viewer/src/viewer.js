@@ -229,9 +229,14 @@ export class Viewer extends EventTarget {
 
   /** What was drawn is taken back: a damaged file is no scene. */
   #fail(message) {
+    // An order that is on its way would bring it back.
+    if (this.sorter) this.sorter.onmessage = null;
+    this.sorter?.terminate();
+    this.sorting = null;
     this.renderer.drawn = 0;
     this.rows = 0;
     this.refresh();
+    this.#tell('sorted');
     this.dispatchEvent(new CustomEvent('failed', { detail: message }));
   }
 
