@@ -15,7 +15,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
     "--output",
     metavar="OUT",
     required=True,
-    help="File to write: .ply, .spz, .sog, .compressed.ply, .splat or .glb.",
+    help="File to write: .ply, .spz, .sog, .compressed.ply, .splat, .glb, or FOLDER/lod-meta.json (streamed SOG).",
 )
 @shared_options.spz_version_option
 @shared_options.reading_options
@@ -52,12 +52,16 @@ def command(
     Formats of other programs round values in their own ways. To make such a file smaller, and to see what is lost, use
     compress.
 
+    FOLDER/lod-meta.json is streamed SOG, which PlayCanvas and SuperSplat load step by step: each layer of a .fgs of compress
+    --layers becomes a level of detail.
+
     \b
     Examples:
       flexgs-edge decompress scene.fgs -o scene.ply
       flexgs-edge decompress scene.fgs -o scene.ply -f --memory-limit 200MiB
       flexgs-edge decompress scene.fgs -o scene.spz
       flexgs-edge decompress scene.sog -o scene.ply
+      flexgs-edge decompress layered.fgs -o streamed/lod-meta.json
     """
     talk.start(quiet, json_path, force)
     from flexgs_edge.commands.decompress import decompress

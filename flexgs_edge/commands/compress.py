@@ -6,6 +6,7 @@ import logging
 import os
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 from flexgs_edge.goals.promise import in_the_way, kept_promise
@@ -19,8 +20,10 @@ from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.doubts import doubts
 from flexgs_edge.run.inputs import ScenePlace, scene_info
 from flexgs_edge.run.judge import measurement_of
+from flexgs_edge.run.live import live_scenes
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.open_bench import bench_info, open_bench
+from flexgs_edge.run.open_scene import is_fgs
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run, open_compression
 from flexgs_edge.run.view_set import GivenViews, views_info
@@ -85,8 +88,15 @@ def compress(
     if run.reporter is not None:
         if run.output.path is not None:
             run.reporter.read_contents(run.output.path)
+            _show_live(run, run.output.path)
         run.reporter.write(result, None if run.plan is None else run.plan.target)
     return result
+
+
+def _show_live(run: Run[CompressOptions], path: Path) -> None:
+    if run.reporter is not None and run.views is not None and is_fgs(path):
+        with run.clock.stage("live scenes"):
+            run.reporter.show_live(lambda first: live_scenes(run, path, first))
 
 
 def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> CompressResult:

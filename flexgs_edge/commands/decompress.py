@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
 
+from flexgs_edge.codec.open_fgs import read_header
+from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import InputError
-from flexgs_edge.files import check_writable
-from flexgs_edge.io.exchange import write_foreign
-from flexgs_edge.io.formats import WRITTEN, written_format
+from flexgs_edge.files import check_folder, check_writable
+from flexgs_edge.io.exchange import write_foreign, write_streamed
+from flexgs_edge.io.formats import FORMATS, WRITTEN, written_format
 from flexgs_edge.io.ply import inria_dtype, write_ply
 from flexgs_edge.io.reading import AS_WRITTEN, Reading, Writing
+from flexgs_edge.io.streamed_sog_writer import STREAMED
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.report.file_results import DecompressResult
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.decoding import ahead, decoder
-from flexgs_edge.run.inputs import ScenePlace, load_scene, scene_info
+from flexgs_edge.run.inputs import CheckedScene, ScenePlace, load_scene, scene_info
 from flexgs_edge.run.open_bench import run_info
+from flexgs_edge.run.open_scene import is_fgs, scene_file
 
 WRITE_COPIES = 3
 """Copies of a chunk's rows in memory while decoding and writing: codes, planes, rows of the PLY."""
@@ -42,7 +47,7 @@ def decompress(
     input : path or CheckedScene
         Any scene: a `.fgs`, a `.ply`, a file of another program's format, or a model folder.
     output : path
-        The `.ply`, `.spz`, `.sog` or `.compressed.ply` to write.
+        The `.ply`, `.spz`, `.sog` or `.compressed.ply` to write, or `FOLDER/lod-meta.json` for streamed SOG.
     force : bool
         Overwrite `output` if it exists. Default: raise `InputError`.
     memory_limit : int, optional
@@ -66,10 +71,14 @@ def decompress(
     FormatError
         If the input does not follow its format.
     """
-    format = written_format(output)
+    streamed = Path(output).name == STREAMED
+    format = FORMATS[".sog"] if streamed else written_format(output)
     if format is None and Path(output).suffix.lower() != ".ply":
-        raise InputError(f"-o {output}: expected a name that ends in .ply, {', '.join(WRITTEN)}")
-    check_writable(output, force)
+        raise InputError(f"-o {output}: expected a name that ends in .ply, {', '.join(WRITTEN)}, or {STREAMED}")
+    if streamed:
+        check_folder(Path(output).parent, force)
+    else:
+        check_writable(output, force)
     writing = Writing(spz_version)
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(memory_limit)
@@ -83,7 +92,13 @@ def decompress(
     with clock.stage("write"):
         if format is not None:
             budget.require(f"writing a {format.suffix}", format.memory * scene.source.count)
-            notes = write_foreign(output, scene.source, force=force, writing=replace(writing, antialiased=antialiased))
+            writing = replace(writing, antialiased=antialiased)
+            if streamed:
+                notes = write_streamed(
+                    Path(output).parent, scene.source, _layers(input, scene.source.count), force=force, writing=writing
+                )
+            else:
+                notes = write_foreign(output, scene.source, force=force, writing=writing)
         else:
             row = inria_dtype(scene.source.sh_degree).itemsize
             rows = budget.rows("decoding", WRITE_COPIES * row, minimum=min(scene.source.count, 1024), most=65536)
@@ -91,5 +106,22 @@ def decompress(
                 notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
         if antialiased and not (format is not None and format.marks_antialiased):
             notes = (*notes, ANTIALIASED_NOTE)
-    size = os.stat(output).st_size
+    size = _written_bytes(Path(output)) if streamed else os.stat(output).st_size
     return DecompressResult(scene_info(scene), os.fspath(output), size, run_info(budget, clock, backend), notes)
+
+
+def _layers(input: ScenePlace, count: int) -> tuple[int, ...]:
+    """Gaussians of each layer of a layered `.fgs`; other scenes have one."""
+    if not isinstance(input, CheckedScene):
+        place = scene_file(input)
+        header = read_header(place) if is_fgs(place) else None
+        if isinstance(header, GridHeader) and sum(header.layers) == count:
+            return tuple(header.layers)
+    return (count,)
+
+
+def _written_bytes(output: Path) -> int:
+    """Bytes of a streamed scene: its `lod-meta.json` and all files that it names."""
+    names: list[str] = json.loads(output.read_bytes())["filenames"]
+    folders = [output.parent / name for name in names]
+    return output.stat().st_size + sum(file.stat().st_size for place in folders for file in place.parent.iterdir())

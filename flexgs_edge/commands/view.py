@@ -28,8 +28,8 @@ from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_scene import is_fgs, scene_file
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import Run, open_run
-from flexgs_edge.viewer.assets import PAGE, content_type, web_files
-from flexgs_edge.viewer.scene_page import page_config, served_files, single_page
+from flexgs_edge.viewer.assets import PAGE, web_files
+from flexgs_edge.viewer.scene_page import page_config, viewer_page
 from flexgs_edge.viewer.server import Resource, SceneServer
 
 LOG = logging.getLogger("flexgs_edge")
@@ -93,15 +93,13 @@ def view(
     with _coded(run, input) as scene:
         size = os.stat(scene).st_size
         if output is not None:
-            page = single_page(files, page_config(name, cameras, look), scene.read_bytes()).encode()
+            page = viewer_page(files, page_config(name, cameras, look), scene.read_bytes()).text.encode()
             with atomic_write(output, force) as file:
                 file.write(page)
             return ViewResult(scene_info(run.scene), size, len(cameras), os.fspath(output), len(page))
-        texts = served_files(files, page_config(name, cameras, look, "scene.fgs"))
-        resources = {
-            path: Resource(content_type(path), text.encode(), gzip.compress(text.encode()))
-            for path, text in texts.items()
-        }
+        made = viewer_page(files, page_config(name, cameras, look, "scene.fgs"))
+        text = made.text.encode()
+        resources = {PAGE: Resource("text/html; charset=utf-8", text, gzip.compress(text), made.policy)}
         resources[_SCENE] = Resource("application/octet-stream", scene)
         server = SceneServer(resources, host, port)
         address = server.address(PAGE)

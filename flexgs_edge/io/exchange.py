@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.files import atomic_write, check_readable
-from flexgs_edge.io.formats import Format, format_of, written_format
+from flexgs_edge.files import atomic_folder, atomic_write, check_readable
+from flexgs_edge.io.formats import FORMATS, Format, format_of, written_format
 from flexgs_edge.io.frames import in_frame
 from flexgs_edge.io.reading import AS_WRITTEN, PLAIN, Reading, Writing
+from flexgs_edge.io.streamed_sog_writer import write_streamed_sog
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.rotations import normalize_quats
@@ -76,13 +77,35 @@ def write_foreign(
     assert format is not None
     if source.count == 0:
         raise InputError(f"{source.name}: the scene is empty: nothing to write to {path}")
-    notes: tuple[str, ...] = ()
-    if source.sh_degree > format.max_degree:
-        notes = (f"SH above degree {format.max_degree} left out: {format.suffix} holds no others",)
     world = _WorldSource(without_degrees(source, format.max_degree))
     _check_reach(path, world, format)
     with atomic_write(path, force) as file:
         format.write(file, in_frame(world.select(near_order(world)), format.frame), writing)
+    return _notes(source, format)
+
+
+def write_streamed(
+    folder: str | os.PathLike[str],
+    source: SceneSource,
+    layers: Sequence[int],
+    *,
+    force: bool = False,
+    writing: Writing = PLAIN,
+) -> tuple[str, ...]:
+    """Write a scene as streamed SOG; `layers` counts the rows of each layer, in their order. Otherwise as `write_foreign`."""
+    format = FORMATS[".sog"]
+    if source.count == 0:
+        raise InputError(f"{source.name}: the scene is empty: nothing to write to {folder}")
+    world = _WorldSource(without_degrees(source, format.max_degree))
+    with atomic_folder(folder, force) as place:
+        write_streamed_sog(place, in_frame(world, format.frame), layers, writing)
+    return _notes(source, format)
+
+
+def _notes(source: SceneSource, format: Format) -> tuple[str, ...]:
+    notes: tuple[str, ...] = ()
+    if source.sh_degree > format.max_degree:
+        notes = (f"SH above degree {format.max_degree} left out: {format.suffix} holds no others",)
     if np.any(source.origin != 0):
         notes += ("positions rounded to float32: the scene is far from zero",)
     return notes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 from functools import cache
 from pathlib import Path
@@ -34,6 +35,7 @@ def render(template: str, **values: object) -> str:
 def environment() -> Environment:
     """Create the jinja2 environment: the templates and their filters."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
 
     made = Environment(
         loader=FileSystemLoader(TEMPLATES),
@@ -44,7 +46,16 @@ def environment() -> Environment:
         keep_trailing_newline=True,
         auto_reload=False,
     )
-    made.filters.update(count=count, data_uri=data_uri, decibel=decibel, figure=figure, size=format_size)
+    made.filters.update(
+        as_is=Markup,
+        base64=base64_text,
+        json=json_text,
+        count=count,
+        data_uri=data_uri,
+        decibel=decibel,
+        figure=figure,
+        size=format_size,
+    )
     made.globals["version"] = __version__
     return made
 
@@ -56,6 +67,26 @@ def data_uri(data: bytes, kind: str) -> str:
     'data:text/plain;base64,YWJj'
     """
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def base64_text(data: bytes) -> str:
+    """Bytes as letters that no page escapes.
+
+    >>> base64_text(b"abc")
+    'YWJj'
+    """
+    return base64.b64encode(data).decode()
+
+
+def json_text(value: object) -> str:
+    """JSON for a script element, which no name of a file or camera ends.
+
+    >>> print(json_text({"name": "</script>"}))
+    {"name": "\\u003c/script>"}
+    """
+    from markupsafe import Markup
+
+    return Markup(json.dumps(value, allow_nan=False).replace("<", "\\u003c"))
 
 
 def figure(value: float | None, form: str, missing: str = "\u2013") -> str:

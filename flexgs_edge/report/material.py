@@ -86,6 +86,31 @@ class Rig:
 
 
 @dataclass(frozen=True)
+class Live:
+    """Scenes that a page draws while it is looked at.
+
+    Parameters
+    ----------
+    script : str
+        Draws them.
+    config : dict
+        Cameras, the first of them, and how the scenes are drawn.
+    compressed : bytes or None
+        The `.fgs` that was made; `None` if it is too large.
+    original : bytes or None
+        The original as a `.fgs`.
+    note : str
+        Why a scene is not there.
+    """
+
+    script: str
+    config: dict[str, Any]
+    compressed: bytes | None
+    original: bytes | None
+    note: str
+
+
+@dataclass(frozen=True)
 class Material:
     """Contents of a page besides the result.
 
@@ -99,9 +124,12 @@ class Material:
         JSON record of `info`; `None` for formats whose channels it does not know.
     target : Target or None
         Target that the search chart marks with a line.
+    live : Live or None
+        Live scenes.
     """
 
     shots: tuple[Shot, ...] = ()
     rig: Rig | None = None
     contents: dict[str, Any] | None = None
     target: Target | None = None
+    live: Live | None = None

@@ -18,7 +18,7 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.report.as_json import json_text
-from flexgs_edge.report.material import Material, Rig, Shot
+from flexgs_edge.report.material import Live, Material, Rig, Shot
 from flexgs_edge.report.pages import compress_page, evaluate_page
 from flexgs_edge.report.results import CompressResult, EvaluateResult
 from flexgs_edge.run.clock import Stopwatch
@@ -57,6 +57,7 @@ class Reporter:
         self._shots: tuple[Shot, ...] = ()
         self._rig: Rig | None = None
         self._contents: dict[str, Any] | None = None
+        self._live: Live | None = None
         self._check()
 
     @classmethod
@@ -103,13 +104,18 @@ class Reporter:
             write(place)
             self.read_contents(place)
 
+    def show_live(self, make: Callable[[int], Live]) -> None:
+        """Put live scenes beside the pictures; `make` gets the camera of the first picture."""
+        if self._shots:
+            self._live = make(self._shots[0].camera)
+
     def see_cameras(self, views: ViewSet, scene: CheckedScene) -> None:
         """Keep the camera poses for the plans."""
         self._rig = rig_of(views, scene.source)
 
     def write(self, result: CompressResult | EvaluateResult, target: Target | None = None) -> Path:
         """Write the page and the record: both, or neither if writing fails. Returns the path of the page."""
-        material = Material(self._shots, self._rig, self._contents, target)
+        material = Material(self._shots, self._rig, self._contents, target, self._live)
         words = (
             compress_page(result, material) if isinstance(result, CompressResult) else evaluate_page(result, material)
         )

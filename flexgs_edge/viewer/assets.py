@@ -1,4 +1,4 @@
-"""The files of the viewer (`web/`), and their content types."""
+"""The files of the viewer (`web/`)."""
 
 from __future__ import annotations
 
@@ -8,14 +8,10 @@ from flexgs_edge.errors import InputError
 
 PAGE = "viewer/index.html"
 STYLE = "viewer/style.css"
-MAIN = "viewer/src/page.js"
-WORKERS = {"load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
-"""Workers of the page by the name that `startWorker` knows."""
-_KINDS = {
-    ".html": "text/html; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-}
+ENTRIES = {"page": "viewer/src/page.js", "load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
+"""The modules that are run: the page's, and those of the workers by the name that `startWorker` knows."""
+LIVE = {**ENTRIES, "page": "viewer/src/live.js"}
+"""The same for the live scenes of a report."""
 _PATTERNS = ("viewer/*.html", "viewer/*.css", "viewer/src/*.js", "decoder/src/*.js")
 
 
@@ -33,8 +29,3 @@ def web_files() -> dict[str, str]:
     folder = web_folder()
     places = [place for pattern in _PATTERNS for place in sorted(folder.glob(pattern))]
     return {place.relative_to(folder).as_posix(): place.read_text(encoding="utf-8") for place in places}
-
-
-def content_type(path: str) -> str:
-    """Content type of a file by its suffix."""
-    return _KINDS[Path(path).suffix]

@@ -9,76 +9,66 @@ import posixpath
 import re
 from collections.abc import Mapping
 
+from flexgs_edge.viewer.strip import strip_script
+
 _IMPORT = re.compile(r"^import (?:\{([^}]*)\} from )?'([^']+)';$", re.MULTILINE)
 _EXPORT_FROM = re.compile(r"^export \{([^}]*)\} from '([^']+)';$", re.MULTILINE)
-_EXPORT = re.compile(r"^export ((?:async )?function\*? |class |const )(\w+)", re.MULTILINE)
-_COMMENT = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
-_SPACE = re.compile(r"\n\s+")
+_EXPORT = re.compile(r"^export (?=(?:async )?(?:function\*?|class|const) (\w+))", re.MULTILINE)
 _LEFT = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
 
 
-def join_modules(files: Mapping[str, str], entry: str) -> str:
-    """One script that does what the module `entry` does.
+def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:
+    """One script that does what one of several modules does, without comments and spaces.
 
-    Comments that stand alone and indentation are left out: with them, a page would be half as large again. Each module
-    becomes a function of its own, so that names in two modules do not meet, and hands over what it exports.
+    On a page it is the entry `page`, in a worker the one with the worker's name. So page and workers share one text.
+    Each module becomes a function, so that names in two modules do not meet. What it exports has the same name for all others:
+    no two modules may export one name, and none may import under another name.
 
     Parameters
     ----------
     files : mapping
         Texts by path.
-    entry : str
-        Path of the module to run.
+    entries : mapping
+        Paths of the modules to run, by name.
 
     Raises
     ------
     ValueError
-        For an import or export of a form that is not understood.
+        For an import or export of a form that is not understood, and for a name that two modules export.
     """
     parts: dict[str, str] = {}
-    _add(files, entry, parts)
-    body = _SPACE.sub("\n", _COMMENT.sub("", "\n".join(parts.values())))
-    return f"(() => {{\n'use strict';\nconst modules = {{}};\n{body}\n}})();\n"
+    owners: dict[str, str] = {}
+    for path in entries.values():
+        _add(files, path, parts, owners)
+    begin = [f"{name}() {{\n{parts.pop(path)}\n}}," for name, path in entries.items()]
+    body = "\n".join([*parts.values(), "const entries = {", *begin, "};"])
+    chosen = "entries[globalThis.document ? 'page' : globalThis.name]();"
+    return strip_script(f"(() => {{\n'use strict';\n{body}\n{chosen}\n}})();") + "\n"
 
 
-def _add(files: Mapping[str, str], path: str, parts: dict[str, str]) -> None:
+def _add(files: Mapping[str, str], path: str, parts: dict[str, str], owners: dict[str, str]) -> None:
     """Add a module after all that it imports."""
     if path in parts:
         return
     text = files[path]
     folder = posixpath.dirname(path)
-
-    def other(place: str) -> str:
-        return posixpath.normpath(posixpath.join(folder, place))
-
     for pattern in (_IMPORT, _EXPORT_FROM):
         for found in pattern.finditer(text):
-            _add(files, other(found[2]), parts)
-    exported: list[str] = []
-
-    def take(found: re.Match[str]) -> str:
-        if not found[1]:
-            return ""
-        return f"const {{{_names(found[1])}}} = modules['{other(found[2])}'];"
-
-    def pass_on(found: re.Match[str]) -> str:
-        exported.extend(f"get {name}() {{ return modules['{other(found[2])}'].{name}; }}" for name in _list(found[1]))
-        return ""
-
-    def keep(found: re.Match[str]) -> str:
-        exported.append(f"get {found[2]}() {{ return {found[2]}; }}")
-        return f"{found[1]}{found[2]}"
-
-    text = _EXPORT.sub(keep, _EXPORT_FROM.sub(pass_on, _IMPORT.sub(take, text)))
+            if " as " in (found[1] or ""):
+                raise ValueError(f"{path}: cannot join {found[0]!r}")
+            _add(files, posixpath.normpath(posixpath.join(folder, found[2])), parts, owners)
+    exported = _EXPORT.findall(text)
+    for name in exported:
+        if name in owners:
+            raise ValueError(f"{path} and {owners[name]} both export {name}")
+        owners[name] = path
+    text = _EXPORT.sub("", _EXPORT_FROM.sub("", _IMPORT.sub("", text)))
+    # A page from disk may start workers from a script only, and scripts have no `import.meta`.
+    text = text.replace("import.meta.url", "document.baseURI")
     if left := _LEFT.search(text):
         raise ValueError(f"{path}: cannot join {left[0]!r}")
-    parts[path] = f"modules['{path}'] = (() => {{\n{text.strip()}\nreturn {{ {', '.join(exported)} }};\n}})();"
-
-
-def _list(names: str) -> list[str]:
-    return [name.strip() for name in names.split(",") if name.strip()]
-
-
-def _names(names: str) -> str:
-    """`{ a, b as c }` as a pattern: `a, b: c`."""
-    return ", ".join(name.replace(" as ", ": ") for name in _list(names))
+    if exported:
+        names = ", ".join(exported)
+        parts[path] = f"const {{ {names} }} = (() => {{\n{text.strip()}\nreturn {{ {names} }};\n}})();"
+    else:
+        parts[path] = f"(() => {{\n{text.strip()}\n}})();"

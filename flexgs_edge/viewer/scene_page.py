@@ -1,15 +1,17 @@
-"""The viewer's page for one scene: with its files on a server, or with everything in one file."""
+"""The viewer's page for one scene, which lies beside it on a server or inside it."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.viewer.assets import MAIN, PAGE, STYLE, WORKERS
+from flexgs_edge.viewer.assets import ENTRIES, PAGE, STYLE
 from flexgs_edge.viewer.join import join_modules
 
 _CONFIG = '<script type="application/json" id="scene">{}</script>'
@@ -50,44 +52,62 @@ def _short(value: float) -> float:
     return value if isinstance(value, int) else float(f"{value:.9g}")
 
 
-def served_files(files: Mapping[str, str], config: Mapping[str, Any]) -> dict[str, str]:
-    """The page with what it is told and the files beside it, by their paths.
+@dataclass(frozen=True)
+class Page:
+    """A page of one file.
 
-    Modules are joined, so that they come with one request and not one after the other.
+    Parameters
+    ----------
+    text : str
+    policy : str
+        What the page may load and run, for a header or an element of its own.
     """
-    scripts = {path: join_modules(files, path) for path in (MAIN, *WORKERS.values())}
-    return {PAGE: _replaced(files[PAGE], {_CONFIG: _config(config)}), STYLE: files[STYLE], **scripts}
+
+    text: str
+    policy: str
 
 
-def single_page(files: Mapping[str, str], config: Mapping[str, Any], scene: bytes) -> str:
-    """A page that opens from disk: viewer, decoder and scene in one file, which may load nothing from anywhere.
+def viewer_page(files: Mapping[str, str], config: Mapping[str, Any], scene: bytes | None = None) -> Page:
+    """The viewer and the decoder in one file.
 
-    Workers start from texts in the page. The policy lets only the page's own script run, by its checksum.
+    With one request, everything but the scene is there. Workers run the page's own script. The policy lets only the page's
+    own script and style in, by their checksums.
+
+    Parameters
+    ----------
+    files : mapping
+        Texts of the viewer by path.
+    config : mapping
+        From `page_config`.
+    scene : bytes, optional
+        A `.fgs` to put into the page, which then opens from disk without a network.
     """
-    script = join_modules(files, MAIN)
-    workers = "".join(
-        f'<script type="text/plain" id="{name}-worker">{join_modules(files, path)}</script>\n'
-        for name, path in WORKERS.items()
-    )
-    for text in (script, workers.replace("</script>\n", "")):
-        if "</script" in text.lower() or "<!--" in text:
-            raise AssertionError("a script that would end in the middle")
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    script = join_modules(files, ENTRIES)
+    if "</script" in script.lower() or "<!--" in script:
+        raise AssertionError("a script that would end in the middle")
+    style = _short_style(files[STYLE])
     policy = (
-        f"default-src 'none'; script-src 'sha256-{digest}' blob:; worker-src blob:; style-src 'unsafe-inline'; "
-        "img-src data: blob:; base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; script-src {_digest(script)} blob:; worker-src blob:; style-src {_digest(style)}; "
+        f"img-src data: blob:; base-uri 'none'; form-action 'none'"
     )
-    data = base64.b64encode(scene).decode()
-    return _replaced(
-        files[PAGE],
-        {
-            _CHARSET: f'{_CHARSET}\n<meta http-equiv="Content-Security-Policy" content="{policy}">',
-            _STYLE_LINK: f"<style>\n{files[STYLE]}</style>",
-            _CONFIG: _config(config),
-            _SCRIPT: f'{workers}<script type="application/octet-stream" id="scene-bytes">{data}</script>\n'
-            f'<script type="module">{script}</script>',
-        },
-    )
+    made = f'<script type="module" id="script">{script}</script>'
+    changes = {_SCRIPT: made, _STYLE_LINK: f"<style>{style}</style>", _CONFIG: _config(config)}
+    if scene is None:
+        policy += "; connect-src 'self'"
+    else:
+        changes[_CHARSET] = f'{_CHARSET}\n<meta http-equiv="Content-Security-Policy" content="{policy}">'
+        data = base64.b64encode(scene).decode()
+        changes[_SCRIPT] = f'<script type="application/octet-stream" id="scene-bytes">{data}</script>\n{made}'
+    return Page(_replaced(files[PAGE], changes), policy)
+
+
+def _digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def _short_style(text: str) -> str:
+    """The style without indentation and ends of lines; our own has neither comments nor strings that would suffer."""
+    return re.sub(r"\s*\n\s*", "", text)
 
 
 def _config(config: Mapping[str, Any]) -> str:

@@ -33,12 +33,9 @@ CONNECTIONS_MOST = 64
 _PIECE = 1 << 16
 _REQUEST = re.compile(r"([A-Z]{1,16}) (\S{1,2048}) HTTP/1\.[01]")
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
-_POLICY = (
-    "default-src 'none'; script-src 'self'; worker-src 'self'; connect-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
+_NOTHING = "default-src 'none'; frame-ancestors 'none'"
 _HEADERS = {
-    "Content-Security-Policy": _POLICY,
+    "Content-Security-Policy": _NOTHING,
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -59,11 +56,14 @@ class Resource:
     content : bytes or Path
     packed : bytes, optional
         The content packed with gzip, for those who take it. A scene has none: it is packed already.
+    policy : str, optional
+        What a page may load and run. Default: nothing.
     """
 
     kind: str
     content: bytes | Path
     packed: bytes | None = None
+    policy: str | None = None
 
 
 class SceneServer:
@@ -194,6 +194,8 @@ class _Handler(socketserver.BaseRequestHandler):
         content, about = resource.content, {"Content-Type": resource.kind, "Accept-Ranges": "bytes"}
         if resource.packed is not None and "range" not in headers and _takes_gzip(headers.get("accept-encoding", "")):
             content, about = resource.packed, {"Content-Type": resource.kind, "Content-Encoding": "gzip"}
+        if resource.policy is not None:
+            about["Content-Security-Policy"] = f"{resource.policy}; frame-ancestors 'none'"
         size = len(content) if isinstance(content, bytes) else os.stat(content).st_size
         part = _part(headers.get("range"), size)
         start, stop = part or (0, size)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
 import json
 import os
@@ -22,8 +23,9 @@ from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.commands.view import view
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import write_ply
-from flexgs_edge.viewer.assets import MAIN, WORKERS, web_files
+from flexgs_edge.viewer.assets import ENTRIES, web_files
 from flexgs_edge.viewer.join import join_modules
+from flexgs_edge.viewer.scene_page import page_config, viewer_page
 from grid_scenes import make_grid
 from quantized_scenes import make_scene
 
@@ -37,6 +39,9 @@ CAMERA = {
     "fx": 40,
     "fy": 40,
 }
+
+MOST_SENT = 33_500
+"""Bytes of viewer and decoder with gzip."""
 
 
 @pytest.fixture
@@ -52,6 +57,18 @@ def part(page: str, name: str) -> str:
     return found[1]
 
 
+def check_digests(page: str, policy: str) -> None:
+    """The policy lets in what stands in the page, and nothing else that is written into it."""
+    for kind, element in (
+        ("script", r'<script type="module" id="script">(.*?)</script>'),
+        ("style", r"<style>(.*?)</style>"),
+    ):
+        (text,) = re.findall(element, page, re.DOTALL)
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"{kind}-src 'sha256-{digest}'" in policy
+    assert policy.startswith("default-src 'none'; ") and "unsafe" not in policy
+
+
 def test_a_page_of_one_file(scene: Path) -> None:
     output = scene.with_suffix(".html")
     result = view(scene, output)
@@ -62,10 +79,9 @@ def test_a_page_of_one_file(scene: Path) -> None:
     assert config["poses"][0]["name"] == CAMERA["img_name"] and config["poses"][0]["position"] == CAMERA["position"]
     assert config["look"]["near"] == 0.01
     assert "<b>" not in page
-    script = re.search(r'<script type="module">(.*?)</script>', page, re.DOTALL)
-    assert script is not None
-    digest = base64.b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
-    assert f"script-src 'sha256-{digest}' blob:" in page
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
+    assert policy is not None and "connect-src" not in policy[1]
+    check_digests(page, policy[1])
     # Nothing is fetched: no address but those of data.
     assert not re.search(r"""(?:src|href)=["'](?!data:)""", page) and "http://" not in page and "https://" not in page
     assert (result.size, result.views, result.page_size) == (scene.stat().st_size, 1, output.stat().st_size)
@@ -108,11 +124,12 @@ def test_it_serves_until_it_is_stopped(scene: Path, stop: signal.Signals) -> Non
         try:
             assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]+/viewer/index\.html", address)
             with urllib.request.urlopen(address) as answer:
-                page = answer.read().decode()
+                page, policy = answer.read().decode(), answer.headers["Content-Security-Policy"]
+            check_digests(page, policy)
+            assert "connect-src 'self'; frame-ancestors 'none'" in policy
             assert json.loads(part(page, "scene"))["scene"] == "scene.fgs"
-            for name in ("scene.fgs", "src/page.js", "style.css", "src/load-worker.js", "src/sort-worker.js"):
-                with urllib.request.urlopen(urllib.parse.urljoin(address, name)) as answer:
-                    assert answer.status == 200, name
+            with urllib.request.urlopen(urllib.parse.urljoin(address, "scene.fgs")) as answer:
+                assert answer.read() == scene.read_bytes()
         finally:
             process.send_signal(stop)
         rest = process.communicate(timeout=60)[1]
@@ -122,28 +139,46 @@ def test_it_serves_until_it_is_stopped(scene: Path, stop: signal.Signals) -> Non
 
 def test_modules_are_joined() -> None:
     files = {
-        "a/main.js": "import { two, one as uno } from './b.js';\nimport './c.js';\nexport const three = uno + two();\n"
+        "a/main.js": "import { two, one } from './b.js';\nimport './c.js';\nexport const three = one + two();\n"
         "globalThis.found = three;\n",
-        "a/b.js": "/** A comment. */\nexport { one } from '../d.js';\nexport function two() {\n  return 2;\n}\n",
+        "a/b.js": "/** A comment. */\nexport { one } from '../d.js';\nconst own = 2;\n"
+        "export function two() {\n  return own;\n}\n",
         "a/c.js": "export class C {}\n// alone\n",
-        "d.js": "export const one = 1;\n",
+        "d.js": "const own = 1;\nexport const one = own;\n",
+        "a/other.js": "import { one } from '../d.js';\nglobalThis.found = -one;\n",
     }
-    text = join_modules(files, "a/main.js")
+    text = join_modules(files, {"page": "a/main.js", "other": "a/other.js"})
     assert "comment" not in text and "alone" not in text and "import" not in text
     node = shutil.which("node")
     if node is not None:
-        run = subprocess.run([node, "-e", f"{text}\nconsole.log(found)"], capture_output=True, text=True, check=True)
-        assert run.stdout == "3\n"
-    with pytest.raises(ValueError, match="cannot join 'export default"):
-        join_modules({"x.js": "export default 3;\n"}, "x.js")
+        for role, wanted in (("document = {}", "3"), ("name = 'other'", "-1")):
+            script = f"globalThis.{role};\n{text}\nconsole.log(found)"
+            run = subprocess.run([node, "-e", script], capture_output=True, text=True, check=True)
+            assert run.stdout == f"{wanted}\n"
 
 
-def test_our_modules_are_joined_into_scripts_that_parse(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("export default 3;", "cannot join 'export default"),
+        ("import { one as uno } from './d.js';", "cannot join .import { one as uno }"),
+        ("import { one } from './d.js';\nexport const one = 2;", "both export one"),
+    ],
+)
+def test_modules_that_cannot_be_joined(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        join_modules({"x.js": f"{text}\n", "d.js": "export const one = 1;\n"}, {"page": "x.js"})
+
+
+def test_our_modules_are_joined_into_a_script_that_parses(tmp_path: Path) -> None:
     node = shutil.which("node")
     if node is None:
         pytest.skip("no node to parse scripts with")
-    for entry in (MAIN, *WORKERS.values()):
-        # The page's script is a module, for `import.meta`.
-        place = tmp_path / f"{Path(entry).stem}{'.mjs' if entry == MAIN else '.cjs'}"
-        place.write_text(join_modules(web_files(), entry))
-        subprocess.run([node, "--check", str(place)], check=True, timeout=60)
+    place = tmp_path / "script.cjs"
+    place.write_text(join_modules(web_files(), ENTRIES))
+    subprocess.run([node, "--check", str(place)], check=True, timeout=60)
+
+
+def test_what_a_browser_is_sent_stays_small() -> None:
+    page = viewer_page(web_files(), page_config("", [], {}, "scene.fgs"))
+    assert len(gzip.compress(page.text.encode())) <= MOST_SENT

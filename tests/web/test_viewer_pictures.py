@@ -6,7 +6,6 @@ import base64
 import io
 import json
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
@@ -18,8 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import browser as browser_module
-from browser import Browser, find_browser
+from browser import Browser
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.codec.v2.container import GridContainer, write_grid
 from flexgs_edge.commands.render import render_views
@@ -30,12 +28,12 @@ from flexgs_edge.io.ply import PlySource
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.viewer.assets import PAGE
 from flexgs_edge.viewer.server import SceneServer
+from viewer_tab import decibels, drag, faults, requests, until
 from web_vectors import FOLDER
 
 POSES = (0, 27, 53)
 LOOK: dict[str, Any] = {"background": (0.2, 0.4, 0.9)}
 Drawn = Callable[[bool], tuple[str, ...]]
-SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 FINE = StepSizes(0.003, 0.1, 0.02, 0.2, 0.03, (0.03, 0.03, 0.03))
 
 
@@ -65,20 +63,6 @@ def drawn(scene: Path, sample_dir: Path, tmp_path_factory: pytest.TempPathFactor
         ).files
 
     return draw
-
-
-@pytest.fixture(scope="module")
-def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    program = find_browser()
-    if program is None:
-        pytest.skip("no Chromium: the viewer's pictures need one")
-    with pytest.MonkeyPatch.context() as patch:
-        flags = tuple(flag for flag in browser_module.FLAGS if flag != "--disable-gpu")
-        patch.setattr(browser_module, "FLAGS", (*flags, *SOFTWARE))
-        with Browser(program, tmp_path_factory.mktemp("profile")) as made:
-            if not made.run("Boolean(document.createElement('canvas').getContext('webgl2'))"):
-                pytest.skip("this Chromium has no WebGL2, not even in software")
-            yield made
 
 
 @contextmanager
@@ -114,20 +98,6 @@ def go(tab: Browser, address: str, width: int = 480, height: int = 360, dark: bo
     until(tab, "globalThis.viewer && viewer.stats.wholeMs > 0 && viewer.stats.firstMs > 0")
 
 
-def until(tab: Browser, condition: str) -> None:
-    for _ in range(600):
-        if tab.run(f"Boolean({condition})"):
-            return
-        time.sleep(0.1)
-    raise AssertionError(f"not within a minute: {condition}; {tab.run('document.body.innerText')!r}, {faults(tab)}")
-
-
-def faults(tab: Browser) -> list[str]:
-    """What went wrong in the page: exceptions, refused requests, broken policies."""
-    names = ("Runtime.exceptionThrown", "Log.entryAdded", "Network.loadingFailed")
-    return [json.dumps(event)[:500] for event in tab.events if event.get("method") in names]
-
-
 def picture(tab: Browser, pose: int, width: int, height: int) -> np.ndarray:
     text = tab.run(
         f"(async () => {{ viewer.setPose({pose}); const blob = await viewer.picture({width}, {height});"
@@ -136,10 +106,6 @@ def picture(tab: Browser, pose: int, width: int, height: int) -> np.ndarray:
     )
     data = base64.b64decode(text.partition(",")[2])
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), np.float64)
-
-
-def decibels(one: np.ndarray, two: np.ndarray) -> float:
-    return float(10 * np.log10(255**2 / max(((one - two) ** 2).mean(), 1e-9)))
 
 
 @pytest.mark.parametrize(
@@ -187,22 +153,9 @@ def test_a_browser_without_webgl2_is_told_so(tab: Browser, scene: Path) -> None:
         tab.send("Page.removeScriptToEvaluateOnNewDocument", identifier=added)
 
 
-def requests(tab: Browser) -> list[dict[str, Any]]:
-    sent = [event for event in tab.events if event.get("method") == "Network.requestWillBeSent"]
-    return [event for event in sent if not event["params"]["request"]["url"].startswith(("data:", "blob:"))]
-
-
 def eye(tab: Browser) -> list[float]:
     found: list[float] = tab.run("[...viewer.camera.eye, ...viewer.camera.axes.flat()]")
     return found
-
-
-def drag(tab: Browser, dx: int, dy: int, button: str = "left", modifiers: int = 0) -> None:
-    mouse = {"button": button, "buttons": 1 if button == "left" else 2, "modifiers": modifiers}
-    tab.send("Input.dispatchMouseEvent", type="mousePressed", x=200, y=200, clickCount=1, **mouse)
-    for step in range(1, 5):
-        tab.send("Input.dispatchMouseEvent", type="mouseMoved", x=200 + dx * step / 4, y=200 + dy * step / 4, **mouse)
-    tab.send("Input.dispatchMouseEvent", type="mouseReleased", x=200 + dx, y=200 + dy, **mouse)
 
 
 def hold(tab: Browser, key: str, code: str) -> None:

@@ -100,8 +100,8 @@ def test_what_the_writer_makes_today(node: str, tmp_path: Path) -> None:
     assert compare(node, tmp_path)["different"] == []
 
 
-def test_damaged_files_are_refused_with_the_same_words(node: str, tmp_path: Path) -> None:
-    """Bits, bytes, numbers, pieces, JSON; a part of the files with correct checksums."""
+def write_damaged(folder: Path) -> None:
+    """Damaged files, and the corpus."""
     draw = random.Random(33)
     seeds = [
         (path.read_bytes(), verify(path))
@@ -115,15 +115,87 @@ def test_damaged_files_are_refused_with_the_same_words(node: str, tmp_path: Path
     for i in range(DAMAGED):
         data, sections = seeds[i % len(seeds)]
         made = mutate_bytes(draw, data) if i % 10 < 3 else mutate_sealed(draw, data, sections)
-        (tmp_path / f"{i:04d}.fgs").write_bytes(made)
+        (folder / f"{i:04d}.fgs").write_bytes(made)
     for path in CORPUS.glob("*.fgs"):
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+        (folder / path.name).write_bytes(path.read_bytes())
+
+
+def test_damaged_files_are_refused_with_the_same_words(node: str, tmp_path: Path) -> None:
+    """Bits, bytes, numbers, pieces, JSON; a part of the files with correct checksums."""
+    write_damaged(tmp_path)
     outcomes = {path.name: outcome(path) for path in sorted(tmp_path.glob("*.fgs"))}
     assert sum("error" in record for record in outcomes.values()) > DAMAGED // 2
     (tmp_path / "expected.json").write_text(json.dumps(outcomes))
     record = compare(node, tmp_path)
     assert list(unlike(record["different"])) == []
     assert record["files"] >= DAMAGED and record["seconds"] < SLOW
+
+
+def test_nothing_large_is_made_on_a_files_word(node: str, tmp_path: Path) -> None:
+    """A file that is refused gets no array of more than four times its size, others none larger than what they hold."""
+    write_damaged(tmp_path)
+    for path in FOLDER.glob("*.fgs"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    command = [node, str(DECODER / "tests" / "allocations.mjs"), str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=250)
+    record = json.loads(result.stdout)
+    assert sum(file["refused"] for file in record) > DAMAGED // 2 and max(file["all"] for file in record) > 100_000
+    for file in record:
+        room = 4 * file["size"] if file["refused"] else max(4 * file["size"], file["values"])
+        assert file["largest"] <= room, file
+        assert file["all"] <= 12 * max(4 * file["size"], file["values"]), file
+
+
+CORRECT = """
+import { FgsError, looksLikeFgs, open, prefetch, type Chunk, type Source } from '@flexgs/decoder';
+import { openInWorker } from '@flexgs/decoder/worker';
+
+export async function read(source: Source): Promise<number> {
+  const file = await open(source, { name: 'a', fetch: { credentials: 'omit' } });
+  let sum = file.origin[0] + file.layers.length + (file.header.steps?.sh[0] ?? 0);
+  for await (const chunk of file.chunks({ sh: false, layers: 1 })) sum += add(chunk);
+  const remote = await openInWorker(await prefetch('scene.fgs'));
+  for await (const chunk of remote.chunks({ values: true })) sum += chunk.values?.means[0] ?? 0;
+  await remote.close();
+  return sum + Number(looksLikeFgs(new Uint8Array(4)));
+}
+
+function add(chunk: Chunk): number {
+  const { means, quats } = chunk.values();
+  return means[0] + quats.length + ('position' in chunk.codes ? chunk.codes.position[2][0] : 0);
+}
+
+export const offset = (error: unknown): number => (error instanceof FgsError ? error.offset : -1);
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        ("", "", None),
+        ("file.origin[0]", "file.origin[3]", "TS2493"),
+        ("layers: 1 }", "layer: 1 }", "TS2561"),
+        ("chunk.values?.means", "chunk.values?.mean", "TS2551"),
+        ("open(source,", "open(5,", "TS2345"),
+    ],
+)
+def test_its_types(node_modules: Path, tmp_path: Path, old: str, new: str, fault: str | None) -> None:
+    """By TypeScript's compiler: a page that uses all of it, and faults in it."""
+    compiler = node_modules / "typescript" / "bin" / "tsc"
+    if not compiler.is_file():
+        pytest.skip(f"no typescript in {node_modules}: npm install typescript@5")
+    assert old in CORRECT
+    (tmp_path / "use.mts").write_text(CORRECT.replace(old, new))
+    scope = tmp_path / "node_modules" / "@flexgs"
+    scope.mkdir(parents=True)
+    (scope / "decoder").symlink_to(DECODER)
+    options = ["--noEmit", "--strict", "--target", "es2022", "--module", "nodenext", "--lib", "es2022,dom,dom.iterable"]
+    command = ["node", str(compiler), *options, "use.mts"]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=250)
+    if fault is None:
+        assert result.returncode == 0, result.stdout
+    else:
+        assert result.returncode != 0 and fault in result.stdout, result.stdout
 
 
 def unlike(different: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:

@@ -9,8 +9,23 @@ export interface RangedSource {
   read(offset: number, length: number): Promise<Uint8Array>;
 }
 
+/** The ends of a file on a server, or all of it as it comes. It can be posted to a worker; a stream has to be transferred. */
+export type Prefetched = { url: string; size: number; first: Uint8Array; last: Uint8Array } | { stream: ReadableStream<Uint8Array> };
+
+/** Ask a server for the first and the last bytes of a file, while the worker that decodes it is still starting. */
+export function prefetch(url: string | URL, init?: RequestInit): Promise<Prefetched>;
+
 /** An address is asked for ranges; a server without them, a `Response` and a stream are read as they come. */
-export type Source = ArrayBuffer | ArrayBufferView | Blob | ReadableStream<Uint8Array> | Response | string | URL | RangedSource;
+export type Source =
+  | ArrayBuffer
+  | ArrayBufferView
+  | Blob
+  | ReadableStream<Uint8Array>
+  | Response
+  | string
+  | URL
+  | RangedSource
+  | Prefetched;
 
 export interface OpenOptions {
   /** Name of the file, which errors begin with. */

@@ -1,15 +1,17 @@
 import { crc32, u32 } from './bytes.js';
 import { FgsError, HeaderError, StreamError } from './errors.js';
 import { decodeHeader2, planChunks2, wrongSize2 } from './header2.js';
+import { StreamSource } from './incoming.js';
 import { MAGIC, PREAMBLE_BYTES } from './limits.js';
 import { readModel } from './model.js';
 import { compareCrc, readPreamble, truncated } from './preamble.js';
 import { rangedChunks } from './ranged.js';
-import { StreamSource, toSource } from './sources.js';
+import { toSource } from './sources.js';
 import { streamedChunks } from './streamed.js';
 import { decodeHeader1, planChunks1, readRanges, wrongSize1 } from './version1.js';
 
 export { FgsError } from './errors.js';
+export { prefetch } from './http.js';
 
 /**
  * Open a `.fgs` file of version 1 or 2: read and check its header and its model. See `index.d.ts`.

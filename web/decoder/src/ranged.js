@@ -8,15 +8,32 @@ export async function* rangedChunks(source, name, frame, { sh, layers, first }) 
   const table = await source.read(size - header.tableBytes, header.tableBytes);
   const { lengths, sums } = readTable(name, frame, table);
   let offset = header.chunksOffset;
-  for (const place of frame.plan()) {
-    const length = lengths[place.index];
-    if (place.layer >= layers) return;
-    if (place.index >= first) {
-      const bytes = await source.read(offset, length);
-      yield checkedChunk(name, frame, place, offset, length, sums[place.index], bytes, sh);
+  const [from, to] = wantedBytes(frame, lengths, first, layers);
+  source.ahead?.(from, to);
+  try {
+    for (const place of frame.plan()) {
+      const length = lengths[place.index];
+      if (place.layer >= layers) return;
+      if (place.index >= first) {
+        const bytes = await source.read(offset, length);
+        yield checkedChunk(name, frame, place, offset, length, sums[place.index], bytes, sh);
+      }
+      offset += length;
     }
-    offset += length;
+  } finally {
+    await source.cancel?.();
   }
+}
+
+/** Where the chunks that are asked for begin and end. */
+function wantedBytes(frame, lengths, first, layers) {
+  let from = frame.header.chunksOffset;
+  let to = from;
+  for (const place of frame.plan()) {
+    if (place.index < first) from += lengths[place.index];
+    if (place.layer < layers) to += lengths[place.index];
+  }
+  return [from, to];
 }
 
 /** Check a chunk and decode it. */

@@ -2,7 +2,7 @@ import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
 import { createServer } from 'node:http';
 import { test } from 'node:test';
-import { FgsError, looksLikeFgs, open } from '../src/index.js';
+import { FgsError, looksLikeFgs, open, prefetch } from '../src/index.js';
 import { readAll, streamOf } from './read.mjs';
 
 const NAME = 'three_chunks_of_512_rows_in_two_layers.fgs';
@@ -10,16 +10,18 @@ const FOLDER = new URL('vectors/', import.meta.url);
 const bytes = new Uint8Array(readFileSync(new URL(NAME, FOLDER)));
 const wanted = JSON.parse(readFileSync(new URL('vectors.json', FOLDER), 'utf8'))[NAME];
 
-async function withServer(ranges, use) {
+/** `ranges`: 'all', 'no' ranges, or none that count from the 'end'. `cut`: the byte at which answers to ranges stop. */
+async function withServer(ranges, use, cut = Infinity) {
   const asked = [];
   const server = createServer((request, response) => {
-    const range = /^bytes=(\d+)-(\d+)$/.exec(request.headers.range ?? '');
+    const range = /^bytes=(\d*)-(\d*)$/.exec(request.headers.range ?? '');
     asked.push(request.headers.range);
     if (request.url !== '/scene.fgs') return response.writeHead(404).end();
-    if (!ranges || !range) return response.writeHead(200).end(bytes);
-    const [first, last] = [Number(range[1]), Math.min(Number(range[2]), bytes.length - 1)];
+    if (ranges === 'no' || !range || (ranges === 'end' && !range[1])) return response.writeHead(200).end(bytes);
+    const first = range[1] ? Number(range[1]) : Math.max(bytes.length - Number(range[2]), 0);
+    const last = range[1] && range[2] ? Math.min(Number(range[2]), bytes.length - 1) : bytes.length - 1;
     response.writeHead(206, { 'Content-Range': `bytes ${first}-${last}/${bytes.length}` });
-    return response.end(bytes.subarray(first, last + 1));
+    return response.end(bytes.subarray(first, Math.min(last + 1, Math.max(cut, first))));
   });
   await new Promise((ready) => server.listen(0, '127.0.0.1', ready));
   try {
@@ -30,16 +32,54 @@ async function withServer(ranges, use) {
   }
 }
 
-test('an address with ranges', () =>
-  withServer(true, async (url, asked) => {
-    assert.deepEqual(await readAll(url), wanted);
-    assert.ok(asked.every((range) => range));
+for (const ranges of ['all', 'end', 'no']) {
+  test(`an address on a server with ranges: ${ranges}`, () =>
+    withServer(ranges, async (url, asked) => {
+      assert.deepEqual(await readAll(ranges === 'no' ? new URL(url) : url), wanted);
+      assert.ok(asked.every((range) => range) && asked.length === 2, asked.join());
+    }));
+}
+
+const ends = (url, first, last) => ({ url, size: bytes.length, first: bytes.slice(0, first), last: bytes.slice(bytes.length - last) });
+
+test('between its ends a file comes in one range, whatever the ends are', () =>
+  withServer('all', async (url, asked) => {
+    for (const [first, last] of [
+      [5000, 36],
+      [5000, 5000],
+      [20, 0],
+      [0, 36],
+    ]) {
+      asked.length = 0;
+      assert.deepEqual(await readAll(ends(url, first, last)), wanted);
+      const middle = asked.filter((range) => Number(/-(\d+)$/.exec(range)[1]) > 9000);
+      assert.ok(asked.length < 6 && middle.length <= 2, asked.join());
+    }
+    const file = await open(ends(url, 5000, 36));
+    asked.length = 0;
+    const seen = [];
+    for await (const chunk of file.chunks({ first: 1, layers: 1 })) seen.push(chunk.index);
+    assert.deepEqual(seen, [1]);
+    assert.equal(asked.length, 1);
+    const [from, to] = asked[0].match(/\d+/g).map(Number);
+    assert.ok(from > 5000 && to < bytes.length - 4000, asked[0]);
+    for await (const chunk of file.chunks()) if (chunk.index === 0) break;
+    assert.equal((await open(ends(url, 5000, 36))).count, wanted.count);
   }));
 
-test('an address without ranges', () => withServer(false, async (url) => assert.deepEqual(await readAll(new URL(url)), wanted)));
+test('a range that ends early, or a server that changed its mind', async () => {
+  await withServer('all', (url) => assert.rejects(readAll(ends(url, 5000, 36)), /wanted \d+ bytes from 5000 on, got 2000/), 7000);
+  await withServer('no', (url) => assert.rejects(readAll(ends(url, 5000, 36)), /does not answer to ranges any more/));
+});
+
+test('what prefetch gives can be opened', async () => {
+  for (const ranges of ['all', 'no']) {
+    await withServer(ranges, async (url) => assert.deepEqual(await readAll(await prefetch(url)), wanted));
+  }
+});
 
 test('a response, and an address that is not there', () =>
-  withServer(false, async (url) => {
+  withServer('no', async (url) => {
     assert.deepEqual(await readAll(await fetch(url)), wanted);
     await assert.rejects(open(`${url}x`), /the server says 404/);
   }));

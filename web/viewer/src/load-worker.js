@@ -1,7 +1,7 @@
 import { FgsError, open } from '../../decoder/src/index.js';
 import { packChunk } from './pack.js';
 
-/** Decode a scene and pack it for the textures. In: { source, name }. Out: { header }, { chunk }, { done } or { error }. */
+/** Decode a scene and pack it for the textures. In: { source, name } or { error }. Out: { header }, { chunk }, { done } or { error }. */
 async function load(source, name) {
   const file = await open(source, { name });
   const { count, shDegree, origin, settings, layers, size, version, header } = file;
@@ -9,7 +9,7 @@ async function load(source, name) {
   self.postMessage({ header: { count, shDegree, origin, settings, layers, size, version, shRows } });
   let shBefore = 0;
   for await (const chunk of file.chunks()) {
-    const packed = packChunk(chunk.values(), chunk.rows, shDegree, shBefore);
+    const packed = packChunk(chunk.values(), chunk.rows, shDegree, shBefore, chunk.codes.degrees);
     shBefore += packed.shRows;
     // The header's count of them is not checked by a decoder, and our room was made for it.
     if (shBefore > shRows) throw new Error(`The header says that ${shRows} splats have SH, but more have.`);
@@ -21,7 +21,8 @@ async function load(source, name) {
 }
 
 self.onmessage = ({ data }) => {
-  load(data.source, data.name).catch((error) => {
+  const loaded = data.error ? Promise.reject(new Error(data.error)) : load(data.source, data.name);
+  loaded.catch((error) => {
     const advice = error instanceof FgsError ? '' : 'Cannot load the scene: ';
     self.postMessage({ error: advice + error.message });
   });

@@ -23,12 +23,12 @@ export function shPerLine(degree) {
  * @param {number} rows
  * @param {number} degree of the scene
  * @param {number} shBefore rows with SH in the chunks before
+ * @param {Uint8Array} [degrees] of the rows; files of version 1 do not tell
  */
-export function packChunk(values, rows, degree, shBefore) {
+export function packChunk(values, rows, degree, shBefore, degrees = rowDegrees(values.shRest, rows, degree)) {
   const data = new Uint32Array(rows * TEXELS * 4);
   const floats = new Float32Array(data.buffer);
   const each = (degree + 1) ** 2 - 1;
-  const degrees = rowDegrees(values.shRest, rows, degree);
   let shRows = 0;
   const { means, logScales, opacityLogits, quats, shDc } = values;
   for (let i = 0, at = 0; i < rows; i++, at += 16) {
@@ -50,7 +50,7 @@ export function packChunk(values, rows, degree, shBefore) {
     data[at + 15] = degrees[i];
   }
   const sh = new Uint32Array(shRows * shTexels(degree) * 4);
-  packSh(values.shRest, rows, each, degrees, new Uint16Array(sh.buffer), 8 * shTexels(degree));
+  packSh(values.shRest, rows, each, rowsWithSh(degrees, shRows), new Uint16Array(sh.buffer), 8 * shTexels(degree));
   return { data, sh, shRows, means: means.slice(), importance: importanceOf(values, rows) };
 }
 
@@ -69,18 +69,23 @@ function raise(shRest, from, rows, degree, degrees) {
   for (let i = 0; i < rows; i++) if (shRest[from + i] !== 0 && degrees[i] < degree) degrees[i] = degree;
 }
 
-function packSh(shRest, rows, each, degrees, halves, width) {
+function rowsWithSh(degrees, count) {
+  const some = new Int32Array(count);
+  for (let i = 0, at = 0; i < degrees.length; i++) if (degrees[i]) some[at++] = i;
+  return some;
+}
+
+function packSh(shRest, rows, each, some, halves, width) {
   for (let plane = 0; plane < 3 * each; plane++) {
     const [colour, k] = [Math.floor(plane / each), plane % each];
-    packPlane(shRest, plane * rows, rows, degrees, halves, width, 3 * k + colour);
+    packPlane(shRest, plane * rows, some, halves, width, 3 * k + colour);
   }
 }
 
-function packPlane(shRest, from, rows, degrees, halves, width, place) {
-  for (let i = 0, at = place; i < rows; i++) {
-    if (degrees[i] === 0) continue;
-    halves[at] = toHalf(shRest[from + i]);
-    at += width;
+function packPlane(shRest, from, some, halves, width, place) {
+  for (let i = 0, at = place; i < some.length; i++, at += width) {
+    const value = shRest[from + some[i]];
+    if (value) halves[at] = toHalf(value);
   }
 }
 

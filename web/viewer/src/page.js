@@ -1,10 +1,10 @@
 // The page: its buttons and texts. All text of files reaches it as text, never as HTML.
+import { bytesInside } from './inside.js';
 import { Viewer } from './viewer.js';
 
 const find = (id) => document.getElementById(id);
 const config = JSON.parse(find('scene')?.textContent || '{}');
 const status = find('status');
-const numbers = new Intl.NumberFormat('en');
 
 function say(text, isError = false) {
   status.textContent = text;
@@ -32,14 +32,8 @@ function start() {
 
 /** The scene of the page: bytes that lie in it, or an address. */
 function firstScene() {
-  const inside = find('scene-bytes');
-  if (inside) {
-    const text = atob(inside.textContent.trim());
-    const bytes = new Uint8Array(text.length);
-    for (let i = 0; i < bytes.length; i++) bytes[i] = text.charCodeAt(i);
-    inside.remove();
-    return { source: bytes, name: config.name };
-  }
+  const bytes = bytesInside('scene-bytes');
+  if (bytes) return { source: bytes, name: config.name };
   const address = config.scene ?? new URLSearchParams(location.search).get('scene');
   return address ? { source: new URL(address, location.href).href, name: config.name ?? address } : null;
 }
@@ -127,7 +121,11 @@ async function save(viewer) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
 
+/** Made when it is needed: it takes as long as a worker to start. */
+let numbers = null;
+
 function showNumbers({ stats, canvas, renderer }) {
+  numbers ??= new Intl.NumberFormat('en');
   const rows = {
     splats: `${numbers.format(stats.drawn)} of ${numbers.format(stats.splats)}`,
     file: stats.bytes ? `${numbers.format(Math.round(stats.bytes / 1000))} kB` : '',

@@ -2,7 +2,7 @@ import { boxOf, Camera, outsidePose, upOf } from './camera.js';
 import { Controls } from './controls.js';
 import { Renderer } from './renderer.js';
 import { subtract, dot, times, add } from './vectors.js';
-import { startWorker } from './workers.js';
+import { sendScene, startWorker } from './workers.js';
 
 const GRID = 256 * 2 ** 20;
 
@@ -21,7 +21,7 @@ export class Viewer extends EventTarget {
     super();
     this.canvas = canvas;
     this.fresh = { load: startWorker('load'), sort: startWorker('sort'), first, started: performance.now() };
-    if (first) this.fresh.load.postMessage(first);
+    if (first) sendScene(this.fresh.load, first.source, first.name);
     this.renderer = new Renderer(canvas, { half });
     this.camera = new Camera([0, -1, 0]);
     this.controls = new Controls(canvas, () => this.camera, () => this.refresh());
@@ -50,14 +50,15 @@ export class Viewer extends EventTarget {
    * Load a scene.
    *
    * @param {string | Uint8Array | Blob} source an absolute address, or bytes
-   * @param {{name: string, poses: object[], look?: object, agree?: (bytes: number) => Promise<boolean>}} options
+   * @param {{name: string, poses: object[], pose?: number, look?: object, agree?: (bytes: number) => Promise<boolean>}} options
    * @returns {Promise<void>} when all is there
    */
-  async load(source, { name, poses = [], look = {}, agree = async () => true }) {
+  async load(source, { name, poses = [], pose = 0, look = {}, agree = async () => true }) {
     this.loader?.terminate();
     this.sorter?.terminate();
     this.#reset();
     this.poses = poses;
+    this.pose = pose;
     this.asked = look;
     const begun = this.fresh?.first?.source === source && this.fresh;
     const { load, sort } = this.fresh ?? { load: startWorker('load'), sort: startWorker('sort') };
@@ -70,7 +71,7 @@ export class Viewer extends EventTarget {
       await new Promise((resolve, reject) => {
         this.loader.onerror = (event) => reject(new Error(event.message || 'The worker that decodes did not start.'));
         this.loader.onmessage = ({ data }) => this.#loaded(data, agree).then((done) => done && resolve(), reject);
-        if (!begun) this.loader.postMessage({ source, name });
+        if (!begun) sendScene(this.loader, source, name);
       });
     } catch (error) {
       this.loader.terminate();
@@ -109,7 +110,7 @@ export class Viewer extends EventTarget {
     Object.assign(this.look, this.asked);
     Object.assign(this.stats, { splats: header.count, bytes: header.size, layers: header.layers.length });
     this.camera = new Camera(upOf(this.poses));
-    if (this.poses.length) this.setPose(0);
+    if (this.poses.length) this.setPose(this.pose);
     this.#tell('begun');
     return false;
   }
@@ -120,7 +121,7 @@ export class Viewer extends EventTarget {
     if (!this.box) {
       this.box = boxOf(chunk.means, chunk.rows);
       if (!this.poses.length) this.poses = [outsidePose(this.box, this.header.origin)];
-      this.setPose(0);
+      this.setPose(this.pose);
       this.#tell('poses');
     }
     this.sorter.postMessage({ add: { means: chunk.means, importance: chunk.importance } }, [
@@ -128,6 +129,8 @@ export class Viewer extends EventTarget {
       chunk.importance.buffer,
     ]);
     this.sortedFor = null;
+    // Not with the next frame: a frame of what is there may take longer than the sort.
+    this.#sortIfNeeded();
     this.refresh();
   }
 
@@ -226,9 +229,14 @@ export class Viewer extends EventTarget {
 
   /** What was drawn is taken back: a damaged file is no scene. */
   #fail(message) {
+    // An order that is on its way would bring it back.
+    if (this.sorter) this.sorter.onmessage = null;
+    this.sorter?.terminate();
+    this.sorting = null;
     this.renderer.drawn = 0;
     this.rows = 0;
     this.refresh();
+    this.#tell('sorted');
     this.dispatchEvent(new CustomEvent('failed', { detail: message }));
   }
 

@@ -69,6 +69,7 @@ test('chunks are packed: rows with SH lie apart', () => {
   assert.equal(fromHalf(halves[width + 8]), -2);
   assert.deepEqual([new Float32Array(data.buffer)[16], new Float32Array(data.buffer)[18]], [1, 7]);
   assert.equal(shPerLine(3) * shTexels(3) <= 2048, true);
+  assert.deepEqual(packChunk(values, rows, 1, 10, Uint8Array.of(0, 1, 1)), { ...packChunk(values, rows, 1, 10) });
 });
 
 function axesAreRight(camera) {

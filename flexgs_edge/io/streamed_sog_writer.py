@@ -1,0 +1,119 @@
+"""Write streamed SOG scenes of PlayCanvas: `lod-meta.json`, and a folder of pictures for each part of each level.
+
+A level stands for the whole scene, so each is written whole: the finest has all layers of a `.fgs`, the next all but the last,
+and so on. Viewers load a coarse level first, and finer ones where somebody looks.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge._version import __version__
+from flexgs_edge.io.reading import Writing
+from flexgs_edge.io.sog import META
+from flexgs_edge.io.sog_writer import write_sog
+from flexgs_edge.scene.curve import near_rows
+from flexgs_edge.scene.rotations import matrices
+from flexgs_edge.scene.source import SceneSource
+
+STREAMED = "lod-meta.json"
+LEAF_ROWS = 1 << 19
+"""Most Gaussians of a part at the finest level. Smaller parts pay for more palettes."""
+_REACH = 3.0
+"""Standard deviations within which a Gaussian counts for the box of its part."""
+_CHUNK_ROWS = 65536
+
+
+def level_counts(layers: Sequence[int]) -> list[int]:
+    """Gaussians of each level, the finest first, from the Gaussians that each layer adds.
+
+    >>> level_counts([5, 0, 10, 20]), level_counts([0, 3])
+    ([35, 15, 5], [3])
+    """
+    sums = np.cumsum(np.asarray(layers, np.int64))
+    return sorted({int(count) for count in sums if count}, reverse=True)
+
+
+def write_streamed_sog(folder: Path, source: SceneSource, layers: Sequence[int], writing: Writing) -> None:
+    """Write the scene into an empty folder.
+
+    Parameters
+    ----------
+    folder : Path
+    source : SceneSource
+        World positions, as `write_sog` takes it; the rows of earlier layers first.
+    layers : sequence of int
+        Gaussians of each layer.
+    writing : Writing
+    """
+    writer = _Writer(folder, source, level_counts(layers), writing)
+    tree = writer.node(np.arange(source.count))
+    meta = {
+        "version": 1,
+        "asset": {"generator": f"flexgs-edge {__version__}"},
+        "count": sum(writer.counts),
+        "counts": writer.counts,
+        "lodLevels": len(writer.counts),
+        "filenames": writer.files,
+        "tree": tree,
+    }
+    (folder / STREAMED).write_text(json.dumps(meta, separators=(",", ":"), allow_nan=False))
+
+
+class _Writer:
+    """Writes the nodes of the tree, and the folders of its leaves."""
+
+    def __init__(self, folder: Path, source: SceneSource, counts: list[int], writing: Writing) -> None:
+        self.folder, self.source, self.counts, self.writing = folder, source, counts, writing
+        parts = [source.read(rows, ["means"])["means"] for rows in source.chunks(_CHUNK_ROWS)]
+        self.means = np.concatenate(parts, axis=1)
+        self.files: list[str] = []
+        self.leaves = 0
+
+    def node(self, rows: np.ndarray) -> dict[str, Any]:
+        """Halves along the widest axis, or the levels of these rows, which ascend."""
+        if len(rows) <= LEAF_ROWS:
+            return {"bound": self._box(rows), "lods": self._levels(rows)}
+        here = self.means[:, rows]
+        order = rows[np.argsort(here[np.ptp(here, axis=1).argmax()], kind="stable")]
+        children = [self.node(np.sort(half)) for half in np.array_split(order, 2)]
+        lows, highs = ([child["bound"][end] for child in children] for end in ("min", "max"))
+        bound = {"min": np.min(lows, axis=0).tolist(), "max": np.max(highs, axis=0).tolist()}
+        return {"bound": bound, "children": children}
+
+    def _levels(self, rows: np.ndarray) -> dict[str, Any]:
+        levels: dict[str, Any] = {}
+        for level, count in enumerate(self.counts):
+            some = rows[: np.searchsorted(rows, count)]
+            if not some.size:
+                break  # coarser levels have even fewer
+            name = f"{level}_{self.leaves}"
+            self._write(name, self.source.select(some[near_rows(self.means[:, some])]))
+            levels[str(level)] = {"file": len(self.files), "offset": 0, "count": len(some)}
+            self.files.append(f"{name}/{META}")
+        self.leaves += 1
+        return levels
+
+    def _write(self, name: str, source: SceneSource) -> None:
+        file = io.BytesIO()
+        write_sog(file, source, self.writing)
+        with zipfile.ZipFile(file) as archive:
+            archive.extractall(self.folder / name)
+
+    def _box(self, rows: np.ndarray) -> dict[str, list[float]]:
+        """The box around the Gaussians of these rows, with the digits of float32."""
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for start in range(0, len(rows), _CHUNK_ROWS):
+            planes = self.source.read(rows[start : start + _CHUNK_ROWS], ["means", "log_scales", "quats"])
+            scales = np.exp(planes["log_scales"].T.astype(np.float64))
+            reach = _REACH * np.sqrt(np.square(matrices(planes["quats"]) * scales[:, None]).sum(axis=2)).T
+            low = np.minimum(low, (planes["means"] - reach).min(axis=1))
+            high = np.maximum(high, (planes["means"] + reach).max(axis=1))
+        return {name: [float(f"{value:.7g}") for value in end] for name, end in (("min", low), ("max", high))}
