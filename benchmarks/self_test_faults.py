@@ -117,8 +117,8 @@ def judge(fault: Fault | None, place: Path, forms: tuple[str, ...]) -> tuple[str
 def forms_of(fault: Fault) -> tuple[str, ...]:
     """Forms whose program has the file."""
     if fault.file.startswith("blend_"):
-        return ("gpu",) if fault.file == "blend_gpu.cl" else ("w16", "w1", "w4")
-    return ("w16", "gpu", "w4")
+        return ("gpu4", "gpu") if fault.file == "blend_gpu.cl" else ("w16", "w1", "w4")
+    return ("fma",) if fault.function == "written_fma" else ("w16", "gpu", "w4")
 
 
 def judge_all(chosen: list[Fault], place: Path, workers: int, verbose: bool) -> list[tuple[Fault, str, str]]:

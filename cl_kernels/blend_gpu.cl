@@ -1,16 +1,29 @@
-// Front-to-back blending of one tile by one 16x16 work-group, one work-item a pixel; splats come in batches through local memory.
-// It has the arguments, the written forms and the bits of blend_cpu.cl. W must be 1. No return before a barrier and no doubles.
-// It takes 256 work-items and less than 16 KiB of local memory, so that small GPUs can run it.
+// Front-to-back blending of one tile by one work-group, W pixels of a row a work-item; splats come in batches through local memory.
+// It has the arguments, the written forms and the bits of blend_cpu.cl. No return before a barrier and no doubles.
+// It takes 256 / W work-items and less than 16 KiB of local memory, so that small GPUs can run it.
 // Twin: flexgs_edge.kernels.twins.blend
 
-#if W != 1
-#error "the GPU form is scalar: build with -DW=1"
+#if W != 1 && W != 4
+#error "a work-item has 1 or 4 pixels of a row of a block: build with -DW=1 or 4"
 #endif
 #if !defined(STATS) || !defined(BLEND)
 #error "BLEND (the kernel's name) and STATS (0: image only, 1: hits and weights, 2: removal costs, 3: residual, 4: residual and removal costs, 5: gradients) must be defined"
 #endif
 
-#define BATCH 64   // splats in local memory at a time
+#define BATCH 64          // splats in local memory at a time
+#define ITEMS (256 / W)   // work-items of a tile
+
+#ifndef BLEND_HELPERS
+#define BLEND_HELPERS
+// Counts hits; a lane holds -1 for each.
+inline uint hit_count(IW m) {
+#if W == 1
+  return (uint)-m;
+#else
+  return (uint)-((m.s0 + m.s2) + (m.s1 + m.s3));
+#endif
+}
+#endif
 
 #undef SUMS
 #undef SUM_UNIT
@@ -31,7 +44,7 @@
 #define SUM_UNIT (c < 4 ? FIXED_WEIGHT : FIXED_MOMENT)
 #endif
 
-__kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
+__kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void BLEND(
     const uint tiles_x,
     const uint blocks,
     const int width,
@@ -63,29 +76,35 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
   __local float parts[SUMS][256];
   __local uint counts;
 #endif
-  // Work-items follow the blocks: item p is pixel p % 16 of block p / 16. `state` has the same layout.
-  const int p = get_local_id(0), b = p >> 4, lane = p & 15;
+  // Pixels follow the blocks: place q is pixel q % 16 of block q / 16, and item p has W places. `state` has the same layout.
+  const int p = get_local_id(0), b = p * W >> 4, lane = p * W & 15;
   const uint tile = get_group_id(0);
-  const int px = (int)(tile % tiles_x) * TILE + BLOCK * (b & 3) + (lane & 3);
-  const int py = (int)(tile / tiles_x) * TILE + BLOCK * (b >> 2) + (lane >> 2);
-  __global float *own = state + (size_t)tile * 1024 + p;
-  float red = 0.0f, green = 0.0f, blue = 0.0f, t = px < width && py < height ? 1.0f : -1.0f;
+  const int left = (int)(tile % tiles_x) * TILE + BLOCK * (b & 3), top = (int)(tile / tiles_x) * TILE + BLOCK * (b >> 2);
+  const FW px = TO_F(((LANE_INDEX + (IW)lane) & (IW)3) + (IW)left), py = TO_F(((LANE_INDEX + (IW)lane) >> 2) + (IW)top);
+  __global float *own = state + (size_t)tile * 1024 + p * W;
+  FW red = (FW)0.0f, green = (FW)0.0f, blue = (FW)0.0f;
+  // Compared as floats: Oclgrind 21.10 finds vectors of four integers never less here.
+  FW t = pick(MASK(px < (FW)(float)width) & MASK(py < (FW)(float)height), (FW)1.0f, (FW)-1.0f);
   if (resume) {
-    red = own[0];
-    green = own[256];
-    blue = own[512];
-    t = own[768];
+    red = LOADF(own, 0);
+    green = LOADF(own, 256);
+    blue = LOADF(own, 512);
+    t = LOADF(own, 768);
   }
   const size_t pitch = (size_t)tiles_x * TILE, plane = pitch * (((size_t)height + TILE - 1) / TILE * TILE);
-  const size_t here = (size_t)py * pitch + px;
+  const size_t here = (size_t)(top + (lane >> 2)) * pitch + left + (lane & 3);
 #if STATS == 2 || STATS == 4
-  const float whole_r = image[here], whole_g = image[plane + here], whole_b = image[2 * plane + here];
+  const FW whole_r = LOADF(image, here), whole_g = LOADF(image, plane + here);
+  const FW whole_b = LOADF(image, 2 * plane + here);
 #endif
 #if STATS > 2
-  const float rest_r = rest[here], rest_g = rest[plane + here], rest_b = rest[2 * plane + here];
+  const FW rest_r = LOADF(rest, here), rest_g = LOADF(rest, plane + here);
+  const FW rest_b = LOADF(rest, 2 * plane + here);
 #if STATS == 5
   // As in blend_cpu.cl: red keeps the product of the light to come with the residual.
-  if (!resume) red = fma(image[2 * plane + here], rest_b, fma(image[plane + here], rest_g, image[here] * rest_r));
+  if (!resume)
+    red = fma(LOADF(image, 2 * plane + here), rest_b,
+              fma(LOADF(image, plane + here), rest_g, LOADF(image, here) * rest_r));
 #endif
 #endif
   ends += (size_t)(blocks - 1) * get_num_groups(0);
@@ -94,62 +113,62 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
     barrier(CLK_LOCAL_MEM_FENCE);
     if (p == 0) open = 0;
     const uint size = min((uint)BATCH, last - start);
-    if (p < (int)size) {
-      list[p] = pairs[start + p];
+    for (uint n = p; n < size; n += ITEMS) {
+      list[n] = pairs[start + n];
 #pragma unroll
-      for (int f = 0; f < 9; ++f) splats[p][f] = records[(size_t)list[p].x * 16 + f];
+      for (int f = 0; f < 9; ++f) splats[n][f] = records[(size_t)list[n].x * 16 + f];
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (t > 0.0f) open = 1;
+    if (ANY(MASK(t > (FW)0.0f))) open = 1;
     barrier(CLK_LOCAL_MEM_FENCE);
     const int go_on = open;   // the same for the whole group, since nobody writes `open` before the next barrier
     if (!go_on) break;
     for (uint n = 0; n < size; ++n) {
-      float weight = 0.0f, alpha = 0.0f;
+      FW weight = (FW)0.0f, alpha = (FW)0.0f;
 #if STATS == 5
-      const float before = t;
+      const FW before = t;
 #endif
-      int hit = 0;
+      IW hit = (IW)0;
       if (list[n].y >> b & 1u) {
-        const float dx = (float)px - splats[n][0], dy = (float)py - splats[n][1];
-        const float exponent = splat_exponent(
-            dx, dy, splats[n][2], splats[n][3], splats[n][4], splats[n][5], highest_exponent(splats[n][5]));
+        const FW dx = px - (FW)splats[n][0], dy = py - (FW)splats[n][1], level = (FW)splats[n][5];
+        const FW exponent = splat_exponent(
+            dx, dy, (FW)splats[n][2], (FW)splats[n][3], (FW)splats[n][4], level, highest_exponent(level));
 #if STATS == 3 || STATS == 5
         hit = pass_through(exponent, &t, &alpha, &weight);
 #else
         hit = blend_over(
-            exponent, splats[n][6], splats[n][7], splats[n][8], &red, &green, &blue, &t, &alpha, &weight);
+            exponent, (FW)splats[n][6], (FW)splats[n][7], (FW)splats[n][8], &red, &green, &blue, &t, &alpha, &weight);
 #endif
       }
 #if STATS
       if (p == 0) counts = 0;
 #if STATS == 2 || STATS == 4
-      const float ratio = weight / t;
-      const float er = fma(splats[n][6], t, red - whole_r), eg = fma(splats[n][7], t, green - whole_g);
-      const float eb = fma(splats[n][8], t, blue - whole_b);
-      const float error = ratio * ratio * fma(eb, eb, fma(eg, eg, er * er));
+      const FW ratio = weight / t;
+      const FW er = fma((FW)splats[n][6], t, red - whole_r), eg = fma((FW)splats[n][7], t, green - whole_g);
+      const FW eb = fma((FW)splats[n][8], t, blue - whole_b);
+      const FW error = ratio * ratio * fma(eb, eb, fma(eg, eg, er * er));
 #elif STATS == 5
-      const float own_light = fma(splats[n][8], rest_b, fma(splats[n][7], rest_g, splats[n][6] * rest_r));
-      const float light = (weight / t) * fma(own_light, before, -red);
+      const FW own_light = fma((FW)splats[n][8], rest_b, fma((FW)splats[n][7], rest_g, (FW)splats[n][6] * rest_r));
+      const FW light = (weight / t) * fma(own_light, before, -red);
       red = fma(-weight, own_light, red);
-      const float error = alpha < ALPHA_MAX ? light : 0.0f;   // gradient of the exponent
+      const FW error = pick(MASK(alpha < (FW)ALPHA_MAX), light, (FW)0.0f);   // gradient of the exponent
 #endif
 #if STATS == 2
-      parts[0][p] = error;
-      parts[1][p] = weight;
+      STOREF(error, parts[0], p * W);
+      STOREF(weight, parts[1], p * W);
 #else
-      parts[0][p] = weight;
+      STOREF(weight, parts[0], p * W);
 #endif
 #if STATS >= 3
-      parts[1][p] = rest_r;
-      parts[2][p] = rest_g;
-      parts[3][p] = rest_b;
+      STOREF(rest_r, parts[1], p * W);
+      STOREF(rest_g, parts[2], p * W);
+      STOREF(rest_b, parts[3], p * W);
 #endif
 #if STATS >= 4
-      parts[4][p] = error;
+      STOREF(error, parts[4], p * W);
 #endif
       barrier(CLK_LOCAL_MEM_FENCE);
-      if (hit) atomic_inc(&counts);
+      if (ANY(hit)) atomic_add(&counts, hit_count(hit));
       // Each lane sums over the blocks in order, then the pairwise tree over lanes: the order and fused steps of blend_cpu.cl.
       float sum[SUMS];
 #pragma unroll
@@ -213,14 +232,14 @@ __kernel __attribute__((reqd_work_group_size(256, 1, 1))) void BLEND(
   if (finish) {
 #if STATS < 2
     __global float *at = image + here;
-    at[0] = fma(fabs(t), background_r, red);
-    at[plane] = fma(fabs(t), background_g, green);
-    at[2 * plane] = fma(fabs(t), background_b, blue);
+    STOREF(fma(fabs(t), (FW)background_r, red), at, 0);
+    STOREF(fma(fabs(t), (FW)background_g, green), at + plane, 0);
+    STOREF(fma(fabs(t), (FW)background_b, blue), at + 2 * plane, 0);
 #endif
   } else {
-    own[0] = red;
-    own[256] = green;
-    own[512] = blue;
-    own[768] = t;
+    STOREF(red, own, 0);
+    STOREF(green, own, 256);
+    STOREF(blue, own, 512);
+    STOREF(t, own, 768);
   }
 }

@@ -70,6 +70,8 @@ class DeviceInfo:
     self_test: str
     loop_steps: int = 0
     """Steps after which the runtime leaves loops, counted over all loops of a work-item; 0 if it does not."""
+    form: str = ""
+    """Name of the form of the kernels that was measured to be fastest; empty if none was."""
     handle: cl.Device | None = field(default=None, repr=False, compare=False)
     context: cl.Context | None = field(default=None, repr=False, compare=False)
     """The context of the self-test, kept alive: after the last context is gone, PoCL starts its compiler anew for the
@@ -227,7 +229,7 @@ def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceIn
     else:
         matches = [d for d in devices if spec.lower() in f"{d.name} {d.platform}".lower()]
     if not matches:
-        raise DeviceError(f"--device {spec}: no such OpenCL device; there are: {listing}")
+        raise DeviceError(f"--device {spec}: no such OpenCL device{_broken_runtimes()}; there are: {listing}")
     for device in matches:
         if device.usable:
             others = [f"{d.index}" for d in matches if d is not device and d.usable]

@@ -15,6 +15,7 @@ from flexgs_edge.errors import DeviceError
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.cl_sources import load_source
+from flexgs_edge.kernels.form import GPU_WIDTHS, WIDTHS, Form, likely_form, native_width
 from flexgs_edge.kernels.loop_limit import LIMITED_BLOCKS, STEPS_A_PAIR, check_steps
 from flexgs_edge.kernels.session import DeviceArray, Session
 from flexgs_edge.memory.budget import MemoryBudget
@@ -33,25 +34,37 @@ class OpenCLBackend:
     budget : MemoryBudget
         Counts all buffers.
     width : int, optional
-        Lanes of a vector: 16, 8, 4 or 1. By default, the device's native width on CPUs, and 1 on GPUs.
+        Lanes of a vector: 16, 8, 4 or 1; in the GPU form 4 or 1.
     form : {"cpu", "gpu"}, optional
-        Form of the blend kernel: one work-item a tile, or one work-group a tile. By default, it follows the device's
-        type.
+        Form of the blend kernel: one work-item a tile, or one work-group a tile.
+    written_fma : bool, optional
+        Whether `fma` is written out.
+
+    By default, all three are what the self-test found to be fastest (`DeviceInfo.form`); if it has not run, they follow
+    the device's type.
     """
 
     is_numpy = False
 
     def __init__(
-        self, info: DeviceInfo, budget: MemoryBudget, width: int | None = None, form: str | None = None
+        self,
+        info: DeviceInfo,
+        budget: MemoryBudget,
+        width: int | None = None,
+        form: str | None = None,
+        written_fma: bool | None = None,
     ) -> None:
         start = time.perf_counter()
         self.session = Session(info, budget)
-        # A pixel takes fewer steps than a tile, so the GPU form serves devices that end loops.
-        self.form = form or ("gpu" if info.type == "gpu" or info.loop_steps else "cpu")
-        native = max(w for w in (16, 8, 4, 1) if w <= max(info.native_width, 1))
-        self.width = width or (1 if self.form == "gpu" else native)
-        if self.width not in (16, 8, 4, 1) or (self.form == "gpu" and self.width != 1):
-            raise DeviceError(f"vector width {self.width} of the {self.form} form: expected 16, 8, 4 or 1 (gpu: 1)")
+        chosen = Form.named(info.form) or likely_form(info)
+        if form is not None and form != chosen.kind:
+            chosen = Form(form, 1 if form == "gpu" else native_width(info), chosen.written_fma)
+        self.form, self.width = chosen.kind, width or chosen.width
+        self.written_fma = chosen.written_fma if written_fma is None else written_fma
+        widths = GPU_WIDTHS if self.form == "gpu" else WIDTHS
+        if self.width not in widths:
+            expected = ", ".join(map(str, widths))
+            raise DeviceError(f"vector width {self.width} of the {self.form} form: expected one of {expected}")
         self.name = f"{info.name} ({info.platform})"
         # Hints and conversions that are not OpenCL C: only PoCL's compiler is known to take them, and only it gains by them.
         self._builtins = "portable computing" in info.platform.lower()
@@ -83,7 +96,7 @@ class OpenCLBackend:
 
     def describe(self) -> dict[str, Any]:
         """The device and its settings, for `--json`."""
-        return {"backend": "opencl", "width": self.width, "form": self.form, **self.session.info.to_json()}
+        return {"backend": "opencl", **self.session.info.to_json(), "width": self.width, "form": self.form}
 
     def array(self, shape: tuple[int, ...], dtype: Any) -> DeviceArray:
         """A new array on the device, not initialised."""
@@ -114,6 +127,8 @@ class OpenCLBackend:
         spec = KERNELS.get(name) or CODEC_KERNELS[name]
         if name not in self._kernels:
             options = [f"-DW={min(self.width, spec.widest)}"]
+            if self.written_fma:
+                options.append("-DWRITTEN_FMA")
             if self._builtins:
                 options.append("-DCLANG_BUILTINS")
             source = load_source(spec.file.format(form=self.form), spec.stats, self.form)
@@ -121,9 +136,9 @@ class OpenCLBackend:
         local: tuple[int, ...] = (1,) * len(size)
         if spec.per == "rows":
             size = (size[0] // self.width,)
-            local = (GPU_GROUP if self.form == "gpu" else 1,)
+            local = (GPU_GROUP // self.width if self.form == "gpu" else 1,)
         elif spec.per == "tile" and self.form == "gpu":
-            size, local = (size[0] * 256,), (256,)
+            size, local = (size[0] * 256 // self.width,), (256 // self.width,)
         if self.session.info.loop_steps:
             check_steps(self.session.info, name, size, args)
         if size[0]:

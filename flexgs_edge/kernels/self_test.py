@@ -135,7 +135,12 @@ def verdict(record: Record, backend: Backend, watch: Callable[[str], None] = lam
     except WrongResult as error:
         return str(error)
     except (DeviceError, BudgetError) as error:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        reasons = [line for line in lines[1:] if "error" in line.lower()]
-        return " ".join([lines[0], *reasons[:1]])[:400]
+        return first_words(str(error))
     return "ok"
+
+
+def first_words(message: str) -> str:
+    """A message of many lines as one: its first line, and the first that tells of an error."""
+    lines = [line.strip() for line in message.splitlines() if line.strip()]
+    reasons = [line for line in lines[1:] if "error" in line.lower()]
+    return " ".join([*lines[:1], *reasons[:1]])[:400]

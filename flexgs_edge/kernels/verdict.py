@@ -21,10 +21,11 @@ _ABOUT = ("name", "platform", "driver", "opencl_c", "type", "native_width", "max
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the self-test said: `DeviceInfo.self_test` and `DeviceInfo.loop_steps`."""
+    """What the self-test said: `DeviceInfo.self_test`, `DeviceInfo.loop_steps` and `DeviceInfo.form`."""
 
     self_test: str
     loop_steps: int = 0
+    form: str = ""
 
 
 def cache_folder() -> Path:
@@ -51,10 +52,11 @@ def kept_verdict(key: str) -> Verdict | None:
     """The verdict of an earlier run; None if there is none, or if its file cannot be read."""
     try:
         found = json.loads((cache_folder() / f"{key}.json").read_text(encoding="utf-8"))
-        verdict = Verdict(found["self_test"], found["loop_steps"])
+        verdict = Verdict(found["self_test"], found["loop_steps"], found["form"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return verdict if isinstance(verdict.self_test, str) and type(verdict.loop_steps) is int else None
+    sound = isinstance(verdict.self_test, str) and isinstance(verdict.form, str) and type(verdict.loop_steps) is int
+    return verdict if sound else None
 
 
 def keep_verdict(key: str, info: DeviceInfo, verdict: Verdict) -> str | None:

@@ -13,15 +13,17 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.kernels.backend import Backend, TwinBackend
 from flexgs_edge.kernels.choose_device import DeviceInfo, choose_device, list_devices
+from flexgs_edge.kernels.form import Form
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.source import SceneSource
 
-FORMS = ("w16", "w8", "w4", "w1", "gpu")
-"""Forms of the OpenCL kernels: vector widths of the CPU form, and the GPU form."""
+FORMS = ("w16", "w8", "w4", "w1", "gpu", "gpu4")
+"""Forms of the OpenCL kernels: vector widths of the CPU form; the GPU form, and that with four pixels a work-item."""
 ALL_FORMS = (*FORMS, "numpy")
+GPU_FORMS = {"gpu": Form("gpu", 1), "gpu4": Form("gpu", 4), "fma": Form("gpu", 4, written_fma=True)}
 
 
 def large_budget() -> MemoryBudget:
@@ -40,8 +42,10 @@ def open_form(form: str) -> Backend:
     """The backend of a form, built once for all tests."""
     if form == "numpy":
         return TwinBackend(large_budget())
-    width, shape = (1, "gpu") if form == "gpu" else (int(form[1:]), "cpu")
-    return OpenCLBackend(default_device(), large_budget(), width=width, form=shape)
+    chosen = GPU_FORMS.get(form) or Form("cpu", int(form[1:]))
+    return OpenCLBackend(
+        default_device(), large_budget(), width=chosen.width, form=chosen.kind, written_fma=chosen.written_fma
+    )
 
 
 def draw(

@@ -147,7 +147,7 @@ def test_open_backend() -> None:
         open_backend("no such thing", large_budget())
 
 
-@pytest.mark.parametrize(("width", "form"), [(2, "cpu"), (32, "cpu"), (4, "gpu")])
+@pytest.mark.parametrize(("width", "form"), [(2, "cpu"), (32, "cpu"), (8, "gpu")])
 def test_widths_that_there_are_not(width: int, form: str) -> None:
     with pytest.raises(DeviceError, match=f"vector width {width} of the {form} form: expected"):
         OpenCLBackend(default_device(), large_budget(), width=width, form=form)
@@ -176,7 +176,7 @@ def test_missing_define() -> None:
     for name, options in (
         ("activate.cl", ()),
         ("blend_cpu.cl", ("-DW=16",)),
-        ("blend_gpu.cl", ("-DW=4", "-DSTATS=0", "-DBLEND=blend")),
+        ("blend_gpu.cl", ("-DW=8", "-DSTATS=0", "-DBLEND=blend")),
     ):
         with pytest.raises(DeviceError, match="does not build"):
             session.kernel(load_source(name), "blend" if "blend" in name else "activate", options, "b")

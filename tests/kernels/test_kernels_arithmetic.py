@@ -29,7 +29,8 @@ def run_probe(
     source = constants_header() + (kernel_dir() / "common.clh").read_text()
     source += f"\n__kernel void probe({', '.join(names)}) {{ const size_t i = get_global_id(0) * W; {body} }}\n"
     session = backend.session
-    kernel = session.kernel(source, "probe", (f"-DW={backend.width}",), "b" * len(names))
+    options = (f"-DW={backend.width}", *(["-DWRITTEN_FMA"] if backend.written_fma else []))
+    kernel = session.kernel(source, "probe", options, "b" * len(names))
     size = inputs[0].size if inputs else backend.width
     arrays = [session.array((size,), np.float32) for _ in inputs] + [
         session.array((size,), dtype) for _ in range(outputs)
@@ -62,6 +63,37 @@ def test_limits_of_the_exponent_are_those_of_alpha() -> None:
     assert 0 < seen.sum() < len(seen)
     capped = fexp2(np.minimum(high, f32(constants.LOG2_ALPHA_MAX)))
     assert capped.max() == capped[-1] == f32(constants.ALPHA_MAX) < fexp2(high).max()
+
+
+@pytest.mark.parametrize("form", [*FORMS, "fma"])
+def test_fma_of_all_numbers(form: str) -> None:
+    """Any bits, sums that nearly cancel, sums at half an ulp. Written out, subnormal results and infinite products may differ."""
+    count = 1 << 18
+    random = np.random.default_rng(5)
+    a, b = ((any_floats(count, seed)) for seed in (6, 7))
+    c = any_floats(count, 8)
+    scale = np.float32(2.0) ** random.integers(-40, 40, (2, count)).astype(np.float32)
+    near_a, near_b = (random.normal(size=(2, count)).astype(np.float32) * scale).astype(np.float32)
+    exact = near_a.astype(np.float64) * near_b
+    near_c = (-exact * (1 + random.choice([0, 1e-7, -1e-7, 1e-8, 1e-3, -2, 3e7, -3e-8], count))).astype(np.float32)
+    # Products of 12 bits are exact, and so are halves of the last place of c: ties that go to even.
+    short_a, short_b = (1 + random.integers(0, 1 << 11, (2, count)) * 2.0**-11).astype(np.float32)
+    tie_c = (random.integers(1 << 23, 1 << 24, count) * 2.0 ** random.integers(-3, 4, count)).astype(np.float32)
+    with np.errstate(all="ignore"):
+        x = (
+            np.concatenate([a, near_a, short_a]),
+            np.concatenate([b, near_b, short_b]),
+            np.concatenate([c, near_c, tie_c]),
+        )
+        expected = fma(*x)
+    (got,) = run_probe(form, "STOREF(fma(LOADF(x0, i), LOADF(x1, i), LOADF(x2, i)), y0, i);", list(x))
+    if form == "fma":
+        with np.errstate(all="ignore"):
+            subnormal = (expected != 0) & (np.abs(expected) < np.finfo(np.float32).tiny)
+            steady = ~subnormal & ~(np.isinf(x[0] * x[1]) & np.isfinite(expected))
+        assert steady.mean() > 0.99
+        expected, got = expected[steady], got[steady]
+    assert same_bits(got, expected)
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -20,6 +20,7 @@ from flexgs_edge.kernels import verdict as verdicts
 from flexgs_edge.kernels.choose_device import DeviceInfo, choose_device, list_devices
 from flexgs_edge.kernels.session import Session
 from flexgs_edge.kernels.tested import (
+    FORM,
     MARK,
     choose_tested,
     list_with_verdicts,
@@ -28,7 +29,7 @@ from flexgs_edge.kernels.tested import (
 )
 from kernel_fixtures import default_device, large_budget
 
-GOOD = {"self_test": "ok", "loop_steps": 0}
+GOOD = {"self_test": "ok", "loop_steps": 0, "form": "cpu16"}
 CRASH = "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"
 
 
@@ -63,12 +64,12 @@ def test_this_machine_has_a_device_that_passes(own_cache: Path) -> None:
 
 
 def test_a_verdict_is_kept(info: DeviceInfo, monkeypatch: pytest.MonkeyPatch) -> None:
-    child(monkeypatch, says({"self_test": "ok", "loop_steps": 65535}))
+    child(monkeypatch, says({"self_test": "ok", "loop_steps": 65535, "form": "gpu4"}))
     assert with_verdict(info).loop_steps == 65535
     child(monkeypatch, CRASH)
     assert with_verdict(info).usable
     monkeypatch.setattr(module, "_known", {})  # as in another process
-    assert with_verdict(info) == replace(info, self_test="ok", loop_steps=65535)
+    assert with_verdict(info) == replace(info, self_test="ok", loop_steps=65535, form="gpu4")
     assert not with_verdict(info, anew=True).usable and not with_verdict(info).usable
     child(monkeypatch, says(GOOD))
     assert with_verdict(info, anew=True).usable
@@ -134,6 +135,19 @@ def test_testing_anew(info: DeviceInfo, monkeypatch: pytest.MonkeyPatch, capsys:
     assert devices()[0] == 4  # the newest verdict holds
 
 
+def test_a_form_that_ends_the_process(info: DeviceInfo, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is left out, and the others are tried."""
+    crash = f"print({MARK + FORM!r} + form, flush=True); {CRASH}"
+    code = f"import os, signal, sys\nform = 'gpu1'\nif form not in sys.argv: {crash}\nelse: {says(GOOD)}"
+    child(monkeypatch, code)
+    assert with_verdict(info) == replace(info, self_test="ok", form="cpu16")
+    nothing = says({"self_test": "", "loop_steps": 0, "form": ""})
+    child(monkeypatch, code.replace(says(GOOD), nothing))
+    assert "SIGSEGV), building or running form gpu1" in with_verdict(info, anew=True).self_test
+    child(monkeypatch, crash.replace("+ form", "+ 'cpu1'").replace("print", "import os, signal; print", 1))
+    assert "SIGSEGV), building or running form cpu1" in with_verdict(info, anew=True).self_test  # though left out
+
+
 def test_a_test_that_does_not_end(info: DeviceInfo, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MOST_SECONDS", 0.3)
     child(monkeypatch, f"import time; print({MARK + 'sort_count'!r}, flush=True); time.sleep(60)")
@@ -144,17 +158,17 @@ def test_wrong_devices_are_passed_over(monkeypatch: pytest.MonkeyPatch, info: De
     """The next one is tested and taken, unless the user named the one that fails."""
     gpu = replace(info, index=1, name="Made up", type="gpu")
     monkeypatch.setattr(module, "list_devices", lambda self_test: [info, gpu])
-    bad = says({"self_test": "kernel x computes 1", "loop_steps": 0})
+    bad = says({"self_test": "kernel x computes 1", "loop_steps": 0, "form": ""})
     code = f"import sys\nif sys.argv[1] == '1': {bad}\nelse: {says(GOOD)}"
     child(monkeypatch, code)
-    assert choose_tested(None)[0] == replace(info, self_test="ok")
+    assert choose_tested(None)[0] == replace(info, self_test="ok", form="cpu16")
     with pytest.raises(DeviceError, match="--device gpu: failed the self-test.*kernel x computes 1"):
         choose_tested("gpu")
     assert [found.usable for found in list_with_verdicts()] == [True, False]
     assert [found.index for found in processors_with_verdicts()] == [0]
 
 
-@pytest.mark.parametrize("fault", ["full", "a file"])
+@pytest.mark.parametrize("fault", ["full", "read-only", "a file"])
 def test_a_cache_that_takes_nothing(
     fault: str, own_cache: Path, info: DeviceInfo, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -165,6 +179,12 @@ def test_a_cache_that_takes_nothing(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
         monkeypatch.setattr(os, "replace", replace_)
+    elif fault == "read-only":
+
+        def mkstemp(**_: object) -> None:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+        monkeypatch.setattr(verdicts.tempfile, "mkstemp", mkstemp)
     else:
         own_cache.parent.write_text("not a folder")
     child(monkeypatch, says(GOOD))
@@ -173,10 +193,20 @@ def test_a_cache_that_takes_nothing(
     assert with_verdict(info).usable and with_verdict(info, anew=True).usable
     warnings = [entry.getMessage() for entry in caplog.records if entry.levelname == "WARNING"]
     assert len(warnings) == 1 and str(own_cache) in warnings[0] and "FLEXGS_CACHE_DIR" in warnings[0]
-    assert fault != "full" or list(own_cache.iterdir()) == []
+    assert fault == "a file" or list(own_cache.iterdir()) == []
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"self_test": 3, "loop_steps": 0}', '{"self_test": "ok"}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        '{"self_test": 3, "loop_steps": 0, "form": ""}',
+        '{"self_test": "ok"}',
+        '{"self_test": "ok", "loop_steps": 0, "form": 4}',
+    ],
+)
 def test_a_damaged_verdict_is_none(text: str, own_cache: Path, info: DeviceInfo) -> None:
     own_cache.mkdir(parents=True)
     (own_cache / f"{verdicts.key_of(info)}.json").write_text(text)
@@ -216,7 +246,7 @@ def test_a_device_that_fails_in_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     array.release()
 
 
-def test_a_runtime_whose_library_is_missing(tmp_path: Path) -> None:
+def test_a_runtime_whose_library_is_missing(tmp_path: Path, info: DeviceInfo, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "gone.icd").write_text("/nowhere/libgone.so.1\n")
     environment = {
         **os.environ,
@@ -232,6 +262,10 @@ def test_a_runtime_whose_library_is_missing(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 4 and "Traceback" not in done.stderr
+    with monkeypatch.context() as patch:  # beside one that works
+        patch.setenv("OCL_ICD_VENDORS", str(tmp_path))
+        with pytest.raises(DeviceError, match=r"no such OpenCL device \(.*gone.icd names .*; there are: \[0\]"):
+            choose_device("gone", [info])
     assert (
         "gone.icd names /nowhere/libgone.so.1, which cannot be loaded" in done.stderr
         and "pocl-opencl-icd" in done.stderr
