@@ -24,7 +24,9 @@ def until(tab: Browser, condition: str) -> None:
 def faults(tab: Browser) -> list[str]:
     """What went wrong in the page: exceptions, refused requests, broken policies."""
     names = ("Runtime.exceptionThrown", "Log.entryAdded", "Network.loadingFailed")
-    return [json.dumps(event)[:500] for event in tab.events if event.get("method") in names]
+    found = [event for event in tab.events if event.get("method") in names]
+    # A request that the page itself has given up is none.
+    return [json.dumps(event)[:500] for event in found if not event["params"].get("canceled")]
 
 
 def decibels(one: np.ndarray, two: np.ndarray) -> float:
