@@ -25,7 +25,7 @@ from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.outputs import Output
 from flexgs_edge.run.plan import EVERYTHING
-from flexgs_edge.run.settings import make_settings
+from flexgs_edge.run.settings import make_settings, settings_room
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.studies.rate.ablations import WHOLE, Variant
 from flexgs_edge.studies.rate.coders import coder_sizes
@@ -199,9 +199,9 @@ def best_points(
     started = time.perf_counter()
     run = replace(run, options=options)
     with open_rounds(run, studied.bench, poses.cameras, variant.path, known=poses.known) as rounds:
-        coder = GridCoder(studied.bench.renderer)
         for ratio in sorted(ratios):
             aimed = run.aimed_at(_target(studied, ratio))
+            coder = GridCoder(studied.bench.renderer, settings_room(aimed))
             make = grid_search(options, coder, variant.search)
             with run.clock.stage("search"):
                 grid, search = search_rounds(make, rounds, aimed, studied.judge)
