@@ -69,9 +69,8 @@ def _write_fine(source: SceneSource, place: Path) -> int:
     """Code a scene so finely that its pictures are those of the scene; returns the bytes."""
     planes = source.read(slice(0, source.count), list(FIELD))
     degrees = np.full(source.count, source.sh_degree, np.uint8)
-    grid = to_grid(planes, degrees, fine_steps(planes["means"], planes["log_scales"], source.sh_degree), source.origin)[
-        0
-    ]
+    steps = fine_steps(planes["means"], planes["log_scales"], source.sh_degree)
+    grid, _ = to_grid(planes, degrees, steps, source.origin)
     return write_grid(place, grid, {})
 
 

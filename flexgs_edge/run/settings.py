@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from flexgs_edge._version import __version__
+from flexgs_edge.codec.header import canonical_json
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.steps import SearchResult, Step
 from flexgs_edge.goals.target import Covered, Measurement
@@ -14,7 +14,7 @@ from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 
 MARGIN = 16
-"""Bytes of a header beside the settings that may take more digits once they are in it."""
+"""Room for numbers of the header that grow by a digit with the settings, such as its own length."""
 
 
 def make_settings(
@@ -71,7 +71,7 @@ def settings_room(run: Run[CompressOptions]) -> int:
     quality = Measurement(widest, widest, widest, covered=Covered(widest, widest))
     step = Step(Choice(prune=999, sh=1), 0, quality, 0.0, "multiplier", 0.0)
     settings = {**make_settings(run, SearchResult(step, False, ())), "prune_rate": 0.999, "sh_rate": 0.999}
-    return len(json.dumps(settings)) + MARGIN
+    return len(canonical_json(settings)) + MARGIN
 
 
 def _means(found: Measurement) -> dict[str, float | None]:

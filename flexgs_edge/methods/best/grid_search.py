@@ -44,9 +44,12 @@ DISTILLED, DISTILLED_POWER = 0.46, -0.2
 """Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
 the power by which it changes with the steps: docs/results/tuning.md#distilled"""
 PRICED = -0.035
-"""Log of the size after a descent over that before it: prices on bits make files smaller. docs/results/tuning.md#landing"""
+"""Expected log of the size after a descent over that before it: prices on bits make files smaller. Scenes differ, so that the
+first candidate may be too small: docs/results/tuning.md#landing"""
 ABOVE = 0.02
 """How far above a size we aim, since results that are too large can be landed: docs/results/tuning.md#landing"""
+CLOSE_SIZE = 0.003
+"""A candidate that is smaller than asked by no more than this ends the search."""
 WARMED = 1.35
 """Factor on it if descents between the rounds have mended a part already: docs/results/tuning.md#distilled"""
 PRUNED_DISTILLED = 1.6
@@ -133,7 +136,7 @@ class GridSearch(MultiplierSearch[GridScene]):
             return super().run(target, best_effort)
         found = super().run(target, best_effort=True)
         if not found.reached and self._left_too_few(found.chosen):
-            LOG.info("the rounds before the descents left too few Gaussians: descending without these rounds")
+            LOG.info("pruning before the descents left too few Gaussians: descending from more")
             self._warming, self._begin, self._slopes = (), 0, None
             found = self._also(found, super().run(target, best_effort=True), target)
         if found.reached:
@@ -150,6 +153,9 @@ class GridSearch(MultiplierSearch[GridScene]):
         """The better one of two results, with the candidates of both."""
         best = other if better(other.chosen, one.chosen, target) else one
         return replace(best, steps=(*one.steps, *other.steps))
+
+    def _close(self, target: Target) -> float:
+        return super()._close(target) if target.limit_bytes is None else CLOSE_SIZE
 
     def _used_up(self, steps: Sequence[Candidate]) -> bool:
         return self._left_too_few(steps[-1]) or super()._used_up(steps)
@@ -219,6 +225,8 @@ class GridSearch(MultiplierSearch[GridScene]):
             offset = (PRICED if self.steps else 0.0) - ABOVE
         if steps:
             offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
+            if by_size and steps[-1].holds:
+                offset -= ABOVE
             if self.refit and not by_size:
                 # Probes have the colours of the last refit, and the next refit goes on from these.
                 if len(steps) > 1 and not self.steps:

@@ -95,8 +95,12 @@ class MultiplierSearch(ABC, Generic[Product]):
         """Improve the guess `multiplier` for the next candidate, in less time than a candidate takes."""
         return multiplier
 
+    def _close(self, target: Target) -> float:
+        """How far below the target a candidate ends the search (log of limit over loss or size)."""
+        return self.effort.close
+
     def _used_up(self, steps: Sequence[Candidate]) -> bool:
-        """Whether no other multiplier could do much better than the last of these candidates, which all missed the target."""
+        """Whether no other multiplier could do much better than the last of these candidates, which all missed a quality."""
         full = [step.excess for step in steps[-2:] if step.count == self.most]
         return len(full) == 2 and abs(full[1] - full[0]) < FLAT
 
@@ -149,9 +153,11 @@ class MultiplierSearch(ABC, Generic[Product]):
                 best = (step, product)
             else:
                 self.discard(product)
-            close = best[0].holds and best[0].excess > -self.effort.close
+            close = best[0].holds and best[0].excess > -self._close(target)
             enough = best[0].holds and best[0].excess > -self.effort.far and count + 1 >= self.effort.steps
-            if close or enough or step.multiplier < 1e-30 or (not best[0].holds and self._used_up(steps)):
+            # A size that is missed can always be met by a larger multiplier.
+            in_vain = target.limit_bytes is None and not best[0].holds and self._used_up(steps)
+            if close or enough or in_vain or step.multiplier < 1e-30:
                 break
             multiplier = self._aim(next_multiplier(steps, target), steps, target)
         assert best is not None
@@ -234,7 +240,5 @@ class MultiplierSearch(ABC, Generic[Product]):
         rows, storage = np.flatnonzero(keep), self.rounds.storage
         planes = drop_bands(snapshot.planes, rows, degrees[rows], snapshot.costs.sh_mean, SH_C0, storage)
         costs = snapshot.costs
-        some, weight2, removal = (
-            storage.take(values, rows) for values in (snapshot.rows, costs.weight2, costs.removal)
-        )
-        return Kept(index, some, planes, degrees[rows], weight2, removal)
+        weight2, removal = storage.take(costs.weight2, rows), storage.take(costs.removal, rows)
+        return Kept(index, storage.take(snapshot.rows, rows), planes, degrees[rows], weight2, removal)

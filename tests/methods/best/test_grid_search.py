@@ -392,6 +392,22 @@ def test_a_size_needs_no_pilot() -> None:
     assert result.reached and [steps for steps, *_ in calls] == [100] * len(result.steps)
 
 
+def test_a_size_that_is_missed_with_all_rows_is_met_by_coarser_steps() -> None:
+    """For a quality such a candidate would end the search."""
+
+    class Grown(Mended):
+        def size_of(self, grid: GridScene) -> int:
+            return round(super().size_of(grid) * (1.5 if (grid.opacity == grid.opacity.max()).all() else 1.0))
+
+    class AllLeft(Mending):
+        def _left_too_few(self, missed: Candidate) -> bool:
+            return True
+
+    Mending.calls = []
+    result = search(Grown(0.3, 0.3), MaxSize(3000), kind=AllLeft, refit=True, steps=100)
+    assert result.reached and not result.steps[0].holds and len(result.steps) > 1
+
+
 @pytest.mark.parametrize("ssim", [0.001, 0.03])
 def test_the_first_candidate_aims_at_ssim_where_it_is_nearer(ssim: float) -> None:
     world = Mended(1.0, 1.0, ssim)

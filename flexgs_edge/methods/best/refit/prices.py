@@ -2,7 +2,7 @@
 
 Values of a kind are taken as Laplace distributed. A value that is x away from the centre of its kind then takes
 |x| / (b ln 2) bits more than one in the centre, where b is the mean of |x|. The coder knows more of a value than this, but
-centres from neighbours, which it also has, gain nothing: docs/results/tuning.md#rate
+centres from neighbours, which it also has, gain nothing: docs/results/tuning.md#bit_weight
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from flexgs_edge.grid.step_sizes import Planes, StepSizes
 
 PRICES = 33
 """Values of the record that the kernel `price_bits` takes."""
-RATE = 3.3
-"""Weight of bits in the loss. A step must pay for a bit more than a pose's share of its worth, since most Gaussians are not
-shown in all poses: docs/results/tuning.md#rate"""
+BIT_WEIGHT = 3.3
+"""Weight of bits in the loss. It is above 1, since most Gaussians are not shown in all poses, and steps move only those that are
+shown: docs/results/tuning.md#bit_weight"""
 WIDTH = 0.5
 """Prices rise over about this many grid steps around a centre. Within a step, it makes no difference to the bits."""
 
@@ -51,7 +51,7 @@ def bit_prices(planes: Planes, degrees: np.ndarray, steps: StepSizes, worth: flo
     def put(place: int, away: np.ndarray, step: float) -> None:
         # Where all values are alike they take no bits, and a small b must not make a large price of it.
         spread = max(float(np.abs(away).mean()) if away.size else 0.0, step / 4)
-        prices[place : place + 2] = RATE * worth / (math.log(2) * spread), WIDTH * step
+        prices[place : place + 2] = BIT_WEIGHT * worth / (math.log(2) * spread), WIDTH * step
 
     put(0, scales - centres[0], steps.scale)
     put(2, planes["quats"][1:].astype(np.float64), steps.rotation)
