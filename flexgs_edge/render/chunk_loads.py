@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 from flexgs_edge.kernels.backend import Backend
-from flexgs_edge.render.chunks import ChunkArrays, QuantizedPlanes, SourcePlanes
+from flexgs_edge.render.chunks import ChunkArrays, ChunkPlanes
 from flexgs_edge.render.fit import padded
 
 SLOTS = 2
@@ -33,7 +33,7 @@ class ChunkLoads:
     Parameters
     ----------
     backend : Backend
-    planes : SourcePlanes or QuantizedPlanes
+    planes : ChunkPlanes
         Fills the chunks.
     may_stay : callable
         Whether a chunk of so many rows may get arrays of its own, which outlive this object.
@@ -44,7 +44,7 @@ class ChunkLoads:
     def __init__(
         self,
         backend: Backend,
-        planes: SourcePlanes | QuantizedPlanes,
+        planes: ChunkPlanes,
         may_stay: Callable[[int], bool],
         may_add: Callable[[int], bool],
     ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -109,6 +109,12 @@ class ChunkArrays:
         self.cov = backend.array((6, stride), np.float32)
         self.log2_opacity = backend.array((stride,), np.float32)
 
+    def chunk(self, base: int, count: int) -> Chunk:
+        """The planes as a chunk of rows [base, base + count)."""
+        stored = self.stored
+        colours = stored["sh_dc"], stored["sh_rest"]
+        return Chunk(base, count, self.stride, self.degree, stored["means"], self.cov, self.log2_opacity, *colours)
+
     def activated(self, base: int, count: int, antialiased: bool) -> Chunk:
         """Activate the stored rows, and return them as a chunk."""
         stored, stride = self.stored, self.stride
@@ -116,8 +122,7 @@ class ChunkArrays:
             "activate", (stride,), stride, int(antialiased), stored["log_scales"], stored["quats"],
             stored["opacity_logits"], self.cov, self.log2_opacity,
         )  # fmt: skip
-        colours = stored["sh_dc"], stored["sh_rest"]
-        return Chunk(base, count, stride, self.degree, stored["means"], self.cov, self.log2_opacity, *colours)
+        return self.chunk(base, count)
 
     def release_raw(self) -> None:
         """Free the planes that only `activate` reads."""
@@ -128,6 +133,28 @@ class ChunkArrays:
         """Free everything."""
         for array in (*self.stored.values(), self.cov, self.log2_opacity):
             array.release()
+
+
+class ChunkPlanes(Protocol):
+    """Fills the chunks of a scene, the rows with SH first.
+
+    Attributes
+    ----------
+    bounds : dict of int to ChunkBounds
+        Bounds of chunks that are known so far, by their first rows.
+    """
+
+    count: int
+    sh_count: int
+    sh_degree: int
+    origin: np.ndarray
+    bounds: dict[int, ChunkBounds]
+
+    def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
+        """Fill arrays of the backend with rows [start, stop), [width, padded(stop - start)] by field name."""
+
+    def close(self) -> None:
+        """Free what is held."""
 
 
 class SourcePlanes:

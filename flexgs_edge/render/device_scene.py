@@ -14,7 +14,7 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render import fit as fit_module
 from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.chunk_loads import ChunkLoads
-from flexgs_edge.render.chunks import Chunk, ChunkArrays, QuantizedPlanes, SourcePlanes
+from flexgs_edge.render.chunks import Chunk, ChunkArrays, ChunkPlanes, SourcePlanes
 from flexgs_edge.render.fit import (
     AHEAD_SHARE,
     MOST_SUMS,
@@ -39,7 +39,7 @@ class DeviceScene:
     Parameters
     ----------
     backend : Backend
-    planes : SourcePlanes or QuantizedPlanes
+    planes : ChunkPlanes
         Loads each chunk: once if the scene fits into the budget, else once a view.
     budget : MemoryBudget
     antialiased : bool
@@ -59,7 +59,7 @@ class DeviceScene:
     def __init__(
         self,
         backend: Backend,
-        planes: SourcePlanes | QuantizedPlanes,
+        planes: ChunkPlanes,
         budget: MemoryBudget,
         antialiased: bool = False,
         sum_bytes: int = SUM_BYTES,
@@ -199,7 +199,7 @@ class DeviceScene:
             # Whole vectors: then only the last chunks with and without SH are padded.
             self._rows = max(min(most, (spare // per_row // LANES - 2) * LANES), self._least_rows)
         if fits:
-            self._resident = [self._load(*span) for span in self._spans()]
+            self._resident = [self._load(*span) for span in self.spans()]
         # Fixed here: in the middle of a view, a part of the memory it left free is taken, and the answer would change.
         self.resident, self._streamed = fits, not fits
 
@@ -230,8 +230,10 @@ class DeviceScene:
         size = padded(rows) * self._chunk_row_bytes // 2
         return self.shown is not None and self._budget.free - size >= self._budget.limit // share
 
-    def _spans(self) -> Iterator[tuple[int, int, int]]:
+    def spans(self) -> Iterator[tuple[int, int, int]]:
         """Yield (start, stop, degree) of each chunk: first the rows with SH, then those without."""
+        if not self._rows:
+            self._decide()
         planes = self._planes
         parts = ((0, planes.sh_count, planes.sh_degree), (planes.sh_count, planes.count, 0))
         for first, last, degree in parts:
@@ -253,9 +255,7 @@ class DeviceScene:
     @property
     def starts(self) -> np.ndarray:
         """[chunks + 1] i64: the first row of every chunk, then the number of rows."""
-        if not self._rows:
-            self._decide()
-        return np.array([*(start for start, _, _ in self._spans()), self.count], np.int64)
+        return np.array([*(start for start, _, _ in self.spans()), self.count], np.int64)
 
     def _load(self, start: int, stop: int, degree: int) -> Chunk:
         """Load a chunk that stays."""
@@ -277,7 +277,7 @@ class DeviceScene:
             yield from self._resident
             return
         bounds = self._planes.bounds
-        spans = [span for span in self._spans() if wanted is None or span[0] not in bounds or wanted(bounds[span[0]])]
+        spans = [span for span in self.spans() if wanted is None or span[0] not in bounds or wanted(bounds[span[0]])]
         loads = ChunkLoads(self.backend, self._planes, self._may_stay, self._may_add)
         try:
             for place, span in enumerate(spans):

@@ -410,7 +410,7 @@ class Renderer:
         if self._buffers is None or self._buffers.key != view_key(scene, camera):
             self.release()
             shown = self.fit.capacity(scene.count, max(1 / self.fit.first_share, GUESS * self._share))
-            if scene.shown is None and self._may_be_compact(scene, camera, shown) and not self._fits(scene, camera):
+            if scene.shown is None and self._may_be_compact(scene, camera, shown) and not self.fits(scene, camera):
                 scene.be_compact(shown)
             try:
                 self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
@@ -428,7 +428,7 @@ class Renderer:
             return not scene.statistics
         return saves_bytes(scene, view_size(self.backend, camera), shown)
 
-    def _fits(self, scene: DeviceScene, camera: Camera) -> bool:
+    def fits(self, scene: DeviceScene, camera: Camera) -> bool:
         """Whether all rows of the scene fit into this view, or into the largest one to come."""
         if self.largest is not None and self.largest.width * self.largest.height > camera.width * camera.height:
             camera = self.largest

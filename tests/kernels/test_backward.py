@@ -14,7 +14,8 @@ from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels import twins
-from flexgs_edge.methods.best.refit.descent import ORDER, Descent
+from flexgs_edge.methods.best.refit.chunk_state import ORDER
+from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
 from flexgs_edge.methods.best.refit.prices import BIT_WEIGHT, WIDTH, bit_prices
 from flexgs_edge.render.renderer import Renderer

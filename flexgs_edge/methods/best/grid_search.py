@@ -322,11 +322,13 @@ class GridSearch(MultiplierSearch[GridScene]):
         Also returns the row of `kept` of each row of the grid.
         """
         moved = self._distil(kept, schedule, step_sizes)
-        grid, order = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
+        storage = self.rounds.storage
+        grid, order = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved), storage)
         return self._with_constants(grid) if self.refit else grid, order
 
-    def _with_constants(self, grid: GridScene, storage: Storage = IN_MEMORY) -> GridScene:
+    def _with_constants(self, grid: GridScene) -> GridScene:
         """The grid with its constant colours refitted once."""
+        storage = self.rounds.storage
         moved = self._refit_colours(values_of(grid, storage), grid.sh_degrees, 1, bands=False)
         return recolour(grid, moved["sh_dc"], moved["sh_rest"], storage)
 
@@ -336,7 +338,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         landed, less = land(grid, removal, size, limit, self.size_of, storage)
         if landed is grid or not self.refit:
             return landed, less
-        mended = self._with_constants(landed, storage)
+        mended = self._with_constants(landed)
         final = self.size_of(mended)
         return (mended, final) if final <= limit else (landed, less)
 

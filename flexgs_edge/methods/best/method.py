@@ -235,7 +235,7 @@ def open_rounds(
     renderer, source, options, budget = bench.renderer, run.source, run.options, run.budget
     storage, steps = renderer.storage, distil_steps(options, len(scored), source.count, run.output.format is not None)
     if storage.spills:
-        size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest_of(scored))
+        size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest_of(scored), steps > 0)
     else:
         size, least = needed_bytes(renderer, source, scored, options, steps > 0)
     budget.require("a search by measured costs", size + least)

@@ -16,9 +16,11 @@ from flexgs_edge.memory.rows import READING_BYTES
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
 from flexgs_edge.methods.best.refit.descent import descent_bytes
+from flexgs_edge.methods.best.refit.streamed_descent import streamed_descent_bytes, streamed_rows
 from flexgs_edge.methods.best.rounds import PARTS, parts_of, sum_row_bytes
 from flexgs_edge.render.ahead import AHEAD_ROW_BYTES
 from flexgs_edge.render.fit import (
+    GRADIENT_SUMS,
     MOST_SUMS,
     chunk_shapes,
     padded,
@@ -92,14 +94,9 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
     size, least = needed_bytes(renderer, source, scored, options, distils)
     if size + least <= budget.free:
         return IN_MEMORY
-    if distils:
-        budget.require(
-            "distilling, which stays in memory as a whole (--distil 0 refits colours instead, in larger files),",
-            size + least,
-        )
     budget.require(
         "a search by measured costs with all else in scratch files",
-        READING_BYTES + SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest),
+        READING_BYTES + SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest, distils),
     )
     storage = ScratchStorage(folder, budget.limit)
     budget.take("reading scratch files", READING_BYTES)  # until the process ends
@@ -130,12 +127,22 @@ def needed_bytes(
     return size, _least_bytes(renderer, source, largest_of(scored), sums, distils)
 
 
-def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera) -> int:
+def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera, distils: bool) -> int:
     """Bytes that the first view of a search in scratch files needs. A view that shows more rows than expected needs more."""
-    fit, size = renderer.fit, view_size(renderer.backend, largest)
-    rows, shown = padded(min(fit.compact_rows, source.count)), -(-source.count // fit.first_share)
-    chunk = rows * streamed_bytes(source.sh_degree) + shapes_bytes(chunk_shapes(rows))
-    return view_bytes(size, shown) + reference_bytes(size) + sum_bytes(MOST_SUMS) * shown + chunk
+    fit, size, degree = renderer.fit, view_size(renderer.backend, largest), source.sh_degree
+    shown = -(-source.count // fit.first_share)
+
+    def least(rows: int, sums: int) -> int:
+        rows = padded(rows)
+        chunk = rows * streamed_bytes(degree) + shapes_bytes(chunk_shapes(rows))
+        return view_bytes(size, shown) + reference_bytes(size) + sum_bytes(sums) * shown + chunk
+
+    pruning = least(min(fit.compact_rows, source.count), MOST_SUMS)
+    if not distils:
+        return pruning
+    rows = streamed_rows(fit, source.count)
+    structure = shapes_bytes(structure_shapes(size))
+    return max(pruning, least(rows, GRADIENT_SUMS) + structure + streamed_descent_bytes(degree, rows))
 
 
 def _least_bytes(renderer: Renderer, source: SceneSource, camera: Camera, sum_bytes: int, structure: bool) -> int:

@@ -53,16 +53,17 @@ def compress(
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
 
 
-def test_the_peak_stays_below_the_limit_that_the_error_names(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("more", "row"), [((), 600), (("--distil", "12"), 2600)], ids=["refit", "descent"])
+def test_the_peak_stays_below_the_limit_that_the_error_names(tmp_path: Path, more: tuple[str, ...], row: int) -> None:
     write_ply(tmp_path / "point_cloud.ply", random_scene(ROWS, 8, 3, size=-4.0))
     write_cameras(tmp_path / "cameras.json")
     # Not the first run of its kernels from here on: building them would count.
-    done = compress(tmp_path, "free", None)
+    done = compress(tmp_path, "free", None, more=more)
     assert done.returncode == 0, done.stderr
 
     limits = ["20MiB"]
     for _ in range(16):  # each stage names what it lacks
-        done = compress(tmp_path, "files", limits[-1], max(parse_size(limits[-1]) + PAGES, 300 << 20))
+        done = compress(tmp_path, "files", limits[-1], max(parse_size(limits[-1]) + PAGES, 300 << 20), more)
         if done.returncode == 0:
             break
         assert done.returncode == 5, done.stderr
@@ -79,8 +80,8 @@ def test_the_peak_stays_below_the_limit_that_the_error_names(tmp_path: Path) -> 
     assert plan, done.stderr
     short = parse_size(plan.group(1)) - parse_size(plan.group(2))
     # And what a view and its sums need, which the plan for files does not name; start-up varies by some MiB.
-    limit = format_mib(parse_size(limits[-1]) + short + 600 * ROWS + (16 << 20))
-    done = compress(tmp_path, "memory", limit)
+    limit = format_mib(parse_size(limits[-1]) + short + row * ROWS + (16 << 20))
+    done = compress(tmp_path, "memory", limit, more=more)
     assert done.returncode == 0, done.stderr
     record = json.loads((tmp_path / "memory.json").read_text())
     assert record["run"]["scratch"] is None
@@ -88,27 +89,6 @@ def test_the_peak_stays_below_the_limit_that_the_error_names(tmp_path: Path) -> 
     assert record["count"] > ROWS / 2
     assert record["run"]["peak_memory"] <= parse_size(limit)
     assert (tmp_path / "memory.fgs").read_bytes() == (tmp_path / "free.fgs").read_bytes()
-
-
-def test_distilling_is_refused_or_stays_below_its_limit(tmp_path: Path) -> None:
-    """It keeps all in memory: no scratch files."""
-    write_ply(tmp_path / "point_cloud.ply", random_scene(ROWS, 8, 3, size=-4.0))
-    write_cameras(tmp_path / "cameras.json")
-    more = ("--distil", "12")
-    assert compress(tmp_path, "free", None, more=more).returncode == 0
-    limit, said = "185MiB", ""
-    for _ in range(4):  # each stage names what it lacks
-        done = compress(tmp_path, "yes", limit, more=more)
-        if done.returncode == 0:
-            break
-        named = re.search(r"use --memory-limit (\d+MiB) or more", done.stderr)
-        assert done.returncode == 5 and named, done.stderr
-        limit, said = named.group(1), said + done.stderr
-    assert done.returncode == 0 and "distilling" in said, said + done.stderr
-    record = json.loads((tmp_path / "yes.json").read_text())
-    assert record["count"] > ROWS / 2 and record["run"]["scratch"] is None
-    assert 0 < record["run"]["peak_memory"] <= parse_size(limit)
-    assert (tmp_path / "yes.fgs").read_bytes() == (tmp_path / "free.fgs").read_bytes()
 
 
 @pytest.mark.timeout(900)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,27 +10,16 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import LANES
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.methods.best.refit.chunk_state import PLANE_SETS, ChunkState, fields_of, widths
 from flexgs_edge.methods.best.refit.prices import PRICES
 from flexgs_edge.render.chunks import Chunk
-from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import GRADIENT_SUMS, sum_bytes
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_mib
 
-ORDER = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
-"""Fields in the order of a gradient's planes (cl_kernels/backward.cl)."""
-DECAYS = (0.9, 0.99)
-"""Decay of Adam's running means of gradients and of their squares. The usual 0.999 of the second would remember longer than
-a descent of a few hundred views lasts."""
 GRID_VALUES = 14
 """Step sizes that the kernel `snap` takes."""
-
-
-def widths(sh_degree: int) -> dict[str, int]:
-    """How many planes each field has, in the order of `ORDER`."""
-    return {name: FIELD[name].width(sh_degree) for name in ORDER}
 
 
 def descent_bytes(sh_degree: int) -> int:
@@ -40,7 +28,7 @@ def descent_bytes(sh_degree: int) -> int:
     They hold the sums of a view; all planes five times (values and their mean, gradient, two running means of it); stored
     geometry, degrees, flags and powers.
     """
-    return sum_bytes(GRADIENT_SUMS) + 4 * (5 * sum(widths(sh_degree).values()) + 8 + 4)
+    return sum_bytes(GRADIENT_SUMS) + 4 * (PLANE_SETS * sum(widths(sh_degree).values()) + 8 + 4)
 
 
 class Descent:
@@ -82,7 +70,7 @@ class Descent:
         self.renderer, self.backend, self.structure = renderer, renderer.backend, structure
         source = MemorySource(planes, origin=origin, sh_count=int(np.flatnonzero(degrees).max(initial=-1)) + 1)
         self.count, self.widths = source.count, widths(source.sh_degree)
-        self._parts: list[_Part] = []
+        self._parts: list[ChunkState] = []
         self._arrays: list[Any] = []
         self._priced = False
         # Planes of the last chunk with SH and of the last without are padded.
@@ -98,7 +86,7 @@ class Descent:
             lengths = sum(self.widths.values()), GRID_VALUES, PRICES
             self._rates, self._steps, self._prices = (self._array((n,)) for n in lengths)
             for chunk in self._scene.chunks():
-                self._parts.append(_Part(self._scene, chunk, planes, degrees))
+                self._parts.append(self._state(chunk, planes, degrees))
             self.put_on(None)
         except BaseException:
             self.close()
@@ -108,11 +96,29 @@ class Descent:
         self._arrays.append(self.backend.array(shape, np.float32))
         return self._arrays[-1]
 
+    def _state(self, chunk: Chunk, planes: dict[str, np.ndarray], degrees: np.ndarray) -> ChunkState:
+        part, span = (
+            ChunkState(self.backend, chunk, self._scene.antialiased),
+            slice(chunk.base, chunk.base + chunk.count),
+        )
+        self.backend.fill(part.values, 0)
+        part.begin()
+        part.put_degrees(degrees[span])
+        for _, rows, own in fields_of(planes, part.widths):
+            values = own[..., span].reshape(rows.stop - rows.start, chunk.count)
+            for plane in range(rows.start, rows.stop):
+                self.backend.write(part.values, values[plane - rows.start], plane * chunk.stride)
+        return part
+
     def put_on(self, steps: StepSizes | None) -> None:
         """From now on, draw from values on this grid (None: from the values themselves)."""
         self.backend.write(self._steps, step_record(steps))
+        self._snap()
+
+    def _snap(self) -> None:
         for part in self._parts:
             part.snap(self._steps)
+            part.activate()
 
     def price(self, prices: np.ndarray) -> None:
         """From now on, steps also go down what bits cost (record of `bit_prices`)."""
@@ -123,18 +129,17 @@ class Descent:
         """Compute gradients of the loss of a view against `target` ([3, H, W] f16, as for `Renderer.residual_sums`)."""
         sums = self.renderer.gradient_sums(self._scene, camera, target, self.structure)
         for part in self._parts:
-            part.differentiate(self.renderer, sums)
+            part.differentiate(self.renderer.camera_array, self.renderer.records_array, sums, part.chunk.base)
 
     def step(self, camera: Camera, target: np.ndarray, rates: dict[str, float]) -> None:
         """Take one step of Adam down the squared error of a view; `rates` are the largest changes of each field's values."""
         self.differentiate(camera, target)
-        per_plane = np.concatenate([np.full(width, rates[name], np.float32) for name, width in self.widths.items()])
-        self.backend.write(self._rates, per_plane)
+        self.backend.write(self._rates, rate_record(rates, self.widths))
         for part in self._parts:
             if self._priced:
                 part.price(self._prices)
             part.step(self._rates)
-            part.snap(self._steps)
+        self._snap()
 
     def follow(self, share: float) -> None:
         """Move the running mean of the values towards them by `share`; 1 begins it anew."""
@@ -149,7 +154,7 @@ class Descent:
     def gradients(self) -> dict[str, np.ndarray]:
         """Gradients of the last view ([width, n] f32 by field), zero for rows that it does not show."""
 
-        def read(part: _Part) -> np.ndarray:
+        def read(part: ChunkState) -> np.ndarray:
             return np.where(self.backend.read(part.touched) > 0, self.backend.read(part.gradient), np.float32(0))
 
         return self._gathered(read)
@@ -162,7 +167,7 @@ class Descent:
         whole = {name: np.zeros((width, self.count), np.float32) for name, width in self.widths.items()}
         for part in self._parts:
             values = read(part)
-            for _, rows, own in _fields(whole, part.widths):
+            for _, rows, own in fields_of(whole, part.widths):
                 span = slice(part.chunk.base, part.chunk.base + part.chunk.count)
                 own[..., span] = values[rows, : part.chunk.count].reshape(own[..., span].shape)
         return whole
@@ -183,107 +188,6 @@ class Descent:
         self.close()
 
 
-class _Part:
-    """One chunk of a descent."""
-
-    def __init__(self, scene: DeviceScene, chunk: Chunk, planes: dict[str, np.ndarray], degrees: np.ndarray) -> None:
-        self.backend, self.chunk, self.antialiased = scene.backend, chunk, int(scene.antialiased)
-        self.widths, self._arrays = widths(chunk.degree), []  # type: dict[str, int], list[Any]
-        stride, count = chunk.stride, sum(self.widths.values())
-        try:
-            self.values, self.gradient, self.first, self.second, self.mean = (
-                self._array((count, stride)) for _ in range(5)
-            )
-            self.powers, self.touched = self._array((2, stride)), self._array((stride,))
-            self.degrees = self._array((stride,), np.uint32)
-            self.stored = [self._array((width, stride)) for width in (3, 4, 1)]
-            self._fill(planes, degrees)
-        except BaseException:
-            self.release()
-            raise
-
-    def _array(self, shape: tuple[int, ...], dtype: Any = np.float32) -> Any:
-        self._arrays.append(self.backend.array(shape, dtype))
-        return self._arrays[-1]
-
-    def _fill(self, planes: dict[str, np.ndarray], degrees: np.ndarray) -> None:
-        backend, chunk = self.backend, self.chunk
-        span = slice(chunk.base, chunk.base + chunk.count)
-        for array in (self.values, self.first, self.second, self.mean):
-            backend.fill(array, 0)
-        backend.write(self.powers, np.ones(self.powers.shape, np.float32))
-        own_degrees = np.zeros(chunk.stride, np.uint32)
-        own_degrees[: chunk.count] = degrees[span]
-        backend.write(self.degrees, own_degrees)
-        for _, rows, own in _fields(planes, self.widths):
-            values = own[..., span].reshape(rows.stop - rows.start, chunk.count)
-            for plane in range(rows.start, rows.stop):
-                backend.write(self.values, values[plane - rows.start], plane * chunk.stride)
-
-    def snap(self, steps: Any) -> None:
-        chunk, stride = self.chunk, self.chunk.stride
-        self.backend.launch(
-            "snap",
-            (stride,),
-            stride,
-            chunk.degree,
-            steps,
-            self.values,
-            chunk.means,
-            *self.stored,
-            chunk.sh_dc,
-            chunk.sh_rest,
-        )
-        self.backend.launch(
-            "activate", (stride,), stride, self.antialiased, *self.stored, chunk.cov, chunk.log2_opacity
-        )
-
-    def differentiate(self, renderer: Renderer, sums: Any) -> None:
-        chunk = self.chunk
-        self.backend.launch(
-            "project_backward", (chunk.stride,), chunk.count, chunk.stride, chunk.base, chunk.degree, self.antialiased,
-            renderer.camera_array, chunk.means, *self.stored, chunk.sh_rest, self.degrees, renderer.records_array, sums,
-            self.touched, self.gradient,
-        )  # fmt: skip
-
-    def price(self, prices: Any) -> None:
-        stride, degree = self.chunk.stride, self.chunk.degree
-        self.backend.launch(
-            "price_bits", (stride,), stride, degree, prices, self.degrees, self.touched, self.values, self.gradient
-        )
-
-    def step(self, rates: Any) -> None:
-        stride = self.chunk.stride
-        self.backend.launch(
-            "adam", (stride,), stride, sum(self.widths.values()), *DECAYS, rates, self.touched, self.gradient, self.powers,
-            self.first, self.second, self.values,
-        )  # fmt: skip
-
-    def follow(self, share: float) -> None:
-        stride = self.chunk.stride
-        self.backend.launch("follow", (stride,), stride, sum(self.widths.values()), share, self.values, self.mean)
-
-    def settle(self) -> None:
-        stride = self.chunk.stride
-        self.backend.launch("follow", (stride,), stride, sum(self.widths.values()), 1.0, self.mean, self.values)
-
-    def release(self) -> None:
-        for array in self._arrays:
-            array.release()
-        self._arrays = []
-
-
-def _fields(planes: dict[str, np.ndarray], own: dict[str, int]) -> Iterator[tuple[str, slice, np.ndarray]]:
-    """Name, slice among all planes, and values of each field, as views. SH are cut to the first coefficients of each channel."""
-    at = 0
-    for name, width in own.items():
-        values = planes[name]
-        if name == "sh_rest":
-            values = values.reshape(3, len(values) // 3, values.shape[1])[:, : width // 3]
-        yield name, slice(at, at + width), values
-        at += width
-
-
 def step_record(steps: StepSizes | None) -> np.ndarray:
     """[GRID_VALUES] f32, step sizes in the order of the kernel `snap`; zeros for None."""
     record = np.zeros(GRID_VALUES, np.float32)
@@ -292,3 +196,8 @@ def step_record(steps: StepSizes | None) -> np.ndarray:
         for k, luma in enumerate((steps.dc, *steps.sh)):
             record[4 + 2 * k : 6 + 2 * k] = steps.colour(luma)[:2]
     return record
+
+
+def rate_record(rates: dict[str, float], own: dict[str, int]) -> np.ndarray:
+    """[planes] f32, the rate of each plane."""
+    return np.concatenate([np.full(width, rates[name], np.float32) for name, width in own.items()])

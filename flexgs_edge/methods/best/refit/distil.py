@@ -12,8 +12,10 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.methods.best.refit.descent import Descent
+from flexgs_edge.memory.rows import put_rows, read_ahead
+from flexgs_edge.memory.storage import Storage
 from flexgs_edge.methods.best.refit.prices import bit_prices
+from flexgs_edge.methods.best.refit.streamed_descent import open_descent
 from flexgs_edge.scene.rotations import canonical_axes
 from flexgs_edge.views.original import Original
 
@@ -131,25 +133,24 @@ def distil(
     Returns
     -------
     dict
-        The values ([width, n] f32 by field), not rounded to any grid.
+        The values ([width, n] f32 by field), not rounded to any grid, in the renderer's storage.
 
     Raises
     ------
     BudgetError
-        When the scene, its gradients and their running means do not fit into memory.
+        When the scene, its gradients and their running means do not fit into memory, and the renderer's storage has no files.
     """
     cameras = original.poses
     rates = {**rates_for(cameras), **(rates or {})}
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
-    # Quaternions get the form that the grid has. Rows with SH come first, so that the other chunks are drawn without SH.
-    quats, log_scales = canonical_axes(planes["quats"], planes["log_scales"])
-    ordered = {**planes, "quats": quats.astype(np.float32), "log_scales": log_scales}
+    renderer, storage = original.bench.renderer, original.bench.renderer.storage
+    # Rows with SH come first, so that the other chunks are drawn without SH.
     rows = np.argsort(degrees == 0, kind="stable")
-    ordered = {name: np.ascontiguousarray(values[:, rows]) for name, values in ordered.items()}
-    with Descent(original.bench.renderer, ordered, degrees[rows], original.origin, largest, structure) as descent:
+    ordered, degrees = _canonical(planes, rows, storage), degrees[rows]
+    with open_descent(renderer, ordered, degrees, original.origin, largest, structure) as descent:
         if step_sizes is not None and schedule.multiplier > 0 and len(degrees):
             worth = schedule.multiplier / len(original.cameras)
-            descent.price(bit_prices(ordered, degrees[rows], step_sizes, worth))
+            descent.price(bit_prices(ordered, degrees, step_sizes, worth))
         order = schedule.order(len(cameras), original.turns)
         parts = schedule.parts(step_sizes is not None)
         for place, part in enumerate(parts):
@@ -172,4 +173,14 @@ def distil(
         moved = descent.planes()
     back = np.empty_like(rows)
     back[rows] = np.arange(len(rows))
-    return {name: values[:, back] for name, values in moved.items()}
+    return {name: storage.take(values, back) for name, values in moved.items()}
+
+
+def _canonical(planes: dict[str, np.ndarray], rows: np.ndarray, storage: Storage) -> dict[str, np.ndarray]:
+    """The listed rows, with quaternions in the form that the grid has."""
+    taken = {name: storage.take(values, rows) for name, values in planes.items()}
+    for part, (quats, log_scales) in read_ahead(len(rows), taken["quats"], taken["log_scales"]):
+        quats, log_scales = canonical_axes(quats, log_scales)
+        put_rows(taken["quats"], part, quats.astype(np.float32))
+        put_rows(taken["log_scales"], part, log_scales)
+    return taken

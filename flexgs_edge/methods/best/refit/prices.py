@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from flexgs_edge.grid.step_sizes import Planes, StepSizes
+from flexgs_edge.memory.rows import read_ahead
 
 PRICES = 33
 """Values of the record that the kernel `price_bits` takes."""
@@ -42,28 +43,41 @@ def bit_prices(planes: Planes, degrees: np.ndarray, steps: StepSizes, worth: flo
         [33] f32: price and width of scale, rotation and opacity, and of luma and chroma of the constant and each SH degree;
         then centres of the three scales, opacity, Y, Co and Cg.
     """
+    centres = _centres(planes)
+    grid = [steps.scale, steps.rotation, steps.opacity]
+    for luma in (steps.dc, *steps.sh):
+        grid += [float(size) for size in steps.colour(luma)[:2]]
+    sums, counts = np.zeros(len(grid)), np.zeros(len(grid))
+    fields = (planes[name] for name in ("log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest"))
+    for rows, (scales, quats, logits, constant, rest) in read_ahead(len(degrees), *fields):
+        colours, own = _luma_and_chroma(constant) - centres[4:, None], degrees[rows]
+        kinds = [scales - centres[:3, None], quats[1:], logits - centres[3], colours[:1], colours[1:]]
+        bands = rest.reshape(3, -1, len(own))
+        for level in range(1, len(steps.sh) + 1):
+            band = _luma_and_chroma(bands[:, level * level - 1 : (level + 1) ** 2 - 1, own >= level])
+            kinds += [band[:1], band[1:]]
+        sums += [np.abs(away).sum(dtype=np.float64) for away in kinds]
+        counts += [away.size for away in kinds]
+    # Where all values are alike they take no bits, and a small b must not make a large price of it.
+    spreads = np.maximum(sums / np.maximum(counts, 1), np.array(grid) / 4)
     prices = np.zeros(PRICES, np.float32)
-    scales, logits = planes["log_scales"].astype(np.float64), planes["opacity_logits"].astype(np.float64)
-    constant = _luma_and_chroma(planes["sh_dc"])
-    centres = [np.median(values, axis=1, keepdims=True) for values in (scales, logits, constant)]
-    prices[26:] = np.concatenate(centres)[:, 0]
-
-    def put(place: int, away: np.ndarray, step: float) -> None:
-        # Where all values are alike they take no bits, and a small b must not make a large price of it.
-        spread = max(float(np.abs(away).mean()) if away.size else 0.0, step / 4)
-        prices[place : place + 2] = BIT_WEIGHT * worth / (math.log(2) * spread), WIDTH * step
-
-    put(0, scales - centres[0], steps.scale)
-    put(2, planes["quats"][1:].astype(np.float64), steps.rotation)
-    put(4, logits - centres[1], steps.opacity)
-    rest = planes["sh_rest"].reshape(3, -1, len(degrees))
-    for level, luma in enumerate((steps.dc, *steps.sh)):
-        band = rest[:, level * level - 1 : (level + 1) ** 2 - 1, degrees >= level] if level else None
-        away = constant - centres[2] if band is None else _luma_and_chroma(band)
-        sizes = steps.colour(luma)
-        put(6 + 4 * level, away[:1], float(sizes[0]))
-        put(8 + 4 * level, away[1:], float(sizes[1]))
+    prices[0 : 2 * len(grid) : 2] = BIT_WEIGHT * worth / (math.log(2) * spreads)
+    prices[1 : 2 * len(grid) : 2] = WIDTH * np.array(grid)
+    prices[-len(centres) :] = centres
     return prices
+
+
+def _centres(planes: Planes) -> np.ndarray:
+    """[7] f64, medians of the three scales, opacity, Y, Co and Cg. Memory holds one column at a time."""
+
+    def median(name: str, place: int) -> float:
+        column = np.empty(planes[name].shape[1])
+        for rows, (part,) in read_ahead(len(column), planes[name]):
+            column[rows] = (_luma_and_chroma(part) if name == "sh_dc" else part)[place]
+        return float(np.median(column, overwrite_input=True))
+
+    scales, colours = ([median(name, place) for place in range(3)] for name in ("log_scales", "sh_dc"))
+    return np.array([*scales, median("opacity_logits", 0), *colours])
 
 
 def _luma_and_chroma(colours: np.ndarray) -> np.ndarray:
