@@ -27,7 +27,7 @@ from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOP
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.kept import Kept, Refitted
-from flexgs_edge.methods.best.landing import land
+from flexgs_edge.methods.best.landing import land, land_on_quality
 from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART, Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import Schedule, distil
@@ -126,8 +126,20 @@ class GridSearch(MultiplierSearch[GridScene]):
         self._drift = DRIFT if effort.refit_rounds and not steps else 0.0
         self._expected = 0.0
         self._warming = effort.warming if steps else ()
+        self._removal: list[tuple[GridScene, np.ndarray]] = []
+        """Results that may be the answer, with the costs of the removal of each of their rows."""
 
     def run(self, target: Target, best_effort: bool = False) -> RateResult[GridScene]:
+        """As `MultiplierSearch.run`, and then `land_on_quality` if a quality is asked for."""
+        found = self._searched(target, best_effort)
+        lands = found.reached and target.limit_bytes is None and not self.ended
+        return self._landed_on_quality(found, target) if lands else found
+
+    def discard(self, product: GridScene) -> None:
+        """See `MultiplierSearch.discard`."""
+        self._removal = [(grid, removal) for grid, removal in self._removal if grid is not product]
+
+    def _searched(self, target: Target, best_effort: bool) -> RateResult[GridScene]:
         """As `MultiplierSearch.run`. Where no descent reaches a quality, colours are refitted instead.
 
         Descents gain most in the mean, so that the worst view may never come near enough to it.
@@ -308,13 +320,19 @@ class GridSearch(MultiplierSearch[GridScene]):
         storage = self.rounds.storage
         grid = lowered(grid, storage)
         size = self.size_of(grid)
+        removal = kept.removal[order]
         if target.limit_bytes is not None:
-            grid, size = self._landed(grid, kept.removal[order], size, target.limit_bytes)
+            grid, size = self._landed(grid, removal, size, target.limit_bytes)
+        else:
+            self._removal.append((grid, removal))
+        return self._measured(grid, size, multiplier, target, started, kept.left_out), grid
+
+    def _measured(
+        self, grid: GridScene, size: int, multiplier: float, target: Target, started: float, left_out: int
+    ) -> Candidate:
         measurement = self.measure(values_of(grid, self.rounds.storage))
-        excess = target.excess(size, measurement)
-        seconds = time.perf_counter() - started
-        found = Candidate(multiplier, grid.count, grid.sh_count, size, measurement, excess, seconds, kept.left_out)
-        return found, grid
+        excess, seconds = target.excess(size, measurement), time.perf_counter() - started
+        return Candidate(multiplier, grid.count, grid.sh_count, size, measurement, excess, seconds, left_out)
 
     def _distilled(self, kept: Kept, step_sizes: StepSizes, schedule: Schedule) -> tuple[GridScene, np.ndarray]:
         """Move all values towards the references, put them on the grid, and refit the constant colour.
@@ -341,6 +359,32 @@ class GridSearch(MultiplierSearch[GridScene]):
         mended = self._with_constants(landed)
         final = self.size_of(mended)
         return (mended, final) if final <= limit else (landed, less)
+
+    def _landed_on_quality(self, found: RateResult[GridScene], target: Target) -> RateResult[GridScene]:
+        """The answer without the Gaussians that it could do without."""
+        chosen, (grid, removal) = found.chosen, next(pair for pair in self._removal if pair[0] is found.product)
+        best, steps = (chosen, grid), list(found.steps)
+
+        def attempt(smaller: GridScene) -> float:
+            nonlocal best
+            started = time.perf_counter()
+            mended = self._with_constants(smaller) if self.refit else smaller
+            size = self.size_of(mended)
+            step = self._measured(mended, size, chosen.multiplier, target, started, chosen.left_out)
+            steps.append(step)
+            if self.on_step:
+                self.on_step(step)
+            if better(step, best[0], target):
+                best = step, mended
+            return step.excess
+
+        try:
+            land_on_quality(grid, removal, chosen.excess, attempt, self.rounds.storage)
+        except KeyboardInterrupt:
+            if not self.keeps_best:
+                raise
+            self.interrupted()
+        return replace(found, product=best[1], chosen=best[0], steps=tuple(steps))
 
     def _finish(self, kept: Kept, step_sizes: StepSizes) -> tuple[GridScene, np.ndarray]:
         """Put geometry on its grid, refit all colours, put SH on their grid, refit the constant colour, put it on its grid.

@@ -1,4 +1,4 @@
-"""Brings a result that is a little too large to the size that was asked for, without making it anew."""
+"""Brings a result to what was asked for, without making it anew: one that is a little too large, or better than need be."""
 
 from __future__ import annotations
 
@@ -17,6 +17,12 @@ NEAR = 0.002
 """How far below the limit, as a share of it, we are content."""
 TRIES = 4
 """Most times that the file is coded on the way."""
+SHARE = 0.5
+"""Share of the Gaussians to remove at first, for each unit of the log of what a quality allows: docs/results/tuning.md#landing"""
+NEAR_QUALITY = 0.02
+"""How far below what it allows, as a share of it, we are content."""
+QUALITY_TRIES = 2
+"""Most results that are made and measured on the way to a quality."""
 
 
 def land(
@@ -66,6 +72,41 @@ def land(
             out = count
         each = max((size - last) / count, each / 4)
     return landed or (grid, size)
+
+
+def land_on_quality(
+    grid: GridScene, removal: np.ndarray, excess: float, attempt: Callable[[GridScene], float], storage: Storage
+) -> None:
+    """Remove the Gaussians whose removal costs least, until a quality hardly holds.
+
+    Parameters
+    ----------
+    grid : GridScene
+        The result, which holds.
+    removal : np.ndarray
+        [n] f64, cost of the removal of each of its rows.
+    excess : float
+        Log of its loss over what is allowed, below 0.
+    attempt : callable
+        Makes and measures the result of a grid, and returns its excess.
+    storage : Storage
+        Holds the grids.
+    """
+    cheapest = np.argsort(removal, kind="stable")
+    within, beyond, aim = (0, excess), grid.count, -NEAR_QUALITY / 2
+    each = 1 / (SHARE * grid.count)
+    for _ in range(QUALITY_TRIES if excess < -NEAR_QUALITY else 0):
+        count = min(within[0] + round((aim - within[1]) / each), beyond - 1)
+        if count <= within[0]:
+            return
+        found = attempt(grid.take(_along_curve(grid.position, np.sort(cheapest[count:])), storage))
+        each = (found - within[1]) / (count - within[0])
+        if found <= 0.0:
+            within = count, found
+            if found >= -NEAR_QUALITY or each <= 0.0:
+                return
+        else:
+            beyond = count
 
 
 def _along_curve(position: np.ndarray, rows: np.ndarray) -> np.ndarray:

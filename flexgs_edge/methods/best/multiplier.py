@@ -68,6 +68,8 @@ class MultiplierSearch(ABC, Generic[Product]):
     ----------
     most : int or None
         Most Gaussians of a candidate (`--max-gaussians`).
+    ended : bool
+        Whether the search was interrupted and answers with what it has.
     """
 
     pruned_part = PRUNED_PART
@@ -85,6 +87,7 @@ class MultiplierSearch(ABC, Generic[Product]):
         self.rounds, self.measure, self.effort, self.on_step = rounds, measure, effort, on_step
         self.bits = BitModel()
         self.most: int | None = None
+        self.ended = False
         self._lead, self._begin = 0.0, 0
 
     @abstractmethod
@@ -107,6 +110,11 @@ class MultiplierSearch(ABC, Generic[Product]):
     def discard(self, product: Product) -> None:
         """Free a product that is not the best any more."""
         return
+
+    def interrupted(self) -> None:
+        """Say that the best candidate so far is taken, and do nothing more to it."""
+        LOG.warning("interrupted: the best result so far is taken")
+        self.ended = True
 
     def choose(self, costs: RemovalCosts, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
         """Rows to keep ([n] bool), and their SH degrees ([n] u8)."""
@@ -141,7 +149,7 @@ class MultiplierSearch(ABC, Generic[Product]):
             except KeyboardInterrupt:
                 if best is None or not self.keeps_best:
                     raise
-                LOG.warning("interrupted: the best of %d results is taken", len(steps))
+                self.interrupted()
                 break
             steps.append(step)
             if self.on_step:

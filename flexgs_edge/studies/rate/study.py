@@ -129,7 +129,7 @@ def _experiments(
     if distilled:
         try:
             found += best_points(studied, WHOLE, MAX, distilled)
-        except BudgetError as error:  # a descent does not stream
+        except BudgetError as error:  # a study keeps its scenes in memory
             found += Found((), (f"best ({MAX}: {error})",))
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder) as place:
         found += peer_points(studied, Path(place))

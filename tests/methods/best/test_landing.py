@@ -1,4 +1,4 @@
-"""Results that are a little too large lose their cheapest Gaussians until they fit."""
+"""Results that are a little too large, or better than asked, lose their cheapest Gaussians."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.memory.storage import IN_MEMORY
-from flexgs_edge.methods.best.landing import REACH, TRIES, land
+from flexgs_edge.methods.best.landing import NEAR_QUALITY, QUALITY_TRIES, REACH, TRIES, land, land_on_quality
 from flexgs_edge.scene.fields import FIELD
 from synthetic import random_scene
 
@@ -76,3 +76,38 @@ def test_sizes_that_do_not_fall_end_it(grid: GridScene) -> None:
 def test_one_gaussian_stays(grid: GridScene) -> None:
     one = grid.take(np.arange(1))
     assert land(one, np.zeros(1), 101, 100, size_of, IN_MEMORY) == (one, 101)
+
+
+@pytest.mark.parametrize("power", [1.0, 1.3, 1.6])
+@pytest.mark.parametrize("excess", [-0.02, -0.06, -0.15])
+def test_lands_just_below_a_quality(grid: GridScene, excess: float, power: float) -> None:
+    """Where the loss grows with some power of what is gone: the cheapest go first."""
+    removal = np.random.default_rng(1).random(COUNT)
+    seen: list[tuple[int, float]] = []
+
+    def attempt(smaller: GridScene) -> float:
+        gone = COUNT - smaller.count
+        seen.append((gone, excess + 3 * (gone / COUNT) ** power))
+        return seen[-1][1]
+
+    land_on_quality(grid, removal, excess, attempt, IN_MEMORY)
+    best = max((found for _, found in seen if found <= 0.0), default=excess)
+    assert len(seen) <= QUALITY_TRIES and len({gone for gone, _ in seen}) == len(seen)
+    assert best >= min(0.9 * excess, -NEAR_QUALITY) and (power != 1.0 or best >= -NEAR_QUALITY)
+
+
+def test_a_quality_that_is_met_is_left_alone(grid: GridScene) -> None:
+    land_on_quality(grid, np.zeros(COUNT), -0.5 * NEAR_QUALITY, lambda _: pytest.fail("no need"), IN_MEMORY)
+
+
+def test_removals_that_gain_quality_end_it(grid: GridScene) -> None:
+    asked: list[int] = []
+
+    def attempt(smaller: GridScene) -> float:
+        asked.append(smaller.count)
+        return -0.2
+
+    land_on_quality(grid, np.zeros(COUNT), -0.1, attempt, IN_MEMORY)
+    assert len(asked) == 1
+    land_on_quality(grid.take(np.arange(1)), np.zeros(1), -0.1, attempt, IN_MEMORY)
+    assert len(asked) == 1

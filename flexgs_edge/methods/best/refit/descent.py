@@ -55,7 +55,7 @@ class Descent:
     Raises
     ------
     BudgetError
-        When the scene, its gradients and their running means do not fit at once: a descent does not stream.
+        When the scene, its gradients and their running means do not fit at once. `StreamedDescent` goes on there.
     """
 
     def __init__(

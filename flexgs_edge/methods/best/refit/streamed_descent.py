@@ -5,26 +5,24 @@ The values are those of `Descent`, bit for bit: a step changes no row that its v
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.kernels.backend import Backend
-from flexgs_edge.memory.rows import copy_rows, put_rows, read_rows
+from flexgs_edge.memory.rows import put_rows, read_rows
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.methods.best.refit.chunk_state import PLANE_SETS, ChunkState, fields_of, widths
-from flexgs_edge.methods.best.refit.descent import GRID_VALUES, Descent, descent_bytes, rate_record, step_record
+from flexgs_edge.methods.best.refit.descent import Descent, descent_bytes, rate_record, step_record
+from flexgs_edge.methods.best.refit.moving_planes import MovingPlanes, Part, bounds_of, parts_of
 from flexgs_edge.methods.best.refit.prices import PRICES
-from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.chunks import ChunkArrays
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import GRADIENT_SUMS, RAW_BYTES, Fit, padded, plane_bytes, sum_bytes
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.scene.source import MemorySource, SceneSource
+from flexgs_edge.scene.source import MemorySource
 
 CHUNK_ROWS = 1 << 14
 """Most rows of a chunk: 4 MB of values at SH degree 3. Larger ones would hold more rows that a view does not show."""
@@ -68,93 +66,6 @@ def streamed_descent_bytes(sh_degree: int, rows: int) -> int:
     return padded(rows) * (own + 2 * (4 * RECORD + sum_bytes(GRADIENT_SUMS)))
 
 
-@dataclass
-class _Part:
-    """Where a chunk's state lies in the files, and what is still to be done to it.
-
-    Attributes
-    ----------
-    at, powers_at : int
-        First element in the files of planes, and in that of powers.
-    stepped : bool
-        Whether a step has moved the chunk. Before, its running means of gradients are zero and not in the files.
-    mean : {"none", "values", "own"}
-        Whether there is a mean of the values, and whether it is in its file or equal to the values.
-    pending : list of float
-        Shares by which the mean is still to follow the values as they are.
-    """
-
-    base: int
-    count: int
-    degree: int
-    at: int
-    powers_at: int
-    stepped: bool = False
-    mean: str = "none"
-    pending: list[float] = field(default_factory=list)
-
-    @property
-    def stride(self) -> int:
-        """Rows in the files."""
-        return padded(self.count)
-
-    @property
-    def span(self) -> slice:
-        """Elements in the files of planes."""
-        return slice(self.at, self.at + sum(widths(self.degree).values()) * self.stride)
-
-    @property
-    def powers_span(self) -> slice:
-        """Elements in the file of powers."""
-        return slice(self.powers_at, self.powers_at + 2 * self.stride)
-
-
-class _MovingPlanes:
-    """Fills the chunks that views are drawn from (`ChunkPlanes`): values put on their grids."""
-
-    def __init__(self, backend: Backend, source: SceneSource) -> None:
-        self.backend, self.origin = backend, source.origin
-        self.count, self.sh_count, self.sh_degree = source.count, source.sh_count, source.sh_degree
-        self.bounds: dict[int, ChunkBounds] = {}
-        self.parts: dict[int, _Part] = {}
-        self.values = np.zeros(0, np.float32)
-        self.steps = backend.array((GRID_VALUES,), np.float32)
-        self._room: Any = None
-        self._drawn: Callable[[], None] = lambda: None
-
-    def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
-        """Put rows [start, stop) on the grid, into arrays of the backend."""
-        part, stride = self.parts[start], padded(stop - start)
-        shape = (sum(widths(part.degree).values()), stride)
-        self._drawn()
-        if self._room is None or self._room.shape != shape:
-            self.close_room()
-            self._room = self.backend.array(shape, np.float32)
-        with self.backend.mapped(self._room) as host:
-            copy_rows(self.values, part.span, host.reshape(-1))
-        stored = [planes[name] for name in ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")]
-        self.backend.launch("snap", (stride,), stride, part.degree, self.steps, self._room, *stored)
-        self._drawn = self.backend.mark()
-        if start not in self.bounds:
-            self.bounds[start] = bounds_of(self.backend, stored[0], stored[1], stop - start)
-
-    def close_room(self) -> None:
-        """Free the room for the values of a chunk."""
-        if self._room is not None:
-            self._room.release()
-            self._room = None
-
-    def close(self) -> None:
-        """Free everything."""
-        self.close_room()
-        self.steps.release()
-
-
-def bounds_of(backend: Backend, means: Any, log_scales: Any, count: int) -> ChunkBounds:
-    """Bounds of the first `count` rows of planes on the backend."""
-    return ChunkBounds.of(backend.read(means)[:, :count], backend.read(log_scales)[:, :count])
-
-
 class StreamedDescent:
     """As `Descent`, with all state in scratch files.
 
@@ -182,7 +93,7 @@ class StreamedDescent:
         source = MemorySource(planes, origin=origin, sh_count=int(np.flatnonzero(degrees).max(initial=-1)) + 1)
         self.count, self.widths, fit = source.count, widths(source.sh_degree), renderer.fit
         self._degrees, self._priced = degrees, False
-        self._planes = _MovingPlanes(self.backend, source)
+        self._planes = MovingPlanes(self.backend, source)
         self._scene = DeviceScene(
             self.backend,
             self._planes,
@@ -202,7 +113,7 @@ class StreamedDescent:
             renderer.release()
             self._scene.be_compact(fit.capacity(self.count, 1 / fit.first_share))
             self._rates, self._prices = (self._array(n) for n in (sum(self.widths.values()), PRICES))
-            self._parts = _parts_of(self._scene.spans())
+            self._parts = parts_of(self._scene.spans())
             self._planes.parts = {part.base: part for part in self._parts}
             size, powers = (self._parts[-1].span.stop, self._parts[-1].powers_span.stop) if self._parts else (0, 0)
             self._first, self._second, self._mean = (self.storage.empty((size,), np.float32) for _ in range(3))
@@ -218,7 +129,7 @@ class StreamedDescent:
         self._arrays.append(self.backend.array((count,), np.float32))
         return self._arrays[-1]
 
-    def _fill(self, part: _Part, planes: dict[str, np.ndarray]) -> None:
+    def _fill(self, part: Part, planes: dict[str, np.ndarray]) -> None:
         own = widths(part.degree)
         values = np.zeros((sum(own.values()), part.stride), np.float32)
         for _, rows, some in fields_of(planes, own):
@@ -254,7 +165,7 @@ class StreamedDescent:
             own = self.backend.read(records, np.empty((last - first, RECORD), np.float32), first * RECORD)
             self._move(part, shown[first:last] - np.uint32(part.base), own, some)
 
-    def _move(self, part: _Part, rows: np.ndarray, records: np.ndarray, sums: np.ndarray) -> None:
+    def _move(self, part: Part, rows: np.ndarray, records: np.ndarray, sums: np.ndarray) -> None:
         """Take one step of Adam for the rows of a chunk that a view shows."""
         state = self._opened(part)
         self._follow_up(part, state)
@@ -281,7 +192,7 @@ class StreamedDescent:
         if part.mean == "own":
             self._save(self._mean, part.span, state.mean)
 
-    def _opened(self, part: _Part) -> ChunkState:
+    def _opened(self, part: Part) -> ChunkState:
         """The state of a chunk on the backend, without its mean."""
         state = self._room_for(part)
         self._load(state.values, self._planes.values, part.span)
@@ -294,7 +205,7 @@ class StreamedDescent:
         state.put_degrees(self._degrees[part.base : part.base + part.count])
         return state
 
-    def _follow_up(self, part: _Part, state: ChunkState) -> None:
+    def _follow_up(self, part: Part, state: ChunkState) -> None:
         """Bring the mean up to the values as they are, and make it the chunk's own, if there is one."""
         if part.mean == "own":
             self._load(state.mean, self._mean, part.span)
@@ -305,7 +216,7 @@ class StreamedDescent:
             state.follow(share)
         part.pending = []
 
-    def _room_for(self, part: _Part) -> ChunkState:
+    def _room_for(self, part: Part) -> ChunkState:
         if self._state is None or (self._state.chunk.degree, self._state.chunk.stride) != (part.degree, part.stride):
             self._free_room()
             self._chunk = ChunkArrays(self.backend, part.degree, part.stride)
@@ -313,7 +224,7 @@ class StreamedDescent:
         self._state.chunk.count = part.count
         return self._state
 
-    def _splats_of(self, part: _Part) -> tuple[Any, Any]:
+    def _splats_of(self, part: Part) -> tuple[Any, Any]:
         """Records and sums of a chunk's rows, on the backend."""
         if self._splats is None:
             shapes = ((part.stride, RECORD), np.float32), ((part.stride, GRADIENT_SUMS, 2), np.uint32)
@@ -379,12 +290,3 @@ class StreamedDescent:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
-
-
-def _parts_of(spans: Iterable[tuple[int, int, int]]) -> list[_Part]:
-    parts: list[_Part] = []
-    at = powers_at = 0
-    for start, stop, degree in spans:
-        parts.append(_Part(start, stop - start, degree, at, powers_at))
-        at, powers_at = parts[-1].span.stop, parts[-1].powers_span.stop
-    return parts
