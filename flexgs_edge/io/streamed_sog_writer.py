@@ -1,7 +1,7 @@
 """Write streamed SOG scenes of PlayCanvas: `lod-meta.json`, and a folder of pictures for each part of each level.
 
 A level stands for the whole scene, so each is written whole: the finest has all layers of a `.fgs`, the next all but the last,
-and so on. Viewers load a coarse level first, and finer ones where somebody looks.
+and so on, with larger Gaussians (`growth`). Viewers load a coarse level first, and finer ones where somebody looks.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from flexgs_edge.io.reading import Writing
 from flexgs_edge.io.sog import META
 from flexgs_edge.io.sog_writer import write_sog
 from flexgs_edge.scene.curve import near_rows
+from flexgs_edge.scene.growth import GrownSource
 from flexgs_edge.scene.rotations import matrices
 from flexgs_edge.scene.source import SceneSource
 
@@ -95,7 +96,8 @@ class _Writer:
             if not some.size:
                 break  # coarser levels have even fewer
             name = f"{level}_{self.leaves}"
-            self._write(name, self.source.select(some[near_rows(self.means[:, some])]))
+            part = self.source.select(some[near_rows(self.means[:, some])])
+            self._write(name, GrownSource(part, len(rows)) if level else part)
             levels[str(level)] = {"file": len(self.files), "offset": 0, "count": len(some)}
             self.files.append(f"{name}/{META}")
         self.leaves += 1

@@ -70,6 +70,14 @@ def test_levels_are_the_scene_up_to_a_layer(
         one = level(tmp_path / "out", number)
         assert (one.count, one.sh_degree, one.settings) == (count, 2, {"antialiased": True})
         np.testing.assert_allclose(means(one, slice(0, count)), means(source, slice(0, count)), atol=tolerance)
+        # Coarse levels are larger, by what their own part of the tree lacks.
+        grown = [
+            np.median(values.read(slice(0, count), ["log_scales"])["log_scales"].astype(np.float64))
+            for values in (one, source)
+        ]
+        lacks = [leaf["lods"]["0"]["count"] / leaf["lods"]["1"]["count"] for leaf in found]
+        expected = np.log([min(lacks), max(lacks)] if number else [1.0, 1.0]) / 8
+        assert expected[0] - 0.02 < grown[0] - grown[1] < expected[1] + 0.02
     assert len(set(meta["filenames"])) == len(meta["filenames"])
 
 

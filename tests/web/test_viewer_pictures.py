@@ -19,13 +19,16 @@ from PIL import Image
 
 from browser import Browser
 from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.codec.v2.container import GridContainer, write_grid
 from flexgs_edge.commands.render import render_views
+from flexgs_edge.commands.trim import trim
 from flexgs_edge.commands.view import view
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
-from flexgs_edge.io.ply import PlySource
+from flexgs_edge.io.ply import PlySource, write_ply
 from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.growth import GrownSource
 from flexgs_edge.viewer.assets import PAGE
 from flexgs_edge.viewer.server import SceneServer
 from viewer_tab import decibels, drag, faults, requests, until
@@ -138,6 +141,28 @@ def test_a_ply_is_shown_too(tab: Browser, sample_dir: Path, tmp_path: Path) -> N
         assert tab.run("viewer.header.version") == 1
         wanted = np.asarray(Image.open(file), np.float64)
         assert decibels(picture(tab, 3, wanted.shape[1], wanted.shape[0]), wanted) >= 50
+
+
+def test_what_is_there_of_a_cut_file_is_drawn_larger(
+    tab: Browser, scene: Path, sample_dir: Path, tmp_path: Path
+) -> None:
+    """Half of the rows: as large as docs/drawing.md says, in a cut file and while the rest is on its way."""
+    cameras = str(sample_dir / "cameras.json")
+    whole = open_fgs(scene)
+    count = whole.container.header.layers[0]
+    cut, grown = tmp_path / "cut.fgs", tmp_path / "grown.ply"
+    trim(scene, cut, scene.stat().st_size - 1)
+    write_ply(grown, GrownSource(whole.select(np.arange(count)), whole.count))
+    (file,) = render_views(grown, tmp_path, views=[3], cameras=cameras, device="numpy").files
+    wanted = np.asarray(Image.open(file), np.float64)
+    with served(cut, cameras) as address:
+        go(tab, address)
+        assert decibels(picture(tab, 3, wanted.shape[1], wanted.shape[0]), wanted) >= 50
+        assert tab.run("viewer.growth") == pytest.approx(2**0.125, rel=1e-3)
+    with served(scene, cameras) as address:
+        go(tab, address)
+        assert tab.run("viewer.growth") == 1
+        assert tab.run("(() => { viewer.rows /= 2; return viewer.growth; })()") == pytest.approx(2**0.125)
 
 
 def test_a_browser_without_webgl2_is_told_so(tab: Browser, scene: Path) -> None:

@@ -13,11 +13,13 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import values_of
+from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
 from flexgs_edge.methods.best.rounds import take_rows
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.fit import sum_bytes
+from flexgs_edge.scene.growth import growth
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
 
@@ -38,7 +40,8 @@ def assign_layers(
 ) -> GridScene:
     """Sort the Gaussians into `layers` layers by cost of removal for each bit; each layer doubles the bytes.
 
-    Costs are measured again after each fifth of the bits, on the decoded scene, because a cut file has no refit.
+    Costs are measured again after each fifth of the bits, on the decoded scene, because a cut file has no refit. What is left is
+    measured as large as viewers draw it (`growth`).
     Gaussians that no pose sees come last.
 
     Parameters
@@ -70,6 +73,8 @@ def assign_layers(
         end = HALF * spent[left].sum()
         while len(left) > 1 and spent[left].sum() > end:  # the first layer is never empty
             kept = take_rows(planes, left, storage)
+            for rows, (scales,) in read_ahead(len(left), kept["log_scales"]):
+                put_rows(kept["log_scales"], rows, scales + growth(len(left), grid.count))
             with renderer.load(MemorySource(kept, origin=grid.origin), sum_bytes(2) + cost_bytes(0)) as scene:
                 costs = measure_costs(bench, scene, cameras, sh_costs=False, progress=progress)
             worth = np.where(costs.weight2 > 0, costs.removal / spent[left], -1.0)

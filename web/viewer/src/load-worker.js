@@ -6,7 +6,8 @@ async function load(source, name) {
   const file = await open(source, { name });
   const { count, shDegree, origin, settings, layers, size, version, header } = file;
   const shRows = header.channels ? (header.channels.rows[0] ?? 0) : (header.shCount ?? (shDegree ? count : 0));
-  self.postMessage({ header: { count, shDegree, origin, settings, layers, size, version, shRows } });
+  const { cutFrom } = header;
+  self.postMessage({ header: { count, shDegree, origin, settings, layers, size, version, shRows, cutFrom } });
   let shBefore = 0;
   for await (const chunk of file.chunks()) {
     const packed = packChunk(chunk.values(), chunk.rows, shDegree, shBefore, chunk.codes.degrees);

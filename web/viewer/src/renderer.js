@@ -72,8 +72,9 @@ export class Renderer {
    * Draw a frame.
    * @param {object} view from `Camera.view`
    * @param {{near: number, degree: number, antialiased: boolean, background: number[]}} look
+   * @param {number} growth factor on all scales
    */
-  draw(view, look) {
+  draw(view, look, growth = 1) {
     const { gl } = this;
     const { width, height } = view;
     this.#makeTarget(width, height);
@@ -81,7 +82,7 @@ export class Renderer {
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    if (this.drawn) this.#drawSplats(view, look);
+    if (this.drawn) this.#drawSplats(view, look, growth);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.disable(gl.BLEND);
     gl.viewport(0, 0, width, height);
@@ -92,7 +93,7 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  #drawSplats(view, look) {
+  #drawSplats(view, look, growth) {
     const { gl } = this;
     const { program, at } = this.splats;
     gl.useProgram(program);
@@ -109,6 +110,7 @@ export class Renderer {
     gl.uniform1i(at('shTexels'), shTexels(this.degree));
     gl.uniform1i(at('shPerLine'), shPerLine(this.degree));
     gl.uniform1i(at('antialiased'), look.antialiased ? 1 : 0);
+    gl.uniform1f(at('growth'), growth);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.array);

@@ -17,6 +17,7 @@ uniform int degree;
 uniform int shTexels;
 uniform int shPerLine;
 uniform bool antialiased;
+uniform float growth;
 flat out vec2 centre;
 flat out vec3 conic;
 flat out vec4 colour;
@@ -78,7 +79,7 @@ void main() {
 
   // The covariance's factor, then its projection: rows of J R M.
   vec4 q = normalize(uintBitsToFloat(texel(2)));
-  vec3 s = exp(uintBitsToFloat(t1.xyz));
+  vec3 s = growth * exp(uintBitsToFloat(t1.xyz));
   float w = q.x, x = q.y, y = q.z, z = q.w;
   mat3 m = mat3(
     s.x * vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),

@@ -5,6 +5,7 @@ import { subtract, dot, times, add } from './vectors.js';
 import { sendScene, startWorker } from './workers.js';
 
 const GRID = 256 * 2 ** 20;
+const GROWTH_POWER = 1 / 8;
 
 /**
  * A scene on a canvas. It draws when something changed, and while a key is held.
@@ -158,6 +159,13 @@ export class Viewer extends EventTarget {
     this.refresh();
   }
 
+  /** Factor on all scales while layers are missing (docs/drawing.md): what is there fills the gaps. */
+  get growth() {
+    const { layers, cutFrom, count } = this.header;
+    const layered = cutFrom || layers.length > 1;
+    return layered && this.rows ? ((cutFrom ?? { count }).count / this.rows) ** GROWTH_POWER : 1;
+  }
+
   /** Draw soon. */
   refresh() {
     if (this.wanted) return;
@@ -179,7 +187,7 @@ export class Viewer extends EventTarget {
     const ratio = (globalThis.devicePixelRatio || 1) * this.scale;
     const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio));
     const height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
-    this.renderer.draw(this.camera.view(width, height), this.look);
+    this.renderer.draw(this.camera.view(width, height), this.look, this.growth);
     this.stats.frameMs = performance.now() - start;
     this.stats.drawn = this.renderer.drawn;
     if (this.renderer.drawn && !this.stats.firstMs) {
@@ -221,7 +229,7 @@ export class Viewer extends EventTarget {
   /** A PNG of the view in this size. */
   async picture(width = this.canvas.width, height = this.canvas.height) {
     await this.settled();
-    this.renderer.draw(this.camera.view(width, height), this.look);
+    this.renderer.draw(this.camera.view(width, height), this.look, this.growth);
     const blob = await new Promise((resolve) => this.canvas.toBlob(resolve, 'image/png'));
     this.refresh();
     return blob;
