@@ -83,7 +83,8 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
     assert result.search is not None
     chosen = steps[result.search.steps.index(result.search.chosen)]
     rows = searches[0].rounds.scene_rows(searches[0].kept(chosen.multiplier).rows)
-    check(len(rows) == result.count, "the rows of the file")
+    # A search lands by removing a few of them.
+    check(0.8 * len(rows) < result.count <= len(rows), "the rows of the file")
     return Found(searches[0], chosen.multiplier, np.sort(rows), result.size)
 
 

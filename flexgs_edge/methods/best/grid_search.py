@@ -320,7 +320,8 @@ class GridSearch(MultiplierSearch[GridScene]):
         storage = self.rounds.storage
         grid = lowered(grid, storage)
         size = self.size_of(grid)
-        removal = kept.removal[order]
+        # Those that no scored pose sees cost nothing. Whether they stay is not for a landing to say.
+        removal = np.where(kept.weight2 > 0, kept.removal, np.inf)[order]
         if target.limit_bytes is not None:
             grid, size = self._landed(grid, removal, size, target.limit_bytes)
         else:
@@ -362,7 +363,10 @@ class GridSearch(MultiplierSearch[GridScene]):
 
     def _landed_on_quality(self, found: RateResult[GridScene], target: Target) -> RateResult[GridScene]:
         """The answer without the Gaussians that it could do without."""
-        chosen, (grid, removal) = found.chosen, next(pair for pair in self._removal if pair[0] is found.product)
+        known = next((removal for grid, removal in self._removal if grid is found.product), None)
+        if known is None:
+            return found
+        chosen, grid = found.chosen, found.product
         best, steps = (chosen, grid), list(found.steps)
 
         def attempt(smaller: GridScene) -> float:
@@ -379,7 +383,7 @@ class GridSearch(MultiplierSearch[GridScene]):
             return step.excess
 
         try:
-            land_on_quality(grid, removal, chosen.excess, attempt, self.rounds.storage)
+            land_on_quality(grid, known, chosen.excess, attempt, self.rounds.storage)
         except KeyboardInterrupt:
             if not self.keeps_best:
                 raise

@@ -35,7 +35,7 @@ def land(
     grid : GridScene
         The result.
     removal : np.ndarray
-        [n] f64, cost of the removal of each of its rows.
+        [n] f64, cost of the removal of each of its rows, infinite for those that must stay.
     size : int
         Its bytes.
     limit : int
@@ -53,7 +53,7 @@ def land(
     if not 0.0 < math.log(size / limit) <= REACH:
         return grid, size
     cheapest = np.argsort(removal, kind="stable")
-    landed, fits, out = None, grid.count, 0
+    landed, fits, out = None, _beyond(removal), 0
     # Bytes of a row: at first the mean, then what the rows removed so far have taken.
     each = size / grid.count
     wanted = limit * (1 - NEAR / 2)
@@ -84,7 +84,7 @@ def land_on_quality(
     grid : GridScene
         The result, which holds.
     removal : np.ndarray
-        [n] f64, cost of the removal of each of its rows.
+        [n] f64, cost of the removal of each of its rows, infinite for those that must stay.
     excess : float
         Log of its loss over what is allowed, below 0.
     attempt : callable
@@ -93,7 +93,7 @@ def land_on_quality(
         Holds the grids.
     """
     cheapest = np.argsort(removal, kind="stable")
-    within, beyond, aim = (0, excess), grid.count, -NEAR_QUALITY / 2
+    within, beyond, aim = (0, excess), _beyond(removal), -NEAR_QUALITY / 2
     each = 1 / (SHARE * grid.count)
     for _ in range(QUALITY_TRIES if excess < -NEAR_QUALITY else 0):
         count = min(within[0] + round((aim - within[1]) / each), beyond - 1)
@@ -107,6 +107,11 @@ def land_on_quality(
                 return
         else:
             beyond = count
+
+
+def _beyond(removal: np.ndarray) -> int:
+    """The least number of rows that cannot be removed. One row always stays."""
+    return min(int(np.isfinite(removal).sum()) + 1, len(removal))
 
 
 def _along_curve(position: np.ndarray, rows: np.ndarray) -> np.ndarray:

@@ -111,3 +111,18 @@ def test_removals_that_gain_quality_end_it(grid: GridScene) -> None:
     assert len(asked) == 1
     land_on_quality(grid.take(np.arange(1)), np.zeros(1), -0.1, attempt, IN_MEMORY)
     assert len(asked) == 1
+
+
+def test_rows_that_must_stay(grid: GridScene) -> None:
+    """However much is wanted, only the others go, and at least one row stays."""
+    removal = np.where(np.arange(COUNT) < 30, np.random.default_rng(1).random(COUNT), np.inf)
+    counts: list[int] = []
+
+    def attempt(smaller: GridScene) -> float:
+        counts.append(smaller.count)
+        return -0.15 + 1e-6 * (COUNT - smaller.count)
+
+    land_on_quality(grid, removal, -0.2, attempt, IN_MEMORY)
+    assert counts and min(counts) == COUNT - 30
+    found, size, _ = landed(grid, 0.97, removal)
+    assert found is grid and size == size_of(grid)

@@ -19,8 +19,8 @@ from flexgs_edge.methods.best.refit.streamed_descent import open_descent
 from flexgs_edge.scene.rotations import canonical_axes
 from flexgs_edge.views.original import Original
 
-MEANS_RATE = 1.0e-4
-"""Largest change of a position in a step, as a share of the cameras' extent: 0.6 times the reference program's.
+MEANS_RATE = 0.7e-4
+"""Largest change of a position in a step, as a share of the cameras' extent: 0.4 times the reference program's.
 With more, positions shake: docs/results/tuning.md#means_rate"""
 FIELD_RATES = {
     "log_scales": 4e-2,
@@ -33,7 +33,7 @@ FIELD_RATES = {
 takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
 STRUCTURE = 0.02
 """Weight of 1 - SSIM in the loss, in units of a squared error: docs/results/tuning.md#structure"""
-MEAN_VIEWS = 0.5
+MEAN_VIEWS = 0.25
 """Values on their grids are averaged over this many steps for each view: docs/results/tuning.md#mean_views"""
 LAST, LAST_HELD = 0.06, 0.03
 """Rates at the end as a share of those at the beginning, while geometry moves and while it is held. They fall by the same factor

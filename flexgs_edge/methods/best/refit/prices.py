@@ -16,7 +16,7 @@ from flexgs_edge.memory.rows import read_ahead
 
 PRICES = 33
 """Values of the record that the kernel `price_bits` takes."""
-BIT_WEIGHT = 3.3
+BIT_WEIGHT = 5.0
 """Weight of bits in the loss. It is above 1, since most Gaussians are not shown in all poses, and steps move only those that are
 shown: docs/results/tuning.md#bit_weight"""
 WIDTH = 0.5
