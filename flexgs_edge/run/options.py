@@ -189,7 +189,7 @@ class CompressOptions(ViewOptions):
     base_psnr : float
         Assumed PSNR of the original against its photos, for the modelled drop, dB.
     effort : {"fast", "balanced", "max"}
-        More effort makes smaller files and takes longer. `balanced` (10 000 to 500 000 Gaussians) and `max` also distil (`best`,
+        More effort makes smaller files and takes longer. `balanced` (from 10 000 Gaussians) and `max` also distil (`best`,
         `.fgs`). `thorough` has become `max`. Default: `balanced`.
     best_effort : bool
         If the target cannot be met, write the closest result. Default: raise `TargetError`.

@@ -5,7 +5,6 @@ Work is counted and never timed, so the same command gives the same bytes.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -83,10 +82,9 @@ class Effort:
         How often the descent to a candidate looks at every scored pose. 0 (default): colours are refitted instead.
     warming : tuple of Warming
         Descents before the first candidate. They pay where candidates descend for long: docs/results/tuning.md#warming
-    descends : tuple of float
-        Least and most Gaussians of a scene that descends; of others, colours are refitted. Small scenes gain nothing by it
-        (docs/results/tuning.md#descends), large ones need much memory. The memory limit has no say, so that files do not
-        depend on it.
+    descends : int
+        Least Gaussians of a scene that descends; of others, colours are refitted. Small scenes gain nothing by it:
+        docs/results/tuning.md#descends
     """
 
     keep: float
@@ -102,7 +100,7 @@ class Effort:
     passes: float = 0.0
     warming: tuple[Warming, ...] = ()
     far: float = 0.15
-    descends: tuple[float, float] = (0, math.inf)
+    descends: int = 0
 
     def poses_of(self, pixels: Sequence[int], count: int) -> int:
         """How many poses to score for `count` Gaussians; `pixels` are those of each pose, in order."""
@@ -188,7 +186,7 @@ EFFORTS = {
         pixels=24,
         refitted=0.7,
         passes=4.0,
-        descends=(10_000, 500_000),
+        descends=10_000,
     ),
     "max": Effort(
         keep=0.8,
@@ -231,7 +229,6 @@ def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool
     if options.distil is not None:
         return options.distil
     plan = EFFORTS[options.effort]
-    least, most = plan.descends
-    if not (plan.passes and options.refit and least <= count <= most):
+    if not (plan.passes and options.refit and count >= plan.descends):
         return 0
     return max(round(plan.passes * poses), LEAST_STEPS)
