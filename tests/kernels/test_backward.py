@@ -17,7 +17,7 @@ from flexgs_edge.kernels import twins
 from flexgs_edge.methods.best.refit.chunk_state import ORDER
 from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
-from flexgs_edge.methods.best.refit.prices import BIT_WEIGHT, WIDTH, bit_prices
+from flexgs_edge.methods.best.refit.prices import WIDTH, bit_prices
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from kernel_fixtures import ALL_FORMS, FORMS, PairedBackend, large_budget, open_form, same_bits
@@ -191,12 +191,12 @@ def test_a_bit_away_from_the_centre_costs_its_worth() -> None:
     prices = bit_prices(planes, degrees, replace(STEPS, sh=STEPS.sh[:1]), 0.25)
     logits = planes["opacity_logits"][0].astype(np.float64)
     assert prices[29] == np.float32(np.median(logits)) and prices[5] == np.float32(WIDTH * STEPS.opacity)
-    assert np.isclose(prices[4] * np.abs(logits - np.median(logits)).mean() * np.log(2), BIT_WEIGHT * 0.25)
+    assert np.isclose(prices[4] * np.abs(logits - np.median(logits)).mean() * np.log(2), 0.25)
     # Degrees that the grid does not have cost nothing, and values that are all alike no more than a quarter of a step says.
     assert (prices[14:26] == 0).all()
     alike = {name: np.full_like(values, 0.5) for name, values in planes.items()}
     flat = bit_prices(alike, degrees * 0, replace(STEPS, sh=STEPS.sh[:1]), 0.25)
-    assert np.isclose(flat[0], BIT_WEIGHT * 0.25 / (np.log(2) * STEPS.scale / 4)) and np.isfinite(flat).all()
+    assert np.isclose(flat[0], 0.25 / (np.log(2) * STEPS.scale / 4)) and np.isfinite(flat).all()
 
 
 def test_views_are_drawn_from_what_a_file_gives_back() -> None:

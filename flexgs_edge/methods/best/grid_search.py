@@ -30,7 +30,7 @@ from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.landing import land, land_on_quality
 from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART, Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.distil import Schedule, distil
+from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule, distil
 from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
 from flexgs_edge.scene.source import Planes
 
@@ -187,11 +187,17 @@ class GridSearch(MultiplierSearch[GridScene]):
 
         def change() -> tuple[np.ndarray, dict[str, np.ndarray]]:
             kept = self.kept(self._cut(self.rounds.snapshots[-1]))
-            schedule = Schedule(math.ceil(share * self.steps), self._rate(kept.planes), WARMING_LAST)
+            schedule = self._schedule(share, kept.planes, last=WARMING_LAST)
             return kept.rows, distil(kept.planes, kept.degrees, self.rounds.original, schedule)
 
         self.rounds.renew(change)
         self._begin = len(self.rounds.snapshots) - 1
+
+    def _schedule(self, share: float, planes: Planes, last: float = LAST, multiplier: float = 0.0) -> Schedule:
+        """A descent from these planes with `share` of a candidate's steps."""
+        course = LONG if self._passes() >= FULL_PASSES else SHORT
+        steps = math.ceil(share * self.steps)
+        return Schedule(steps, self._rate(planes), last, multiplier=multiplier, course=course)
 
     def _rate(self, planes: Planes) -> float:
         """Share of the full rates for a descent from these planes."""
@@ -278,7 +284,7 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _piloted(self, multiplier: float, target: Target) -> float:
         """Expected change of the excess by a descent, learned from a pilot. Scenes differ too much for a constant."""
         kept, step_sizes = self._choice(multiplier)
-        schedule = Schedule(math.ceil(PILOT * self.steps), self._rate(kept.planes), multiplier=multiplier)
+        schedule = self._schedule(PILOT, kept.planes, multiplier=multiplier)
         grid, _ = self._distilled(kept, step_sizes, schedule)
         found = target.excess(0, self.measure(values_of(grid, self.rounds.storage)))
         return found - self._probe(multiplier, target) - PILOT_POWER * math.log(PILOT)
@@ -313,7 +319,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         started = time.perf_counter()
         kept, step_sizes = self._choice(multiplier)
         if self.steps:
-            schedule = Schedule(self.steps, self._rate(kept.planes), multiplier=multiplier)
+            schedule = self._schedule(1.0, kept.planes, multiplier=multiplier)
             grid, order = self._distilled(kept, step_sizes, schedule)
         else:
             grid, order = self._finish(kept, step_sizes)

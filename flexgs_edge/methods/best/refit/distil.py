@@ -19,9 +19,6 @@ from flexgs_edge.methods.best.refit.streamed_descent import open_descent
 from flexgs_edge.scene.rotations import canonical_axes
 from flexgs_edge.views.original import Original
 
-MEANS_RATE = 0.7e-4
-"""Largest change of a position in a step, as a share of the cameras' extent: 0.4 times the reference program's.
-With more, positions shake: docs/results/tuning.md#means_rate"""
 FIELD_RATES = {
     "log_scales": 4e-2,
     "quats": 4.8e-3,
@@ -33,8 +30,6 @@ FIELD_RATES = {
 takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
 STRUCTURE = 0.02
 """Weight of 1 - SSIM in the loss, in units of a squared error: docs/results/tuning.md#structure"""
-MEAN_VIEWS = 0.25
-"""Values on their grids are averaged over this many steps for each view: docs/results/tuning.md#mean_views"""
 LAST, LAST_HELD = 0.06, 0.03
 """Rates at the end as a share of those at the beginning, while geometry moves and while it is held. They fall by the same factor
 at each step. With more, the views that come last decide too much: docs/results/tuning.md#last"""
@@ -43,6 +38,32 @@ ON_GRID, HOLDING = 0.5, 0.75
 HELD = ("means", "log_scales", "quats")
 """Fields that are held in the last steps. Codes of geometry that flip back and forth would move whole splats, and the
 last views would decide where they stay: docs/results/tuning.md#held"""
+
+
+@dataclass(frozen=True)
+class Course:
+    """Numbers of a descent that depend on how often it looks at every pose.
+
+    They are chosen in docs/results/tuning.md#together.
+
+    Parameters
+    ----------
+    means_rate : float
+        Largest change of a position in a step, as a share of the cameras' extent. With more, positions shake.
+    mean_views : float
+        Values on their grids are averaged over this many steps for each view.
+    bit_weight : float
+        Weight of bits in the loss. It is above 1, since most Gaussians are not shown in all poses, and steps move only those
+        that are shown: docs/results/tuning.md#bit_weight
+    """
+
+    means_rate: float
+    mean_views: float
+    bit_weight: float
+
+
+SHORT, LONG = Course(0.7e-4, 0.25, 5.0), Course(1.0e-4, 0.5, 3.3)
+"""Measured with 4 and with 12 looks. Their rates of positions are 0.4 and 0.6 times the reference program's."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +82,8 @@ class Schedule:
         Share of the steps before values are put on their grids for drawing, and share before geometry is held there.
     multiplier : float
         Squared error over all scored poses that a bit on the grid is worth. 0 (default): bits cost nothing.
+    course : Course
+        See there.
     """
 
     iterations: int
@@ -69,6 +92,7 @@ class Schedule:
     on_grid: float = ON_GRID
     holding: float = HOLDING
     multiplier: float = 0.0
+    course: Course = LONG
 
     def parts(self, grid: bool) -> tuple[range, range, range]:
         """Steps off the grid, on it, and on it with geometry held. Without a grid, all steps are off it."""
@@ -95,11 +119,11 @@ class Schedule:
         return np.concatenate(rounds)[: self.iterations]
 
 
-def rates_for(cameras: Sequence[Camera]) -> dict[str, float]:
+def rates_for(cameras: Sequence[Camera], means_rate: float) -> dict[str, float]:
     """Rates of all fields. That of positions scales with the cameras' extent, 1.1 times the largest distance from their mean."""
     centres = np.stack([camera.center for camera in cameras])
     extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    return {"means": MEANS_RATE * extent, **FIELD_RATES}
+    return {"means": means_rate * extent, **FIELD_RATES}
 
 
 def distil(
@@ -140,8 +164,8 @@ def distil(
     BudgetError
         When the scene, its gradients and their running means do not fit into memory, and the renderer's storage has no files.
     """
-    cameras = original.poses
-    rates = {**rates_for(cameras), **(rates or {})}
+    cameras, course = original.poses, schedule.course
+    rates = {**rates_for(cameras, course.means_rate), **(rates or {})}
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     renderer, storage = original.bench.renderer, original.bench.renderer.storage
     # Rows with SH come first, so that the other chunks are drawn without SH.
@@ -149,7 +173,7 @@ def distil(
     ordered, degrees = _canonical(planes, rows, storage), degrees[rows]
     with open_descent(renderer, ordered, degrees, original.origin, largest, structure) as descent:
         if step_sizes is not None and schedule.multiplier > 0 and len(degrees):
-            worth = schedule.multiplier / len(original.cameras)
+            worth = course.bit_weight * schedule.multiplier / len(original.cameras)
             descent.price(bit_prices(ordered, degrees, step_sizes, worth))
         order = schedule.order(len(cameras), original.turns)
         parts = schedule.parts(step_sizes is not None)
@@ -167,7 +191,7 @@ def distil(
                 descent.step(cameras[order[k]], original.references[order[k]], moving)
                 if place:
                     # A plain mean first, then one that forgets: single views then decide little.
-                    descent.follow(max(1.0 / (k - part.start + 1), 1.0 / max(MEAN_VIEWS * len(cameras), 1.0)))
+                    descent.follow(max(1.0 / (k - part.start + 1), 1.0 / max(course.mean_views * len(cameras), 1.0)))
         if len(parts[1]) or len(parts[2]):
             descent.settle()
         moved = descent.planes()

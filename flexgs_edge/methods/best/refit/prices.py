@@ -16,9 +16,6 @@ from flexgs_edge.memory.rows import read_ahead
 
 PRICES = 33
 """Values of the record that the kernel `price_bits` takes."""
-BIT_WEIGHT = 5.0
-"""Weight of bits in the loss. It is above 1, since most Gaussians are not shown in all poses, and steps move only those that are
-shown: docs/results/tuning.md#bit_weight"""
 WIDTH = 0.5
 """Prices rise over about this many grid steps around a centre. Within a step, it makes no difference to the bits."""
 
@@ -35,7 +32,7 @@ def bit_prices(planes: Planes, degrees: np.ndarray, steps: StepSizes, worth: flo
     steps : StepSizes
         Of the grid that the values will be put on.
     worth : float
-        Squared error in one pose that a bit is worth.
+        Squared error in one pose that a bit costs.
 
     Returns
     -------
@@ -61,7 +58,7 @@ def bit_prices(planes: Planes, degrees: np.ndarray, steps: StepSizes, worth: flo
     # Where all values are alike they take no bits, and a small b must not make a large price of it.
     spreads = np.maximum(sums / np.maximum(counts, 1), np.array(grid) / 4)
     prices = np.zeros(PRICES, np.float32)
-    prices[0 : 2 * len(grid) : 2] = BIT_WEIGHT * worth / (math.log(2) * spreads)
+    prices[0 : 2 * len(grid) : 2] = worth / (math.log(2) * spreads)
     prices[1 : 2 * len(grid) : 2] = WIDTH * np.array(grid)
     prices[-len(centres) :] = centres
     return prices
