@@ -22,7 +22,7 @@ SHARE = 0.5
 NEAR_QUALITY = 0.02
 """How far below what it allows, as a share of it, we are content."""
 QUALITY_TRIES = 2
-"""Most results that are made and measured on the way to a quality."""
+"""Most results that are made and measured on the way to a quality; one more if none of them holds."""
 
 
 def land(
@@ -95,7 +95,9 @@ def land_on_quality(
     cheapest = np.argsort(removal, kind="stable")
     within, beyond, aim = (0, excess), _beyond(removal), -NEAR_QUALITY / 2
     each = 1 / (SHARE * grid.count)
-    for _ in range(QUALITY_TRIES if excess < -NEAR_QUALITY else 0):
+    for number in range(QUALITY_TRIES + 1 if excess < -NEAR_QUALITY else 0):
+        if number == QUALITY_TRIES and within[0]:
+            return
         count = min(within[0] + round((aim - within[1]) / each), beyond - 1)
         if count <= within[0]:
             return
