@@ -57,8 +57,8 @@ PRUNED_DISTILLED = 1.6
 WARMING_LAST = 0.5
 """Rates at the end of a descent between rounds, as a share of those at its beginning. Its values need not settle."""
 FULL_PASSES = 10
-"""Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one:
-docs/results/tuning.md#full_passes"""
+"""Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
+goes the course `SHORT`: docs/results/tuning.md#full_passes"""
 FULL_RATES, LEAST_RATE = 41.0, 0.25
 """Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
 DECAY = 0.8
