@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.goals.line import AIM, next_point
-from flexgs_edge.goals.promise import bounds_ssim
+from flexgs_edge.goals.promise import bounds_ssim, means
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
@@ -50,6 +50,9 @@ ABOVE = 0.02
 """How far above a size we aim, since results that are too large can be landed: docs/results/tuning.md#landing"""
 CLOSE_SIZE = 0.003
 """A candidate that is smaller than asked by no more than this ends the search."""
+ROOM = 0.1
+"""How far below what is asked the means must be for a result to lose Gaussians although its worst view misses:
+docs/results/tuning.md#room"""
 WARMED = 1.35
 """Factor on it if descents between the rounds have mended a part already: docs/results/tuning.md#distilled"""
 PRUNED_DISTILLED = 1.6
@@ -369,11 +372,33 @@ class GridSearch(MultiplierSearch[GridScene]):
 
     def _landed_on_quality(self, found: RateResult[GridScene], target: Target) -> RateResult[GridScene]:
         """The answer without the Gaussians that it could do without."""
-        known = next((removal for grid, removal in self._removal if grid is found.product), None)
-        if known is None:
+        steps = list(found.steps)
+        try:
+            best = self._thinned(found.chosen, found.product, target, target, steps)
+        except KeyboardInterrupt:
+            if not self.keeps_best:
+                raise
+            self.interrupted()
             return found
-        chosen, grid = found.chosen, found.product
-        best, steps = (chosen, grid), list(found.steps)
+        return replace(found, product=best[1], chosen=best[0], steps=tuple(steps))
+
+    def _mended(
+        self, missed: Candidate, product: GridScene, target: Target, tried: list[Candidate]
+    ) -> tuple[Candidate, GridScene] | None:
+        """With fewer Gaussians, if only the worst view misses while the means are far better than asked.
+
+        The bound on the worst view grows with the mean, so that a finer result would miss it as well.
+        """
+        if target.limit_bytes is not None or means(target).excess(missed.size, missed.measurement) > -ROOM:
+            return None
+        step, grid = self._thinned(missed, product, target, means(target), tried)
+        return (step, grid) if step.holds else None
+
+    def _thinned(
+        self, chosen: Candidate, grid: GridScene, target: Target, goal: Target, steps: list[Candidate]
+    ) -> tuple[Candidate, GridScene]:
+        """The best of a result and what is left of it when the cheapest Gaussians go until `goal` hardly holds."""
+        best = chosen, grid
 
         def attempt(smaller: GridScene) -> float:
             nonlocal best
@@ -386,15 +411,12 @@ class GridSearch(MultiplierSearch[GridScene]):
                 self.on_step(step)
             if better(step, best[0], target):
                 best = step, mended
-            return step.excess
+            return goal.excess(size, step.measurement)
 
-        try:
-            land_on_quality(grid, known, chosen.excess, attempt, self.rounds.storage)
-        except KeyboardInterrupt:
-            if not self.keeps_best:
-                raise
-            self.interrupted()
-        return replace(found, product=best[1], chosen=best[0], steps=tuple(steps))
+        known = next((removal for made, removal in self._removal if made is grid), None)
+        if known is not None:
+            land_on_quality(grid, known, goal.excess(chosen.size, chosen.measurement), attempt, self.rounds.storage)
+        return best
 
     def _finish(self, kept: Kept, step_sizes: StepSizes) -> tuple[GridScene, np.ndarray]:
         """Put geometry on its grid, refit all colours, put SH on their grid, refit the constant colour, put it on its grid.

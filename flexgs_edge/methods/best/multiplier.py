@@ -98,6 +98,12 @@ class MultiplierSearch(ABC, Generic[Product]):
         """Improve the guess `multiplier` for the next candidate, in less time than a candidate takes."""
         return multiplier
 
+    def _mended(
+        self, missed: Candidate, product: Product, target: Target, tried: list[Candidate]
+    ) -> tuple[Candidate, Product] | None:
+        """What holds and is made of a candidate that does not, in less time than another takes. All results go to `tried`."""
+        return None
+
     def _close(self, target: Target) -> float:
         """How far below the target a candidate ends the search (log of limit over loss or size)."""
         return self.effort.close
@@ -141,6 +147,7 @@ class MultiplierSearch(ABC, Generic[Product]):
             When no candidate holds and `best_effort` is not set; it names the closest one.
         """
         steps: list[Candidate] = []
+        tried: list[Candidate] = []
         best: tuple[Candidate, Product] | None = None
         multiplier = self._aim(self._start(target), steps, target)
         for count in range(self.effort.steps + EXTRA_STEPS):
@@ -154,6 +161,12 @@ class MultiplierSearch(ABC, Generic[Product]):
             steps.append(step)
             if self.on_step:
                 self.on_step(step)
+            mended = None if step.holds else self._mended(step, product, target, tried)
+            if mended is not None:
+                if best is not None:
+                    self.discard(best[1])
+                best = mended
+                break
             if best is None:
                 best = (step, product)
             elif better(step, best[0], target):
@@ -178,7 +191,7 @@ class MultiplierSearch(ABC, Generic[Product]):
                 f"{target.describe()} is out of reach; the closest point has {target.report(chosen.size, chosen.measurement)}"
                 f"{last} (--best-effort writes it){obstacle(target, chosen)}"
             )
-        return RateResult(product, chosen, chosen.holds, tuple(steps))
+        return RateResult(product, chosen, chosen.holds, (*steps, *tried))
 
     def _start(self, target: Target) -> float:
         """Prune until pruning alone has used up its share of the target; returns the multiplier of that cut."""
