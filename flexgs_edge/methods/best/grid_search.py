@@ -391,7 +391,13 @@ class GridSearch(MultiplierSearch[GridScene]):
         """
         if target.limit_bytes is not None or means(target).excess(missed.size, missed.measurement) > -ROOM:
             return None
-        step, grid = self._thinned(missed, product, target, means(target), tried)
+        try:
+            step, grid = self._thinned(missed, product, target, means(target), tried)
+        except KeyboardInterrupt:
+            if not self.keeps_best:
+                raise
+            self.interrupted()
+            return None
         return (step, grid) if step.holds else None
 
     def _thinned(

@@ -163,10 +163,8 @@ class MultiplierSearch(ABC, Generic[Product]):
                 self.on_step(step)
             mended = None if step.holds else self._mended(step, product, target, tried)
             if mended is not None:
-                if best is not None:
-                    self.discard(best[1])
-                best = mended
-                break
+                self.discard(product)
+                step, product = mended
             if best is None:
                 best = (step, product)
             elif better(step, best[0], target):
@@ -178,7 +176,7 @@ class MultiplierSearch(ABC, Generic[Product]):
             enough = best[0].holds and best[0].excess > -self.effort.far and count + 1 >= self.effort.steps
             # A size that is missed can always be met by a larger multiplier.
             in_vain = target.limit_bytes is None and not best[0].holds and self._used_up(steps)
-            if close or enough or in_vain or step.multiplier < 1e-30:
+            if mended is not None or self.ended or close or enough or in_vain or step.multiplier < 1e-30:
                 break
             multiplier = self._aim(next_multiplier(steps, target), steps, target)
         assert best is not None

@@ -443,6 +443,23 @@ def test_a_result_whose_worst_view_alone_misses_loses_gaussians() -> None:
     assert result.chosen.multiplier == result.steps[0].multiplier and result.chosen.count < result.steps[0].count
 
 
+def test_a_mended_result_does_not_take_the_place_of_a_smaller_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor is anything lost by an interruption while a result is mended."""
+    quality = Measurement(0.3, 30.0, 0.3)
+    given = iter([Candidate(1.0, 9, 0, 100, quality, -0.5, 0.0), Candidate(2.0, 8, 0, 90, quality, 0.1, 0.0)])
+    finder = KnownSearch(FakeRounds(), lambda _: 0, lambda *_: quality, EFFORT)  # type: ignore[arg-type]
+    monkeypatch.setattr(finder, "_start", lambda _: 1.0)
+    monkeypatch.setattr(finder, "_aim", lambda multiplier, *_: multiplier)
+    monkeypatch.setattr(finder, "_whole", lambda *_: (next(given), object()))
+    larger = Candidate(2.0, 8, 0, 110, quality, -0.01, 0.0)
+    monkeypatch.setattr(finder, "_mended", lambda *_: (larger, object()))
+    assert finder.run(MaxDrop(0.5)).chosen.size == 100
+    again = iter([Candidate(1.0, 9, 0, 100, quality, 0.4, 0.0)])
+    monkeypatch.setattr(finder, "_whole", lambda *_: (next(again), object()))
+    monkeypatch.setattr(finder, "_mended", lambda *_: finder.interrupted())
+    assert finder.run(MaxDrop(0.5), best_effort=True).chosen.size == 100
+
+
 @pytest.mark.parametrize("target", [MaxDrop(1.0), MaxSize(2000)])
 def test_descents_between_the_rounds(target: Target, monkeypatch: pytest.MonkeyPatch) -> None:
     """They come before the first candidate, with a share of its steps, and all costs are measured anew behind them."""
