@@ -10,11 +10,12 @@ import numpy as np
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes, plan_chunks
 from flexgs_edge.codec.v2.device.encode_kernels import CountKernel, encode_streams
 from flexgs_edge.codec.v2.device.launch import Device
+from flexgs_edge.codec.v2.fit_levels import fit_levels
 from flexgs_edge.codec.v2.groups import Group, fit_group
 from flexgs_edge.codec.v2.model import SHARED, Model, group_kinds, tables_of
 from flexgs_edge.codec.v2.ports import UNIFORM, Batch, CountPort, FitPort
 from flexgs_edge.codec.v2.rans import Encoder, lane_count
-from flexgs_edge.codec.v2.tables import merge_contexts, to_levels
+from flexgs_edge.codec.v2.tables import merge_contexts
 from flexgs_edge.codec.v2.threads import in_order, thread_count
 from flexgs_edge.codec.v2.walk import ChunkCodes, base_kinds, walk_chunk, walk_positions
 from flexgs_edge.constants import RANS_PRECISION as PRECISION
@@ -170,10 +171,12 @@ def encode_grid(
         batches.append(_put_away(port.batches, storage))
         count.add(port)
     merged = [merge_contexts(counts) for counts in count.counts]
-    levels = [
-        to_levels(counts if len(counts) else np.zeros((1, len(all_[0])), np.int64))
-        for (_, counts), all_ in zip(merged, count.counts, strict=True)
-    ]
+    levels = fit_levels(
+        [
+            counts if len(counts) else np.zeros((1, len(all_[0])), np.int64)
+            for (_, counts), all_ in zip(merged, count.counts, strict=True)
+        ]
+    )
     model = Model(
         grid.sh_degree, depth, groups, [mapping for mapping, _ in merged], levels, list(map(tables_of, levels))
     )

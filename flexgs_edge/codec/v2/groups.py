@@ -19,6 +19,8 @@ SPREAD_BUCKETS = 5
 their tables cost: docs/results/tuning.md#codec"""
 RESIDUAL_BUCKETS = 12
 """Contexts of a group of residuals: 12 of the predicted error times 2, the side that the prediction is rounded to."""
+ALL_BUCKETS = 1 << 15
+"""A group of fewer values has fewer contexts, by the cube root: docs/results/tuning.md#levels"""
 SYMBOL_ROOM = 192
 """Most symbols of a fitted alphabet. For more values, the low bits are coded raw, and the alphabet stays short."""
 _RARE = 2000
@@ -201,9 +203,11 @@ def fit_group(kind: GroupKind, batches: list[tuple[list[np.ndarray], np.ndarray]
     guess = mean.astype(np.float64) @ matrix
     error = solve(np.abs(np.rint(target - guess / 256))[usual])
     size = error.astype(np.float64) @ matrix
+    few = min(float(np.cbrt(len(codes) / ALL_BUCKETS)), 1.0)
+    means, spreads = (1, RESIDUAL_BUCKETS) if kind.residual else (MEAN_BUCKETS, SPREAD_BUCKETS)
     cuts = (
-        empty if kind.residual else _quantiles(np.floor(guess / 4096), MEAN_BUCKETS),
-        _quantiles(np.floor(size / 1024), RESIDUAL_BUCKETS if kind.residual else SPREAD_BUCKETS),
+        _quantiles(np.floor(guess / 4096), max(round(few * means), 1)),
+        _quantiles(np.floor(size / 1024), max(round(few * spreads), 1)),
     )
     symbols = codes - (np.floor(guess / 65536 + 0.5).astype(np.int64) + centre if kind.residual else 0)
     low, shift, count = _alphabet(symbols)

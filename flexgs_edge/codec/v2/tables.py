@@ -13,14 +13,14 @@ LEVELS = 65
 steps of 14 to 25 %. Finer levels would cost more bytes in the file than they save: docs/results/tuning.md#codec"""
 SYMBOLS_MOST = 256
 CONTEXTS_MOST = 64
-ENTRY_BITS = 3.0
-"""Estimated bits of one frequency in the file; contexts are merged until their tables pay."""
+ENTRY_BITS = 4.0
+"""Bits that one frequency should save; contexts are merged until their tables pay: docs/results/tuning.md#levels"""
 
 _CLASSES = 5
 """Classes of a level: in the first table; in later ones, if the level above is absent, rare or often; in a mapping."""
-_OFTEN = 20
+OFTEN = 20
 _LANES = 16
-_WEIGHTS = np.array([0] + [(4 + (v - 1) % 4) << ((v - 1) // 4) for v in range(1, LEVELS)], np.int64)
+WEIGHTS = np.array([0] + [(4 + (v - 1) % 4) << ((v - 1) // 4) for v in range(1, LEVELS)], np.int64)
 
 
 def merge_contexts(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -73,14 +73,24 @@ def to_levels(counts: np.ndarray) -> np.ndarray:
     """Round counts [t, a] to levels [t, a] u8, relative to the sum of each table."""
     total = np.maximum(counts.sum(axis=1, keepdims=True), 1)
     target = counts * (1 << 17) // total
-    middles = (_WEIGHTS[1:] + np.append(_WEIGHTS[2:], _WEIGHTS[-1] * 2)) // 2
+    middles = (WEIGHTS[1:] + np.append(WEIGHTS[2:], WEIGHTS[-1] * 2)) // 2
     levels = 1 + np.searchsorted(middles[:-1], target)
     return np.where(counts > 0, levels, 0).astype(np.uint8)
 
 
 def from_levels(levels: np.ndarray) -> Tables:
     """Frequency tables of levels [t, a], in integers, so that all decoders agree."""
-    return Tables(np.array([normalize(_WEIGHTS[row]) for row in levels]).reshape(len(levels), -1))
+    return Tables(np.array([normalize(WEIGHTS[row]) for row in levels]).reshape(len(levels), -1))
+
+
+def level_batches(levels: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Classes and changes ([a] u8 each) of the levels of each table of an alphabet ([t, a])."""
+    batches = []
+    for i, row in enumerate(levels):
+        classes, before = _expect(levels[i - 1] if i else None, row.size)
+        ahead = np.concatenate([[0], row[:-1]]) if before is None else before
+        batches.append((classes, ((row.astype(np.int64) - ahead) % LEVELS).astype(np.uint8)))
+    return batches
 
 
 def encode_tables(mappings: Sequence[np.ndarray], levels: Sequence[np.ndarray]) -> bytes:
@@ -96,10 +106,7 @@ def encode_tables(mappings: Sequence[np.ndarray], levels: Sequence[np.ndarray]) 
     batches = []
     for mapping, rows in zip(mappings, levels, strict=True):
         batches.append((np.full(len(mapping), _CLASSES - 1, np.uint8), mapping))
-        for i, row in enumerate(rows):
-            classes, before = _expect(rows[i - 1] if i else None, row.size)
-            ahead = np.concatenate([[0], row[:-1]]) if before is None else before
-            batches.append((classes, ((row.astype(np.int64) - ahead) % LEVELS).astype(np.uint8)))
+        batches += level_batches(rows)
     counts = np.zeros((_CLASSES, LEVELS), np.int64)
     for classes, symbols in batches:
         np.add.at(counts, (classes, symbols), 1)
@@ -153,7 +160,7 @@ def _expect(before: np.ndarray | None, size: int) -> tuple[np.ndarray, np.ndarra
     """Classes [a] of a table's symbols, and the levels of the table before it (None for the first table)."""
     if before is None:
         return np.zeros(size, np.uint8), None
-    return (1 + (before > 0).astype(np.uint8) + (before > _OFTEN)).astype(np.uint8), before
+    return (1 + (before > 0).astype(np.uint8) + (before > OFTEN)).astype(np.uint8), before
 
 
 def _meta_tables(meta: np.ndarray) -> Tables:

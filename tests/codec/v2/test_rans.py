@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flexgs_edge.codec.v2.fit_levels import cheapest_path, fit_levels
 from flexgs_edge.codec.v2.rans import Decoder, Encoder, StreamError, Tables, lane_count, normalize
-from flexgs_edge.codec.v2.tables import decode_tables, encode_tables, from_levels, merge_contexts, to_levels
+from flexgs_edge.codec.v2.tables import LEVELS, decode_tables, encode_tables, from_levels, merge_contexts, to_levels
 from flexgs_edge.constants import RANS_TOTAL as TOTAL
 
 
@@ -131,6 +134,46 @@ def test_levels_cost_little() -> None:
     share = counts / counts.sum()
     freqs = from_levels(to_levels(counts)).freqs / TOTAL
     assert (share * np.log2(share / freqs)).sum() < 0.005
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32), st.lists(st.tuples(st.integers(1, 9), st.integers(1, 40)), min_size=1, max_size=4))
+def test_fitted_levels_hold_every_symbol(seed: int, shapes: list[tuple[int, int]]) -> None:
+    rng = np.random.default_rng(seed)
+    counts = [rng.poisson(rng.gamma(0.3, 30, shape)) for shape in shapes]
+    levels = fit_levels(counts)
+    for own, rows in zip(levels, counts, strict=True):
+        assert own.dtype == np.uint8 and own.shape == rows.shape and own.max() < LEVELS
+        assert np.all(own[rows > 0] > 0)
+        assert not own[~rows.any(axis=1)].any()
+
+
+def test_fitted_levels_take_fewer_bytes_with_their_symbols() -> None:
+    rng = np.random.default_rng(3)
+    widths = np.linspace(2, 9, 6)[:, None]
+    counts = [rng.poisson(12 * np.exp(-abs(np.arange(-20, 21)) / widths)) for _ in range(4)]
+    mappings = [np.arange(6, dtype=np.uint8)] * 4
+
+    def size(levels: list[np.ndarray]) -> float:
+        freqs = [from_levels(own).freqs for own in levels]
+        bits = sum((rows * (14 - np.log2(np.maximum(own, 1)))).sum() for rows, own in zip(counts, freqs, strict=True))
+        return float(bits / 8 + len(encode_tables(mappings, levels)))
+
+    assert size(fit_levels(counts)) < 0.97 * size([to_levels(rows) for rows in counts])
+
+
+def testcheapest_path_is_the_best_of_all() -> None:
+    rng = np.random.default_rng(0)
+    bits, prices = rng.random((LEVELS, 3)) * 9, rng.random(LEVELS) * 9
+    bits[5:] = 1e12
+    best = min(
+        itertools.product(range(5), repeat=3),
+        key=lambda path: sum(
+            bits[level, k] + prices[(level - before) % LEVELS]
+            for k, (before, level) in enumerate(itertools.pairwise((0, *path)))
+        ),
+    )
+    assert cheapest_path(bits, prices).tolist() == list(best)
 
 
 def test_equal_contexts_are_merged_and_different_ones_kept() -> None:
