@@ -147,9 +147,10 @@ def edges(backend: Any) -> None:
     gradient = np.where(some % 3, 10.0 ** (some % 7 - 18.0), -0.5).astype(f32)
     ones = np.ones((1, rows), f32)
     powers = np.stack([some % 2 + 0.5, some % 2 + 0.25]).astype(f32) * f32(0.4)
+    pace = ((some % 5 > 0) / (some % 4 + 1)).astype(f32)
     call(
-        backend, "adam", rows, rows, 1, 0.9, 0.999, np.array([0.01], f32), (some % 5 > 0).astype(f32), gradient[None],
-        powers, gradient[::-1][None] * f32(1e-3), ones * f32(1e-29), ones,
+        backend, "adam", rows, rows, 1, 0.9, 0.999, np.array([0.01], f32), pace, gradient[None], powers,
+        gradient[::-1][None] * f32(1e-3), ones * f32(1e-29), ones,
     )  # fmt: skip
     # Costs: both words, sums at the ends of their range.
     sums = np.empty((rows, 2), np.int64)

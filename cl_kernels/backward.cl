@@ -35,6 +35,7 @@ __kernel void project_backward(
     const uint base,                      // row of the scene that the chunk starts at
     const uint degree,                    // SH degree of the chunk
     const int antialiased,
+    const float wide,                     // rows with a larger deviation over their depth take shorter steps
     __global const float *camera,         // [32]
     __global const float *means,          // [3, stride]
     __global const float *log_scales,     // [3, stride]
@@ -44,7 +45,7 @@ __kernel void project_backward(
     __global const uint *degrees,         // [stride] SH degree of each row: no gradient above it
     __global const float *records,        // [N, 16] of the view
     __global const long *sums,            // [N, 9] of blend_backward
-    __global float *touched,              // [stride] 1 where a row has a gradient, else 0
+    __global float *pace,                 // [stride] share of a whole step that a row takes; 0 where it has no gradient
     __global float *gradient)             // [14 + 3 K, stride]
 {
   const size_t i = get_global_id(0) * W, s = stride;
@@ -65,9 +66,11 @@ __kernel void project_backward(
     seen_lanes[l] = some ? 1.0f : 0.0f;
   }
   const FW seen_row = LOADF(seen_lanes, 0);
-  STOREF(seen_row, touched, i);
   const IW seen = MASK(seen_row > (FW)0.0f);
-  if (!ANY(seen)) return;
+  if (!ANY(seen)) {
+    STOREF(seen_row, pace, i);
+    return;
+  }
 #define SUM(k) LOADF(lanes[k], 0)
 #define RECORD(f) LOADF(lanes[GRADIENT_SUMS + (f)], 0)
 
@@ -136,6 +139,9 @@ __kernel void project_backward(
   const FW x = fma(CAM(2), pz, fma(CAM(0), px, CAM(1) * py)) + CAM(9);
   const FW y = fma(CAM(5), pz, fma(CAM(3), px, CAM(4) * py)) + CAM(10);
   const FW iz = (FW)1.0f / z, u = x * iz, v = y * iz;
+  // A turn or growth of a splat that fills the view changes all of it, so it goes in smaller steps.
+  const FW size = larger(larger(s0, s1), s2) * iz;
+  STOREF(pick(seen, pick(MASK(size > (FW)wide), (FW)wide / size, (FW)1.0f), (FW)0.0f), pace, i);
   const FW uc = fmin(fmax(u, CAM(17)), CAM(18)), vc = fmin(fmax(v, CAM(19)), CAM(20));
   const FW j00 = CAM(12) * iz, j02 = -(j00 * uc), j11 = CAM(13) * iz, j12 = -(j11 * vc);
   const FW t00 = fma(j02, CAM(6), j00 * CAM(0)), t01 = fma(j02, CAM(7), j00 * CAM(1)), t02 = fma(j02, CAM(8), j00 * CAM(2));
@@ -209,7 +215,7 @@ inline FW pull(FW away, float price, float width) { return (FW)price * away / (f
     STOREF(pick(moves, old + (value), old), at, 0);                                                  \
   }
 
-// Adds to the gradients of the touched rows what the bits of their values cost, but for positions. Values then move towards those
+// Adds to the gradients of the rows that have one what the bits of their values cost, but for positions. Values then move towards those
 // that are frequent, which take few bits, unless pictures need them where they are.
 __kernel void price_bits(
     const uint stride,
@@ -217,12 +223,12 @@ __kernel void price_bits(
     __global const float *prices,          // [33] price and width of scale, rotation, opacity, then of luma and of chroma of the
                                            // constant and of every SH degree; centres of 3 scales, opacity, Y, Co, Cg
     __global const uint *degrees,          // [stride] SH degree of each row: no gradient above it
-    __global const float *touched,         // [stride]
+    __global const float *pace,            // [stride]
     __global const float *values,          // [14 + 3 K, stride]
     __global float *gradient)              // [14 + 3 K, stride]
 {
   const size_t i = get_global_id(0) * W, s = stride;
-  const IW seen = MASK(LOADF(touched, i) > (FW)0.0f);
+  const IW seen = MASK(LOADF(pace, i) > (FW)0.0f);
   if (!ANY(seen)) return;
   const UW own_degree = degrees_at(degrees, i);
   IW moves = seen;
@@ -259,7 +265,7 @@ __kernel void adam(
     const float decay_first,               // of the running mean of gradients
     const float decay_second,              // of the running mean of their squares
     __global const float *rates,           // [planes] largest change of a step
-    __global const float *touched,         // [stride]
+    __global const float *pace,            // [stride] share of a whole step; 0 for rows that stay
     __global const float *gradient,        // [planes, stride]
     __global float *powers,                // [2, stride] both decays to the power of the steps that a row has made
     __global float *first,                 // [planes, stride]
@@ -267,7 +273,8 @@ __kernel void adam(
     __global float *values)                // [planes, stride]
 {
   const size_t i = get_global_id(0) * W, s = stride;
-  const IW seen = MASK(LOADF(touched, i) > (FW)0.0f);
+  const FW share = LOADF(pace, i);
+  const IW seen = MASK(share > (FW)0.0f);
   if (!ANY(seen)) return;
   const FW old_first = LOADF(powers, i), old_second = LOADF(powers, s + i);
   const FW power_first = pick(seen, old_first * (FW)decay_first, old_first);
@@ -287,7 +294,7 @@ __kernel void adam(
     STOREF(pick(seen, mean, m), first, at);
     STOREF(pick(seen, square, v), second, at);
     const FW value = LOADF(values, at);
-    STOREF(pick(seen, fma(-(FW)rates[k], step, value), value), values, at);
+    STOREF(pick(seen, fma(-(FW)rates[k] * share, step, value), value), values, at);
   }
 }
 

@@ -73,7 +73,7 @@ KERNELS: dict[str, KernelSpec] = {
     "dssim_slopes": KernelSpec("similarity.cl", "uuuuuubbb", "rows"),
     "dssim_columns_back": KernelSpec("similarity.cl", "uuuuubbb", "rows"),
     "dssim_residual": KernelSpec("similarity.cl", "uuufubbbbb", "rows"),
-    "project_backward": KernelSpec("backward.cl", "uuuuibbbbbbbbbbb", "rows"),
+    "project_backward": KernelSpec("backward.cl", "uuuuifbbbbbbbbbbb", "rows"),
     "price_bits": KernelSpec("backward.cl", "uubbbbb", "rows"),
     "adam": KernelSpec("backward.cl", "uuffbbbbbbb", "rows"),
     "follow": KernelSpec("backward.cl", "uufbb", "rows"),

@@ -14,7 +14,7 @@ from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels import twins
-from flexgs_edge.methods.best.refit.chunk_state import ORDER
+from flexgs_edge.methods.best.refit.chunk_state import ORDER, WIDE
 from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
 from flexgs_edge.methods.best.refit.prices import WIDTH, bit_prices
@@ -139,6 +139,23 @@ def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: 
         lower = np.flatnonzero(degrees < degree)
         band = [c * 24 + k for c in range(3) for k in range(degree**2 - 1, (degree + 1) ** 2 - 1)]
         assert same_bits(moved["sh_rest"][band][:, lower], planes["sh_rest"][band][:, lower])
+
+
+@pytest.mark.parametrize("form", ["w16", "numpy"])
+def test_wide_splats_take_shorter_steps(form: str) -> None:
+    """The first step of Adam moves a value by its rate, times the share of its depth that is allowed over its own."""
+    planes, camera = planes_of(12, 5, 0, -3.0), make_camera(33, 20)
+    planes["log_scales"][:, :6] = np.linspace(-2.0, 1.0, 6)
+    renderer = Renderer(open_form(form), large_budget(), background=BACKGROUND)
+    with Descent(renderer, planes, np.zeros(12, int), np.zeros(3), camera) as descent:
+        descent.step(camera, padded_target(camera, 5), RATES)
+        moved = abs(descent.planes()["opacity_logits"] - planes["opacity_logits"])[0]
+    renderer.release()
+    depths = camera.rotation[2] @ planes["means"] + camera.translation[2]
+    allowed = np.minimum(WIDE * depths / np.exp(planes["log_scales"].max(axis=0)), 1.0)
+    shown = moved > 0
+    assert shown[:6].sum() > 3 and (allowed[shown] < 0.5).any() and (allowed[shown] == 1).any()
+    np.testing.assert_allclose(moved[shown], RATES["opacity_logits"] * allowed[shown], rtol=1e-3)
 
 
 def expected_bits(planes: Planes, degrees: np.ndarray, prices: np.ndarray) -> float:

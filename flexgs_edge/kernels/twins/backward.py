@@ -80,6 +80,7 @@ def project_backward(
     base: int,
     degree: int,
     antialiased: int,
+    wide: float,
     camera: np.ndarray,
     means: np.ndarray,
     log_scales: np.ndarray,
@@ -89,14 +90,17 @@ def project_backward(
     degrees: np.ndarray,
     records: np.ndarray,
     sums: np.ndarray,
-    touched: np.ndarray,
+    pace: np.ndarray,
     gradient: np.ndarray,
 ) -> None:
-    """Gradients ([14 + 3 K, stride]) of the rows that the view touches, and a mark of these rows ([stride], 1 or 0)."""
+    """Gradients ([14 + 3 K, stride]) of the rows that the view shows, and the share of a whole step that they take ([stride]).
+
+    The share is 0 for other rows, and below 1 for those whose largest deviation over their depth is above `wide`.
+    """
     fixed = sums.view(np.int64)[base : base + count, :, 0]
     seen = np.zeros(stride, bool)
     seen[:count] = (fixed != 0).any(axis=1)
-    touched[:] = seen
+    pace[:] = 0
     rows = np.flatnonzero(seen)
     moments = fixed[rows].astype(f32)
     moments[:, :4] *= f32(-2.0 / FIXED_WEIGHT)
@@ -108,7 +112,17 @@ def project_backward(
     out[:AT_LOGIT] = _geometry(antialiased, camera, centres, scales, turns, record, moments, toward)
     opacity = f32(1) / (f32(1) + fexp2(logits.reshape(-1)[rows] * f32(-LOG2_E)))
     out[AT_LOGIT] = moments[:, 3] * (f32(1) - opacity)
+    pace[rows] = _pace(wide, camera, centres, scales)
     gradient[:, rows] = out
+
+
+def _pace(wide: float, cam: np.ndarray, means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    """Share of a whole step that each row takes ([n])."""
+    px, py, pz = means
+    iz = f32(1) / (fma(cam[8], pz, fma(cam[6], px, cam[7] * py)) + cam[11])
+    size = fexp2(log_scales * f32(LOG2_E)).max(axis=0) * iz
+    share: np.ndarray = np.where(size > f32(wide), f32(wide) / size, f32(1))
+    return share
 
 
 def _colours(
@@ -227,15 +241,15 @@ def price_bits(
     degree: int,
     prices: np.ndarray,
     degrees: np.ndarray,
-    touched: np.ndarray,
+    pace: np.ndarray,
     values: np.ndarray,
     gradient: np.ndarray,
 ) -> None:
-    """Add to the gradients ([14 + 3 K, stride]) of the touched rows what the bits of their values cost.
+    """Add to the gradients ([14 + 3 K, stride]) of the rows that have one what the bits of their values cost.
 
     `prices` is the record of `flexgs_edge.methods.best.refit.prices.bit_prices`.
     """
-    rows = np.flatnonzero(touched > 0)
+    rows = np.flatnonzero(pace > 0)
     own = values[:, rows]
     for k in range(3):
         gradient[AT_SCALE + k, rows] += _pull(own[AT_SCALE + k] - prices[26 + k], *prices[:2])
@@ -267,15 +281,15 @@ def adam(
     decay_first: float,
     decay_second: float,
     rates: np.ndarray,
-    touched: np.ndarray,
+    pace: np.ndarray,
     gradient: np.ndarray,
     powers: np.ndarray,
     first: np.ndarray,
     second: np.ndarray,
     values: np.ndarray,
 ) -> None:
-    """One step of Adam for the touched rows; running means, powers of the decays and values change in place."""
-    rows = np.flatnonzero(touched > 0)
+    """One step of Adam for the rows with a share above 0; running means, powers of the decays and values change in place."""
+    rows = np.flatnonzero(pace > 0)
     one, least = f32(1), f32(GRADIENT_MIN)
     decays = f32(decay_first), f32(decay_second)
     for k, decay in enumerate(decays):
@@ -290,7 +304,7 @@ def adam(
         square = np.where(square >= least * least, square, f32(0))
         step = (mean * whole[0]) / (np.sqrt(square * whole[1]) + least)
         first[k, rows], second[k, rows] = mean, square
-        values[k, rows] = fma(-rates[k], step, values[k, rows])
+        values[k, rows] = fma(-rates[k] * pace[rows], step, values[k, rows])
 
 
 def follow(size: tuple[int, ...], stride: int, planes: int, share: float, values: np.ndarray, mean: np.ndarray) -> None:

@@ -185,7 +185,7 @@ EFFORTS = {
         views=400,
         pixels=24,
         refitted=0.7,
-        passes=4.0,
+        passes=6.0,
         descends=10_000,
     ),
     "max": Effort(
@@ -197,9 +197,13 @@ EFFORTS = {
         few=400,
         views=400,
         pixels=24,
-        passes=12.0,
+        passes=16.0,
         far=0.06,
-        warming=(Warming(loss=0.8, size=1.35, share=1 / 3), Warming(loss=0.7, size=1.2, share=1 / 3)),
+        warming=(
+            Warming(loss=0.9, size=1.6, share=1 / 3),
+            Warming(loss=0.8, size=1.35, share=1 / 3),
+            Warming(loss=0.7, size=1.2, share=1 / 3),
+        ),
     ),
 }
 

@@ -53,12 +53,12 @@ CLOSE_SIZE = 0.003
 ROOM = 0.1
 """How far below what is asked the means must be for a result to lose Gaussians although its worst view misses:
 docs/results/tuning.md#room"""
-WARMED = 1.35
+WARMED = 2.2
 """Factor on it if descents between the rounds have mended a part already: docs/results/tuning.md#distilled"""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
-WARMING_LAST = 0.5
-"""Rates at the end of a descent between rounds, as a share of those at its beginning. Its values need not settle."""
+WARMING_LAST = 0.2
+"""Rates at the end of a descent between rounds, as a share of those at its beginning: docs/results/tuning.md#passes"""
 FULL_PASSES = 10
 """Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
 goes the course `SHORT`: docs/results/tuning.md#full_passes"""
@@ -69,7 +69,7 @@ DECAY = 0.8
 docs/results/tuning.md#decay"""
 FARTHER = 0.05
 """How much farther below the target we aim for each candidate in a row that missed it, from the second on."""
-PILOT, PILOT_POWER = 0.5, -0.33
+PILOT, PILOT_POWER = 0.5, -0.1
 """A pilot is a shorter descent, which tells how much a candidate's will mend: its steps as a share of the candidate's, and the
 power by which the loss changes with the steps. After descents between the rounds there is none: docs/results/tuning.md#pilot"""
 ALL_LEFT = 0.97

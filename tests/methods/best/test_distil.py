@@ -234,10 +234,10 @@ def test_distilled_files_lose_less_in_the_same_bytes(project: Path, tmp_path: Pa
         "cameras": str(project / "cameras.json"),
     }
     # How far below its limit a search ends is partly chance.
-    plain = compress(project / "point_cloud.ply", tmp_path / "plain.fgs", distil=0, max_size=7500, **words)
-    found = compress(project / "point_cloud.ply", tmp_path / "a.fgs", distil=240, max_size=7500, **words)
-    again = compress(project / "point_cloud.ply", tmp_path / "b.fgs", distil=240, max_size=7500, **words)
-    assert found.size <= 7500 and found.size <= 1.02 * plain.size
+    plain = compress(project / "point_cloud.ply", tmp_path / "plain.fgs", distil=0, max_size=6000, **words)
+    found = compress(project / "point_cloud.ply", tmp_path / "a.fgs", distil=240, max_size=6000, **words)
+    again = compress(project / "point_cloud.ply", tmp_path / "b.fgs", distil=240, max_size=6000, **words)
+    assert found.size <= 6000 and found.size <= 1.02 * plain.size
     assert found.training_fidelity is not None and plain.training_fidelity is not None
     # Not of held-out views: of this scene they are worse at 8500 bytes than at 7500, whatever is done.
     assert found.training_fidelity > plain.training_fidelity + 0.5, (found.training_fidelity, plain.training_fidelity)

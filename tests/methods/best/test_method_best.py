@@ -161,12 +161,12 @@ def test_fidelity_and_modelled_drop_decide_without_photos(project: Path, tmp_pat
 def test_the_refit_pays(project: Path, tmp_path: Path) -> None:
     """With it, files as near to the original's renders are smaller in the mean. (`fast` refits the constant alone.)"""
     sizes = []
-    for fidelity in (34, 37, 40, 43, 46):
+    for fidelity in (33, 35, 37, 39, 41, 43, 45, 47):
         words = {**TINY, "effort": "balanced", "images": "none", "min_fidelity": fidelity, "max_drop": None}
         with_refit = compress(project / "point_cloud.ply", tmp_path / "a.fgs", force=True, **words)
         without = compress(project / "point_cloud.ply", tmp_path / "b.fgs", force=True, refit=False, **words)
         sizes.append((with_refit.size, without.size))
-    assert np.mean([np.log(one / other) for one, other in sizes]) < -0.01, sizes
+    assert np.mean([np.log(one / other) for one, other in sizes]) < -0.005, sizes
 
 
 @pytest.mark.parametrize(

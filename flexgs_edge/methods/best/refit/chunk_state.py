@@ -16,6 +16,9 @@ ORDER = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 DECAYS = (0.9, 0.99)
 """Decay of Adam's running means of gradients and of their squares. The usual 0.999 of the second would remember longer than
 a descent of a few hundred views lasts."""
+WIDE = 0.1
+"""A Gaussian whose largest deviation is above this share of its depth takes steps that are shorter by the same factor. Full
+steps would make haze that no scored pose sees: docs/results/tuning.md#wide"""
 PLANE_SETS = 5
 """How often all planes of a chunk are held: values and their mean, gradient, two running means of it."""
 
@@ -45,7 +48,7 @@ class ChunkState:
             self.values, self.gradient, self.first, self.second, self.mean = (
                 self._array((self.planes, stride)) for _ in range(PLANE_SETS)
             )
-            self.powers, self.touched = self._array((2, stride)), self._array((stride,))
+            self.powers, self.pace = self._array((2, stride)), self._array((stride,))
             self.degrees = self._array((stride,), np.uint32)
             self.stored = [self._array((width, stride)) for width in (3, 4, 1)]
         except BaseException:
@@ -95,22 +98,22 @@ class ChunkState:
         """Gradients of the rows from a view's splats and their sums, where the chunk's first row is at `base`."""
         chunk = self.chunk
         self.backend.launch(
-            "project_backward", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, self.antialiased,
-            camera, chunk.means, *self.stored, chunk.sh_rest, self.degrees, records, sums, self.touched, self.gradient,
+            "project_backward", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, self.antialiased, WIDE,
+            camera, chunk.means, *self.stored, chunk.sh_rest, self.degrees, records, sums, self.pace, self.gradient,
         )  # fmt: skip
 
     def price(self, prices: Any) -> None:
         """Add to the gradients what bits cost (record of `bit_prices`)."""
         stride, degree = self.chunk.stride, self.chunk.degree
         self.backend.launch(
-            "price_bits", (stride,), stride, degree, prices, self.degrees, self.touched, self.values, self.gradient
+            "price_bits", (stride,), stride, degree, prices, self.degrees, self.pace, self.values, self.gradient
         )
 
     def step(self, rates: Any) -> None:
         """Take one step of Adam."""
         stride = self.chunk.stride
         self.backend.launch(
-            "adam", (stride,), stride, self.planes, *DECAYS, rates, self.touched, self.gradient, self.powers, self.first,
+            "adam", (stride,), stride, self.planes, *DECAYS, rates, self.pace, self.gradient, self.powers, self.first,
             self.second, self.values,
         )  # fmt: skip
 

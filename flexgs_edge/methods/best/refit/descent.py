@@ -155,7 +155,7 @@ class Descent:
         """Gradients of the last view ([width, n] f32 by field), zero for rows that it does not show."""
 
         def read(part: ChunkState) -> np.ndarray:
-            return np.where(self.backend.read(part.touched) > 0, self.backend.read(part.gradient), np.float32(0))
+            return np.where(self.backend.read(part.pace) > 0, self.backend.read(part.gradient), np.float32(0))
 
         return self._gathered(read)
 
