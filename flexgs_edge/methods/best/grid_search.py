@@ -53,7 +53,7 @@ CLOSE_SIZE = 0.003
 ROOM = 0.1
 """How far below what is asked the means must be for a result to lose Gaussians although its worst view misses:
 docs/results/tuning.md#room"""
-WARMED = 2.2
+WARMED = 2.3
 """Factor on it if descents between the rounds have mended a part already: docs/results/tuning.md#distilled"""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
@@ -68,7 +68,8 @@ DECAY = 0.8
 """Share of the last drift that the next refit adds again. It is above zero because refits overfit the scored poses:
 docs/results/tuning.md#decay"""
 FARTHER = 0.05
-"""How much farther below the target we aim for each candidate in a row that missed it, from the second on."""
+"""How much farther below the target we aim for each candidate in a row that missed it, from the second on; behind descents from
+the first on, since what is left is landed: docs/results/tuning.md#follow"""
 PILOT, PILOT_POWER = 0.5, -0.1
 """A pilot is a shorter descent, which tells how much a candidate's will mend: its steps as a share of the candidate's, and the
 power by which the loss changes with the steps. After descents between the rounds there is none: docs/results/tuning.md#pilot"""
@@ -258,10 +259,11 @@ class GridSearch(MultiplierSearch[GridScene]):
             self._learn_lead(values_of(self._before_refit(multiplier), self.rounds.storage), target)
         low, high = bounds(steps, by_size)
         place = min(max(math.log(multiplier), low), high)
-        if math.isfinite(high - low):
-            # Between two whole results, their own line is better than probes, whose colours make up for missing rows.
+        if math.isfinite(high - low) or (steps and self.steps and not by_size):
+            # Lines through whole results are better than probes, whose colours make up for missing rows, and of which a descent
+            # mends the more, the more they lose.
             self._expected = AIM
-            return math.exp(place)
+            return math.exp(min(max(place - FARTHER / slope * misses(steps), low), high))
         # If nothing holds and the curve is flat, the search must not run away to infinity.
         ends = max(low, place - FARTHEST), min(high, place + FARTHEST)
         place = self._probed(place, offset, ends, slope, target)
