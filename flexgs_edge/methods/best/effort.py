@@ -193,12 +193,11 @@ EFFORTS = {
         refit_rounds=2,
         subsets=7,
         steps=2,
-        close=0.08,
+        close=0.09,
         few=400,
         views=400,
         pixels=24,
         passes=16.0,
-        far=0.1,
         warming=(
             Warming(loss=0.9, size=1.6, share=1 / 3),
             Warming(loss=0.8, size=1.35, share=1 / 3),
