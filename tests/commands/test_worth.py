@@ -28,7 +28,7 @@ from flexgs_edge.scene.source import MemorySource, SceneSource
 from synthetic import random_scene
 from tiny_project import write_cameras
 
-COUNT, DEGREE = 120, 2
+COUNT, DEGREE = 400, 2
 STEPS = StepSizes(2**-6, 2**-3, 2**-6, 2**-2, 2**-4, (2**-4, 2**-4))
 """Powers of two: of a value and twice the step, both ways there and back are exact."""
 VIEWS: dict[str, Any] = {"device": "numpy", "resolution": 24}
