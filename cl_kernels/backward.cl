@@ -215,8 +215,8 @@ inline FW pull(FW away, float price, float width) { return (FW)price * away / (f
     STOREF(pick(moves, old + (value), old), at, 0);                                                  \
   }
 
-// Adds to the gradients of the rows that have one what the bits of their values cost, but for positions. Values then move towards those
-// that are frequent, which take few bits, unless pictures need them where they are.
+// Adds what the bits of values cost to their gradients, in rows that have gradients. Positions cost nothing here. Values then move
+// towards those that are frequent, which take few bits, unless pictures need them where they are.
 __kernel void price_bits(
     const uint stride,
     const uint degree,

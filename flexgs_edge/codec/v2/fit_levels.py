@@ -10,13 +10,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexgs_edge.codec.v2.tables import LEVELS, OFTEN, WEIGHTS, level_batches, to_levels
+from flexgs_edge.codec.v2.tables import CLASSES, LEVELS, OFTEN, WEIGHTS, level_batches, to_levels
 
 ROUNDS = 2
 """How often levels are chosen, each time by what levels cost after the time before."""
 _UNSEEN = 0.25
 """A change of levels that no table has yet costs as much as one that comes this often. It would need an entry of its own."""
-_NEVER = 1e12
+_UNIT = 2.0**-20
+"""Bits are counted in these units. Sums are then exact, and the last digit of a logarithm, in which machines differ, decides
+nothing."""
 
 
 def fit_levels(counts: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -39,14 +41,18 @@ def fit_levels(counts: Sequence[np.ndarray]) -> list[np.ndarray]:
     return levels
 
 
+def _in_units(bits: np.ndarray) -> np.ndarray:
+    whole: np.ndarray = np.rint(bits / _UNIT) * _UNIT
+    return whole
+
+
 def _prices(levels: Sequence[np.ndarray]) -> np.ndarray:
     """[4, 65] f64, bits of each change of a level, for each class of levels."""
-    seen = np.full((4, LEVELS), _UNSEEN)
+    seen = np.full((CLASSES - 1, LEVELS), _UNSEEN)
     for rows in levels:
         for classes, changes in level_batches(rows):
             np.add.at(seen, (classes, changes), 1)
-    bits: np.ndarray = np.log2(seen.sum(axis=1, keepdims=True)) - np.log2(seen)
-    return bits
+    return _in_units(np.log2(seen.sum(axis=1, keepdims=True)) - np.log2(seen))
 
 
 def _chosen(levels: np.ndarray, counts: np.ndarray, prices: np.ndarray) -> np.ndarray:
@@ -59,7 +65,7 @@ def _chosen(levels: np.ndarray, counts: np.ndarray, prices: np.ndarray) -> np.nd
         if i + 1 < len(counts):
             bits += _change_bits(np.arange(LEVELS)[:, None], result[i + 1][None], prices)
         if i:
-            bits += _change_bits(result[i - 1][None].astype(np.int64), np.arange(LEVELS)[:, None], prices)
+            bits += _change_bits(result[i - 1][None], np.arange(LEVELS)[:, None], prices)
             result[i] = np.argmin(bits, axis=0)
         else:
             result[i] = cheapest_path(bits, prices[0])
@@ -72,15 +78,15 @@ def _symbol_bits(counts: np.ndarray, levels: np.ndarray) -> np.ndarray:
     Any weight makes all other symbols dearer. The tangent at the table's present sum of weights tells by how much.
     """
     dearer = counts.sum() / (WEIGHTS[levels].sum() * np.log(2))
-    bits: np.ndarray = WEIGHTS[:, None] * dearer - counts * np.log2(np.maximum(WEIGHTS, 1))[:, None]
-    bits[0, counts > 0] = _NEVER
+    bits = _in_units(WEIGHTS * dearer)[:, None] - counts * _in_units(np.log2(np.maximum(WEIGHTS, 1)))[:, None]
+    bits[0, counts > 0] = np.inf
     return bits
 
 
 def _change_bits(before: np.ndarray, levels: np.ndarray, prices: np.ndarray) -> np.ndarray:
     """Bits of levels behind those of the table before."""
     classes = 1 + (before > 0) + (before > OFTEN)
-    bits: np.ndarray = prices[classes, (levels.astype(np.int64) - before) % LEVELS]
+    bits: np.ndarray = prices[classes, (levels.astype(np.int64) - before.astype(np.int64)) % LEVELS]
     return bits
 
 

@@ -16,7 +16,7 @@ CONTEXTS_MOST = 64
 ENTRY_BITS = 4.0
 """Bits that one frequency should save; contexts are merged until their tables pay: docs/results/tuning.md#levels"""
 
-_CLASSES = 5
+CLASSES = 5
 """Classes of a level: in the first table; in later ones, if the level above is absent, rare or often; in a mapping."""
 OFTEN = 20
 _LANES = 16
@@ -105,9 +105,9 @@ def encode_tables(mappings: Sequence[np.ndarray], levels: Sequence[np.ndarray]) 
     """
     batches = []
     for mapping, rows in zip(mappings, levels, strict=True):
-        batches.append((np.full(len(mapping), _CLASSES - 1, np.uint8), mapping))
+        batches.append((np.full(len(mapping), CLASSES - 1, np.uint8), mapping))
         batches += level_batches(rows)
-    counts = np.zeros((_CLASSES, LEVELS), np.int64)
+    counts = np.zeros((CLASSES, LEVELS), np.int64)
     for classes, symbols in batches:
         np.add.at(counts, (classes, symbols), 1)
     meta = to_levels(counts)
@@ -129,7 +129,7 @@ def decode_tables(data: bytes, shapes: Sequence[tuple[int, int]]) -> list[tuple[
     shapes : sequence of tuple
         Number of contexts and of symbols, for each alphabet.
     """
-    meta, at = np.zeros((_CLASSES, LEVELS), np.uint8), 0
+    meta, at = np.zeros((CLASSES, LEVELS), np.uint8), 0
     for row in meta:
         length = data[at] if at < len(data) else LEVELS + 1
         part = np.frombuffer(data[at + 1 : at + 1 + length], np.uint8)
@@ -141,7 +141,7 @@ def decode_tables(data: bytes, shapes: Sequence[tuple[int, int]]) -> list[tuple[
     decoder = Decoder(data[at:], _LANES)
     result = []
     for contexts, size in shapes:
-        mapping = decoder.get(tables, np.full(contexts, _CLASSES - 1, np.uint8))
+        mapping = decoder.get(tables, np.full(contexts, CLASSES - 1, np.uint8))
         count = int(mapping.max(initial=0)) + 1
         if count > contexts:
             raise StreamError(f"tables: wanted at most {contexts}, got {count}")

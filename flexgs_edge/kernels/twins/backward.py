@@ -245,7 +245,7 @@ def price_bits(
     values: np.ndarray,
     gradient: np.ndarray,
 ) -> None:
-    """Add to the gradients ([14 + 3 K, stride]) of the rows that have one what the bits of their values cost.
+    """Add what the bits of values cost to their gradients ([14 + 3 K, stride]), in rows that have gradients.
 
     `prices` is the record of `flexgs_edge.methods.best.refit.prices.bit_prices`.
     """

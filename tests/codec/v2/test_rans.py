@@ -162,7 +162,7 @@ def test_fitted_levels_take_fewer_bytes_with_their_symbols() -> None:
     assert size(fit_levels(counts)) < 0.97 * size([to_levels(rows) for rows in counts])
 
 
-def testcheapest_path_is_the_best_of_all() -> None:
+def test_the_cheapest_path_is_the_best_of_all() -> None:
     rng = np.random.default_rng(0)
     bits, prices = rng.random((LEVELS, 3)) * 9, rng.random(LEVELS) * 9
     bits[5:] = 1e12
