@@ -78,7 +78,9 @@ def _symbol_bits(counts: np.ndarray, levels: np.ndarray) -> np.ndarray:
     Any weight makes all other symbols dearer. The tangent at the table's present sum of weights tells by how much.
     """
     dearer = counts.sum() / (WEIGHTS[levels].sum() * np.log(2))
-    bits = _in_units(WEIGHTS * dearer)[:, None] - counts * _in_units(np.log2(np.maximum(WEIGHTS, 1)))[:, None]
+    bits: np.ndarray = (
+        _in_units(WEIGHTS * dearer)[:, None] - counts * _in_units(np.log2(np.maximum(WEIGHTS, 1)))[:, None]
+    )
     bits[0, counts > 0] = np.inf
     return bits
 

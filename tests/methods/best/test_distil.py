@@ -226,22 +226,25 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_project(tmp_path_factory.mktemp("tiny") / "scene")
 
 
-def test_distilled_files_lose_less_in_the_same_bytes(project: Path, tmp_path: Path) -> None:
+def test_distilled_files_lose_less_in_the_same_bytes(sample_dir: Path, tmp_path: Path) -> None:
+    """In views that are held out, and in the same bytes each time."""
     words: dict[str, Any] = {
         "effort": "fast",
-        "holdout": 4,
         "promise": "mean",
-        "cameras": str(project / "cameras.json"),
+        "images": "none",
+        "resolution": 160,
+        "max_size": 60_000,
     }
-    # How far below its limit a search ends is partly chance.
-    plain = compress(project / "point_cloud.ply", tmp_path / "plain.fgs", distil=0, max_size=6000, **words)
-    found = compress(project / "point_cloud.ply", tmp_path / "a.fgs", distil=240, max_size=6000, **words)
-    again = compress(project / "point_cloud.ply", tmp_path / "b.fgs", distil=240, max_size=6000, **words)
-    assert found.size <= 6000 and found.size <= 1.02 * plain.size
-    assert found.training_fidelity is not None and plain.training_fidelity is not None
-    # Not of held-out views: of this scene they are worse at 8500 bytes than at 7500, whatever is done.
-    assert found.training_fidelity > plain.training_fidelity + 0.5, (found.training_fidelity, plain.training_fidelity)
-    assert again.training_fidelity == found.training_fidelity
+    plain = compress(sample_dir / "point_cloud.ply", tmp_path / "plain.fgs", distil=0, **words)
+    found, again = (
+        compress(sample_dir / "point_cloud.ply", tmp_path / name, distil=240, **words) for name in ("a.fgs", "b.fgs")
+    )
+    assert found.size <= 60_000 and found.size <= 1.02 * plain.size
+    assert found.quality is not None and plain.quality is not None
+    assert found.quality.fidelity is not None and plain.quality.fidelity is not None
+    # 4.5 dB; it was 5.1 in 40 kB, and 3.8 in 90.
+    assert found.quality.fidelity > plain.quality.fidelity + 2.0
+    assert again.quality == found.quality
     assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
 
 
