@@ -259,11 +259,13 @@ class GridSearch(MultiplierSearch[GridScene]):
             self._learn_lead(values_of(self._before_refit(multiplier), self.rounds.storage), target)
         low, high = bounds(steps, by_size)
         place = min(max(math.log(multiplier), low), high)
-        if math.isfinite(high - low) or (steps and self.steps and not by_size):
-            # Lines through whole results are better than probes, whose colours make up for missing rows, and of which a descent
-            # mends the more, the more they lose.
+        if math.isfinite(high - low):
+            # Between two whole results, their own line is better than probes, whose colours make up for missing rows.
             self._expected = AIM
-            return math.exp(min(max(place - FARTHER / slope * misses(steps), low), high))
+            return math.exp(place)
+        if steps and self.steps and not by_size:
+            # A descent mends the more, the more a probe loses, so that the slope of whole results is better than probes.
+            return math.exp(place - FARTHER / slope * misses(steps))
         # If nothing holds and the curve is flat, the search must not run away to infinity.
         ends = max(low, place - FARTHEST), min(high, place + FARTHEST)
         place = self._probed(place, offset, ends, slope, target)
