@@ -75,7 +75,7 @@ class CompressWords(TypedDict, total=False):
     refit: bool
     distil: int | None
     spz_version: int
-    layers: int
+    layers: int | None
     scratch: str | None
     resume: bool
     cluster: str | None

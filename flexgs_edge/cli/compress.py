@@ -164,9 +164,9 @@ Several scenes:
     "--layers",
     metavar="N",
     type=int,
-    default=1,
-    show_default=True,
-    help="Layers, up to 4, that `flexgs-edge trim` can cut. More: slightly larger file.",
+    default=None,
+    help="Layers, up to 4, that `flexgs-edge trim` can cut and viewers show one by one. Default: 2 from 1 MB on, if they cost at "
+    "most 2 %.",
 )
 @shared_options.report_option
 @option(OUTPUT, "--dry-run", is_flag=True, help="Write nothing (no -o needed). The size shown is exact.")

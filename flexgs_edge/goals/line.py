@@ -29,7 +29,7 @@ SLOPE = 5.0
 docs/results/tuning.md#prior_slopes"""
 
 
-def next_point(points: Iterable[tuple[float, float]], slope: float, stride: float) -> float:
+def next_point(points: Iterable[tuple[float, float]], slope: float, stride: float, least: float = 0.2) -> float:
     """Position where the excess should be just below zero: false position, kept away from measured points.
 
     Parameters
@@ -40,6 +40,8 @@ def next_point(points: Iterable[tuple[float, float]], slope: float, stride: floa
         Excess per position, used before two points are measured. Its sign must be right.
     stride : float
         Largest move beyond all points; twice that once a slope has been measured.
+    least : float
+        A measured slope counts as at least this share of `slope`. Points that differ by chance have no slope of their own.
 
     >>> round(next_point([(0.0, -1.0), (1.0, 1.0)], 2.0, 1.0), 3)
     0.495
@@ -58,7 +60,7 @@ def next_point(points: Iterable[tuple[float, float]], slope: float, stride: floa
         # The slope between the two points nearest to the target, kept within bounds.
         (low, below), (high, above) = points[-2:] if first_miss else points[:2]
         measured = (above - below) / (high - low) if high != low else slope
-        slope *= min(max(measured / slope, 0.2), 3.0)
+        slope *= min(max(measured / slope, least), 3.0)
         stride *= 2
     return edge + max(-stride, min(stride, (AIM - excess) / slope))
 

@@ -50,7 +50,7 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "unseen": ("best", "keep"),
     "refit": ("best", True),
     "distil": ("best", None),
-    "layers": ("best", 1),
+    "layers": ("best", None),
     "scratch": ("best", None),
     "resume": ("best", False),
     "cluster": ("best", None),
@@ -205,8 +205,9 @@ class CompressOptions(ViewOptions):
         effort says.
     spz_version : {3, 4}
         Version of a `.spz` that is written. Older programs read only 3. Default: 3.
-    layers : int
-        Write the file in 1 to 4 layers, between which `trim` can cut it (`best`). Default: 1.
+    layers : int, optional
+        Write the file in 1 to 4 layers, between which `trim` can cut it (`best`). Default: 2 for a file of a megabyte or more,
+        if the first layer costs at most 2 % more bytes and no target forbids them; else 1.
     scratch : str, optional
         Folder for scratch files of scenes that do not fit into memory (`best`). Default: the folder of the output.
     resume : bool
@@ -247,7 +248,7 @@ class CompressOptions(ViewOptions):
     refit: bool = True
     distil: int | None = None
     spz_version: int = 3
-    layers: int = 1
+    layers: int | None = None
     scratch: str | None = None
     resume: bool = False
     cluster: str | None = None
@@ -283,7 +284,7 @@ class CompressOptions(ViewOptions):
             raise InputError(f"--no-refit with {word}: distilling is the larger refit; give one or the other")
         if self.distil is not None and not 0 <= self.distil <= DISTIL_MOST:
             raise InputError(f"--distil {self.distil}: expected 0 (none) to {DISTIL_MOST} steps")
-        if not 1 <= self.layers <= LAYERS_MOST:
+        if self.layers is not None and not 1 <= self.layers <= LAYERS_MOST:
             raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
         if self.score_cache is not None and self.score not in ("gs", "meson"):
             raise InputError(f"--score-cache keeps scores that are computed: leave it out with --score {self.score}")

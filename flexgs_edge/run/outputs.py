@@ -66,7 +66,7 @@ def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOpti
             f"--distil {options.distil}: distilling ends on the grid of a .fgs, {format.suffix} has its own; "
             "leave it out, or write a .fgs"
         )
-    if options.layers > 1:
+    if options.layers is not None and options.layers > 1:
         raise InputError(f"--layers {options.layers}: {format.suffix} has no layers; leave it out, or write a .fgs")
     if options.resume or options.scratch is not None:
         raise InputError(

@@ -26,10 +26,11 @@ from flexgs_edge.memory.rows import blocks, put_rows, read_rows
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.curve import morton
 
-SAMPLE_CHUNKS = 2
-"""Chunks that the predictions are fitted to; the tables count the symbols of all chunks."""
-SAMPLE_ROWS = 16384
-"""Rows of each such chunk that the fit uses, about. All rows would take longer and save hardly a bit:
+SAMPLE_CHUNKS = 4
+"""Chunks that the predictions are fitted to; the tables count the symbols of all chunks. With fewer, layers of a small file
+are left out: docs/results/tuning.md#codec"""
+SAMPLE_ROWS = 24576
+"""Rows of these chunks that the fit uses, or up to twice as many. All rows would take longer and save hardly a bit:
 docs/results/tuning.md#codec"""
 
 
@@ -149,9 +150,10 @@ def encode_grid(
     layers = np.bincount(grid.layer, minlength=1).tolist()
     chunks = plan_chunks(layers, chunk_rows)
     kinds = group_kinds(grid.sh_degree)
-    fit = FitPort(kinds, max(min(grid.count, chunk_rows) // SAMPLE_ROWS, 1))
-    for i in sorted({len(chunks) * k // SAMPLE_CHUNKS for k in range(SAMPLE_CHUNKS)} if chunks else ()):
-        _walk(grid, cells, chunks[i], depth, fit)
+    sample = [chunks[i] for i in sorted({len(chunks) * k // SAMPLE_CHUNKS for k in range(SAMPLE_CHUNKS)}) if chunks]
+    fit = FitPort(kinds, max(sum(chunk.stop - chunk.start for chunk in sample) // SAMPLE_ROWS, 1))
+    for chunk in sample:
+        _walk(grid, cells, chunk, depth, fit)
     groups = [fit_group(kind, samples) for kind, samples in zip(kinds, fit.samples, strict=True)]
     del fit
 

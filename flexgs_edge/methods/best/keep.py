@@ -69,7 +69,7 @@ def kept_as_it_is(
     grid = on_grid(source.read(slice(0, source.count), list(FIELD)), steps, source.origin)
     if grid is None:
         return None
-    layers_cost = 1.0 if run.options.layers == 1 else LAYERS_COST
+    layers_cost = 1.0 if run.options.layers in (None, 1) else LAYERS_COST
     size = coder.size(grid, {})  # without settings: they hold the measurement, which is not there yet
     if round(layers_cost * size) > limit:
         return None

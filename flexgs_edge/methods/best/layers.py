@@ -16,6 +16,7 @@ from flexgs_edge.grid.values import values_of
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
+from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.rounds import take_rows
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.fit import sum_bytes
@@ -26,19 +27,52 @@ from flexgs_edge.views.bench import Bench
 HALF = 0.485
 """Share of the bits that stays when the last layer is cut off. It is below .5, so that half of a file's bytes hold the other
 layers and the header."""
+LEAST_LAYERED, FIRST_LAYER, MOST_COST, LAYER_POSES = 1_000_000, 0.125, 1.02, 32
+"""Where nothing is said, files from so many bytes on get two layers. A smaller file comes within a second over 10 Mbit/s. The
+first layer has this share of the bits. Most bytes of a layered file over those of one without, and most poses that decide:
+docs/results/web.md#layers"""
 ROUND = 0.8
 """Share of the bits that stays before costs are measured again. Removed Gaussians interact, so costs go out of date."""
 
 
+def layered_where_cheap(
+    grid: GridScene,
+    coder: GridCoder,
+    bench: Bench,
+    cameras: Sequence[Camera],
+    limit: int | None,
+    progress: Progress = SILENT,
+) -> GridScene:
+    """The grid in two layers if these cost little, else as it is.
+
+    Parameters
+    ----------
+    grid : GridScene
+        The scene to sort.
+    coder : GridCoder
+        Tells what the file takes.
+    bench, cameras, progress
+        As for `assign_layers`; a part of the poses decides.
+    limit : int, optional
+        Most bytes of the file.
+    """
+    plain = coder.size(grid)
+    some = cameras[:: -(-len(cameras) // LAYER_POSES)]
+    layered = assign_layers(grid, (FIRST_LAYER,), coder.bits(grid), bench, some, progress)
+    size = coder.size(layered)
+    cheap = size <= MOST_COST * plain and (limit is None or size <= limit)
+    return layered if cheap else grid
+
+
 def assign_layers(
     grid: GridScene,
-    layers: int,
+    parts: Sequence[float],
     bits: BitModel,
     bench: Bench,
     cameras: Sequence[Camera],
     progress: Progress = SILENT,
 ) -> GridScene:
-    """Sort the Gaussians into `layers` layers by cost of removal for each bit; each layer doubles the bytes.
+    """Sort the Gaussians into layers by cost of removal for each bit.
 
     Costs are measured again after each fifth of the bits, on the decoded scene, because a cut file has no refit. What is left is
     measured as large as viewers draw it (`growth`).
@@ -48,8 +82,9 @@ def assign_layers(
     ----------
     grid : GridScene
         The scene to sort.
-    layers : int
-        From 1 (no layers) to 4.
+    parts : sequence of float
+        Share of the bits that stays when the last layer is cut off, then the last but one, and so on. One layer more than
+        shares is made.
     bits : BitModel
         Bits that the coder takes for a row of each SH degree.
     bench : Bench
@@ -69,8 +104,8 @@ def assign_layers(
     left = np.arange(grid.count)
     renderer = bench.renderer
     planes, storage = values_of(grid, renderer.storage), renderer.storage
-    for level in range(layers - 1, 0, -1):
-        end = HALF * spent[left].sum()
+    for level, part in zip(range(len(parts), 0, -1), parts, strict=True):
+        end = part * spent[left].sum()
         while len(left) > 1 and spent[left].sum() > end:  # the first layer is never empty
             kept = take_rows(planes, left, storage)
             for rows, (scales,) in read_ahead(len(left), kept["log_scales"]):

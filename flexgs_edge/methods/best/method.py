@@ -32,7 +32,7 @@ from flexgs_edge.methods.best.effort import distil_steps, effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.keep import LAYERS_COST, kept_as_it_is
-from flexgs_edge.methods.best.layers import assign_layers
+from flexgs_edge.methods.best.layers import HALF, LEAST_LAYERED, assign_layers, layered_where_cheap
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
 from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
 from flexgs_edge.methods.best.rounds import PruneRounds
@@ -102,10 +102,8 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
             grid_search(run.options, coder), run, bench, poses, judges.decide, checkpoint=kept
         )
         judges.decided()
-        if run.options.layers > 1:
-            with run.clock.stage("layers"):
-                bits = GridCoder(bench.renderer).bits(grid)
-                grid = assign_layers(grid, run.options.layers, bits, bench, poses.cameras, run.progress)
+        if run.options.layers != 1:
+            grid = _layered(run, coder, bench, poses.cameras, grid)
         settings = make_settings(run, search)
         if output is None:
             size, quality = _tried(run, coder, grid, settings, judges)
@@ -137,6 +135,20 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
         )
 
 
+def _layered(
+    run: Run[CompressOptions], coder: GridCoder, bench: Bench, cameras: Sequence[Camera], grid: GridScene
+) -> GridScene:
+    """The grid in as many layers as asked for, or in as many as pay."""
+    if run.options.layers is not None:
+        with run.clock.stage("layers"):
+            parts = (HALF,) * (run.options.layers - 1)
+            return assign_layers(grid, parts, coder.bits(grid), bench, cameras, run.progress)
+    if coder.size(grid) < LEAST_LAYERED:
+        return grid
+    with run.clock.stage("layers"):
+        return layered_where_cheap(grid, coder, bench, cameras, run.target.limit_bytes, run.progress)
+
+
 def _tried(
     run: Run[CompressOptions], coder: GridCoder, grid: GridScene, settings: dict[str, Any], judges: Judges
 ) -> tuple[int, Quality]:
@@ -154,7 +166,7 @@ def grid_search(
 
     def size_of(grid: GridScene) -> int:
         size = coder.size(grid)
-        return size if options.layers == 1 else round(LAYERS_COST * size)
+        return size if options.layers in (None, 1) else round(LAYERS_COST * size)
 
     plan = effort_of(options)
 

@@ -13,6 +13,7 @@ from flexgs_edge.codec.v2.decode import decode_chunk
 from flexgs_edge.codec.v2.encode import cells_of, chunk_codes, encode_grid
 from flexgs_edge.codec.v2.model import Model
 from flexgs_edge.codec.v2.octree import TooManyNodes
+from flexgs_edge.codec.v2.ports import FitPort
 from flexgs_edge.codec.v2.rans import StreamError
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
@@ -43,6 +44,20 @@ def check_trip(grid: GridScene, chunk_rows: int = 65536) -> int:
 @pytest.mark.parametrize("degree", [0, 3])
 def test_round_trip(count: int, degree: int) -> None:
     check_trip(make_grid(count, degree))
+
+
+def test_predictions_are_fitted_to_every_layer_of_a_small_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    chunks: list[int] = []
+
+    class Port(FitPort):
+        def repeats(self, codes: np.ndarray | None, cells: int, rows: int) -> np.ndarray:
+            chunks.append(rows)
+            return super().repeats(codes, cells, rows)
+
+    monkeypatch.setattr("flexgs_edge.codec.v2.encode.FitPort", Port)
+    grid = make_grid(2000, 1, layers=4)
+    encode_grid(grid)
+    assert chunks == np.bincount(grid.layer).tolist()
 
 
 @settings(max_examples=12, deadline=None)

@@ -278,6 +278,34 @@ def test_layers_are_the_same_scene_and_worth_most_first(project: Path, tmp_path:
         CompressOptions(method="paper", layers=2)
 
 
+@pytest.mark.parametrize(
+    ("least", "cost", "limit", "layers"), [(10**9, 2.0, 0, 1), (0, 2.0, 0, 2), (0, 1.0, 0, 1), (0, 2.0, 1, 1)]
+)
+def test_large_files_have_two_layers_where_they_cost_little(
+    tiny: tuple[Path, CompressResult],
+    project: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    least: int,
+    cost: float,
+    limit: int,
+    layers: int,
+) -> None:
+    monkeypatch.setattr("flexgs_edge.methods.best.method.LEAST_LAYERED", least)
+    monkeypatch.setattr("flexgs_edge.methods.best.layers.MOST_COST", cost)
+    # As it is, the file fits by a few bytes, which a second layer would not.
+    target = {"max_size": tiny[1].size + 20} if limit else {"max_drop": 1.0}
+    result = compress(
+        tiny[0] if limit else project / "point_cloud.ply",
+        tmp_path / "a.fgs",
+        **{**TINY, **target, "cameras": str(project / "cameras.json"), "images": str(project / "images")},
+    )
+    rows = [layer["rows"] for layer in info(tmp_path / "a.fgs").layers or ()]
+    assert len(rows) == layers and sum(rows) == result.count
+    if layers == 2:
+        assert 0 < rows[0] < 0.3 * result.count
+
+
 def test_cameras_are_needed(project: Path, tmp_path: Path) -> None:
     shutil.copy(project / "point_cloud.ply", tmp_path / "lonely.ply")
     with pytest.raises(InputError, match=r"--cameras none leaves no views.*what each Gaussian is worth"):
