@@ -116,9 +116,9 @@ def open_checkpoint(
     # Rounds that lead to a descent also keep references from between the scored poses.
     steps, plan = distil_steps(options, len(scored), run.source.count), effort_of(options)
     words = f"path {plan.keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r} {steps > 0}"
-    if steps and plan.warming:
+    if steps and plan.interleaved:
         # The target says between which rounds a descent comes.
-        words += f" {plan.warming!r} {steps} {run.target!r}"
+        words += f" {plan.interleaved!r} {steps} {run.target!r}"
     assert options.near is not None and options.extent is not None
     key = fingerprint(run.source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
     checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")

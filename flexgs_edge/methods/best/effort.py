@@ -22,28 +22,12 @@ docs/results/tuning.md#least_views"""
 REFITTED = 0.66
 """Expected loss after the first round of the colour refit, divided by the loss before it, until a candidate tells:
 docs/results/tuning.md#refitted"""
+INTERLEAVED_SHARE = 0.5
+"""Steps of a descent between rounds of pruning, as a share of those of the descent to a candidate:
+docs/results/tuning.md#interleaved"""
 LARGEST_STEP = 4
 """Largest distance in pixels between those that we look at. Splats of one or two pixels must not fall between them
 in every view."""
-
-
-@dataclass(frozen=True)
-class Warming:
-    """A descent between two rounds of pruning, so that the rounds that follow know what mends itself.
-
-    Parameters
-    ----------
-    loss : float
-        Pruning stops for it at this share of the loss that the target allows.
-    size : float
-        With a target for the size, pruning stops for it at this many times the Gaussians that fit.
-    share : float
-        Its steps, as a share of those of the descent to a candidate.
-    """
-
-    loss: float
-    size: float
-    share: float
 
 
 @dataclass(frozen=True)
@@ -80,8 +64,9 @@ class Effort:
         Most poses that trial grids are measured on: docs/results/tuning.md#probed
     passes : float
         How often the descent to a candidate looks at every scored pose. 0 (default): colours are refitted instead.
-    warming : tuple of Warming
-        Descents before the first candidate. They pay where candidates descend for long: docs/results/tuning.md#warming
+    interleaved : int
+        Most descents between rounds of pruning, before the first candidate, so that pruning knows what mends itself:
+        docs/results/tuning.md#interleaved
     descends : int
         Least Gaussians of a scene that descends; of others, colours are refitted. Small scenes gain nothing by it:
         docs/results/tuning.md#descends
@@ -98,7 +83,7 @@ class Effort:
     refitted: float = REFITTED
     probed: int = 8
     passes: float = 0.0
-    warming: tuple[Warming, ...] = ()
+    interleaved: int = 0
     far: float = 0.15
     descends: int = 0
 
@@ -197,12 +182,8 @@ EFFORTS = {
         few=400,
         views=400,
         pixels=24,
-        passes=16.0,
-        warming=(
-            Warming(loss=0.9, size=1.6, share=1 / 3),
-            Warming(loss=0.8, size=1.35, share=1 / 3),
-            Warming(loss=0.7, size=1.2, share=1 / 3),
-        ),
+        passes=12.0,
+        interleaved=16,
     ),
 }
 
@@ -210,7 +191,7 @@ EFFORTS = {
 def effort_of(options: CompressOptions) -> Effort:
     """The effort of a run. Whoever sets the steps of a descent gets one descent for each candidate, and no others."""
     plan = EFFORTS[options.effort]
-    return plan if options.distil is None else replace(plan, warming=())
+    return plan if options.distil is None else replace(plan, interleaved=0)
 
 
 def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool = False) -> int:

@@ -23,14 +23,15 @@ from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import recolour, to_grid
 from flexgs_edge.grid.values import values_of
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
+from flexgs_edge.methods.best import descents
 from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOPE, Candidate, RateResult, bounds, misses
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
-from flexgs_edge.methods.best.effort import Effort
+from flexgs_edge.methods.best.effort import INTERLEAVED_SHARE, Effort
 from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.landing import land, land_on_quality
 from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART, Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule, distil
+from flexgs_edge.methods.best.refit.distil import LAST, Schedule, distil
 from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
 from flexgs_edge.scene.source import Planes
 
@@ -40,9 +41,6 @@ FURTHER = 0.92
 """Loss after a further round of the colour refit, divided by the loss before it: docs/results/tuning.md#further"""
 DRIFT = -0.12
 """Change of the excess by a second refit, which goes on where the first one ended: docs/results/tuning.md#drift"""
-DISTILLED, DISTILLED_POWER = 0.46, -0.2
-"""Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
-the power by which it changes with the steps: docs/results/tuning.md#distilled"""
 PRICED = -0.035
 """Expected log of the size after a descent over that before it: prices on bits make files smaller. Scenes differ, so that the
 first candidate may be too small: docs/results/tuning.md#landing"""
@@ -53,40 +51,21 @@ CLOSE_SIZE = 0.003
 ROOM = 0.1
 """How far below what is asked the means must be for a result to lose Gaussians although its worst view misses:
 docs/results/tuning.md#room"""
-WARMED = 2.3
-"""Factor on it if descents between the rounds have mended a part already: docs/results/tuning.md#distilled"""
-PRUNED_DISTILLED = 1.6
-"""`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
-WARMING_LAST = 0.2
-"""Rates at the end of a descent between rounds, as a share of those at its beginning: docs/results/tuning.md#passes"""
-FULL_PASSES = 10
-"""Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
-goes the course `SHORT`: docs/results/tuning.md#full_passes"""
-FULL_RATES, LEAST_RATE = 41.0, 0.25
-"""Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
 DECAY = 0.8
 """Share of the last drift that the next refit adds again. It is above zero because refits overfit the scored poses:
 docs/results/tuning.md#decay"""
 FARTHER = 0.05
 """How much farther below the target we aim for each candidate in a row that missed it, from the second on; behind descents from
 the first on, since what is left is landed: docs/results/tuning.md#follow"""
-PILOT, PILOT_POWER = 0.5, -0.1
-"""A pilot is a shorter descent, which tells how much a candidate's will mend: its steps as a share of the candidate's, and the
-power by which the loss changes with the steps. After descents between the rounds there is none: docs/results/tuning.md#pilot"""
 ALL_LEFT = 0.97
 """A candidate with this share of the Gaussians that there are gains hardly anything by the others."""
+STEPS_SLOPE, LITTLE, NEARLY = 0.35, 0.1, 0.1
+"""Expected slope of the log of the loss over that of the multiplier where all Gaussians that are left stay, so that steps alone
+get finer. At a slope below the second, and an excess above the third, others are missing: docs/results/tuning.md#interleaved"""
 PROBES = 4
 """Most probes between two candidates."""
 FARTHEST = 2.0
 """Largest change of the log of the multiplier by all probes of one aim."""
-
-
-def rate_from(fidelity: float | None) -> float:
-    """Share of the full rates for a descent that starts at `fidelity` dB; it follows the root of the mean squared error.
-
-    With little error left, full steps would break more than they repair: docs/results/tuning.md#rate_from
-    """
-    return 1.0 if fidelity is None else max(min(1.0, 10 ** ((FULL_RATES - fidelity) / 20)), LEAST_RATE)
 
 
 class GridSearch(MultiplierSearch[GridScene]):
@@ -123,13 +102,13 @@ class GridSearch(MultiplierSearch[GridScene]):
         super().__init__(rounds, measure, effort, on_step)
         self.size_of, self.refit, self.steps = size_of, refit, steps
         if steps:
-            self.pruned_part, self.keeps_best = PRUNED_DISTILLED, True
+            self.pruned_part, self.keeps_best = descents.PRUNED_DISTILLED, True
         self._slopes: Slopes | None = None
         self._refitted: Refitted | None = None
         # Without a refit of SH, a candidate takes nothing over from the one before. Descents begin anew as well.
         self._drift = DRIFT if effort.refit_rounds and not steps else 0.0
         self._expected = 0.0
-        self._warming = effort.warming if steps else ()
+        self._interleaved = effort.interleaved if steps else 0
         self._removal: list[tuple[GridScene, np.ndarray]] = []
         """Results that may be the answer, with the costs of the removal of each of their rows."""
 
@@ -151,14 +130,14 @@ class GridSearch(MultiplierSearch[GridScene]):
         if not (self.steps and self.refit) or target.limit_bytes is not None:
             return super().run(target, best_effort)
         found = super().run(target, best_effort=True)
-        if not found.reached and self._left_too_few(found.chosen):
-            LOG.info("pruning before the descents left too few Gaussians: descending from more")
-            self._warming, self._begin, self._slopes = (), 0, None
+        if not found.reached and self._has_all_left(found.chosen):
+            LOG.info("the descents between the rounds left too few Gaussians: descending from more")
+            self._interleaved, self._begin, self._slopes = 0, 0, None
             found = self._also(found, super().run(target, best_effort=True), target)
         if found.reached:
             return found
         LOG.info("no descent reaches the target: colours are refitted instead")
-        self._warming, self._begin = (), 0
+        self._interleaved, self._begin = 0, 0
         self.steps, self.pruned_part, self.keeps_best = 0, PRUNED_PART, False
         self._refitted, self._slopes = None, None
         self._drift = DRIFT if self.effort.refit_rounds else 0.0
@@ -174,24 +153,40 @@ class GridSearch(MultiplierSearch[GridScene]):
         return super()._close(target) if target.limit_bytes is None else CLOSE_SIZE
 
     def _used_up(self, steps: Sequence[Candidate]) -> bool:
-        return self._left_too_few(steps[-1]) or super()._used_up(steps)
+        """Also if the last two have nearly all that the descents between the rounds left, and finer steps gain little."""
+        last = steps[-2:]
+        if len(last) == 2 and all(map(self._has_all_left, last)) and last[1].excess > NEARLY:
+            finer = math.log(last[0].multiplier / last[1].multiplier)
+            if last[0].excess - last[1].excess < LITTLE * finer:
+                return True
+        return super()._used_up(steps)
 
-    def _left_too_few(self, missed: Candidate) -> bool:
+    def _has_all_left(self, step: Candidate) -> bool:
         """Whether a candidate has nearly all Gaussians that the descents between the rounds have left."""
-        return self._begin > 0 and missed.count >= ALL_LEFT * self.rounds.snapshots[self._begin].count
+        return self._begin > 0 and step.count >= ALL_LEFT * self.rounds.snapshots[self._begin].count
 
     def _start(self, target: Target) -> float:
-        for warming in self._warming:
-            self._prune(target, warming.loss, warming.size)
-            self._warm(warming.share)
+        fit = descents.MOST_FIT
+        for _ in range(self._interleaved):
+            self._prune(target, descents.INTERLEAVED, fit)
+            self._descend_between()
+            if target.limit_bytes is None:
+                left = self.rounds.snapshots[-1].planes
+                if bounds_ssim(target):
+                    self._learn_lead(left, target)
+                if self._guess(left, target) >= math.log(descents.MENDED_ENOUGH):
+                    break
+            elif fit <= descents.LEAST_FIT:
+                break
+            fit = max(descents.FEWER * fit, descents.LEAST_FIT)
         return super()._start(target)
 
-    def _warm(self, share: float) -> None:
-        """Descend off the grid between two rounds of pruning, with `share` of the steps."""
+    def _descend_between(self) -> None:
+        """Cut half a round, and descend off the grid from what is left."""
 
         def change() -> tuple[np.ndarray, dict[str, np.ndarray]]:
             kept = self.kept(self._cut(self.rounds.snapshots[-1]))
-            schedule = self._schedule(share, kept.planes, last=WARMING_LAST)
+            schedule = self._schedule(INTERLEAVED_SHARE, kept.planes, last=descents.INTERLEAVED_LAST)
             return kept.rows, distil(kept.planes, kept.degrees, self.rounds.original, schedule)
 
         self.rounds.renew(change)
@@ -199,14 +194,12 @@ class GridSearch(MultiplierSearch[GridScene]):
 
     def _schedule(self, share: float, planes: Planes, last: float = LAST, multiplier: float = 0.0) -> Schedule:
         """A descent from these planes with `share` of a candidate's steps."""
-        course = LONG if self._passes() >= FULL_PASSES else SHORT
-        steps = math.ceil(share * self.steps)
-        return Schedule(steps, self._rate(planes), last, multiplier=multiplier, course=course)
+        fidelity = self.measure(planes, estimate=True).figure("fidelity")
+        return self._descents.schedule(share, fidelity, last, multiplier)
 
-    def _rate(self, planes: Planes) -> float:
-        """Share of the full rates for a descent from these planes."""
-        longer = min(math.sqrt(FULL_PASSES / self._passes()), 1.0)
-        return longer * rate_from(self.measure(planes, estimate=True).figure("fidelity"))
+    @property
+    def _descents(self) -> descents.Descents:
+        return descents.Descents(self.steps, len(self.rounds.original.cameras))
 
     def _before_refit(self, multiplier: float) -> GridScene:
         kept, step_sizes = self._choice(multiplier)
@@ -240,6 +233,8 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _aim(self, multiplier: float, steps: Sequence[Candidate], target: Target) -> float:
         """Probe for the multiplier whose candidate should be just below the target. A refit changes the excess alike nearby."""
         by_size = target.limit_bytes is not None
+        if steps and self.steps and not by_size:
+            return self._follow(multiplier, steps)
         slope = SIZE_SLOPE if by_size else SLOPE
         offset = math.log(self._refitted_part()) if self.refit and not by_size else 0.0
         if by_size:
@@ -251,7 +246,7 @@ class GridSearch(MultiplierSearch[GridScene]):
                 offset -= ABOVE
             if self.refit and not by_size:
                 # Probes have the colours of the last refit, and the next refit goes on from these.
-                if len(steps) > 1 and not self.steps:
+                if len(steps) > 1:
                     self._drift = DECAY * (self._drift + steps[-1].excess - self._expected)
                 # If candidates keep missing, for whatever reason, aim farther each time.
                 offset += self._drift + FARTHER * max(misses(steps) - 1, 0)
@@ -260,18 +255,26 @@ class GridSearch(MultiplierSearch[GridScene]):
         low, high = bounds(steps, by_size)
         place = min(max(math.log(multiplier), low), high)
         if math.isfinite(high - low):
-            # Between two whole results, their own line is better than probes, whose colours make up for missing rows.
+            # The line between two whole results is better than probes, whose colours make up for missing rows.
             self._expected = AIM
             return math.exp(place)
-        if steps and self.steps and not by_size:
-            # A descent mends the more, the more a probe loses, so that the slope of whole results is better than probes.
-            return math.exp(place - FARTHER / slope * misses(steps))
         # If nothing holds and the curve is flat, the search must not run away to infinity.
         ends = max(low, place - FARTHEST), min(high, place + FARTHEST)
         place = self._probed(place, offset, ends, slope, target)
         if self.steps and not (steps or by_size or self._begin):
             place = self._probed(place, self._piloted(math.exp(place), target), ends, slope, target)
         return math.exp(place)
+
+    def _follow(self, multiplier: float, steps: Sequence[Candidate]) -> float:
+        """The multiplier after descents. They mend the more, the more a probe loses, so that whole results tell more."""
+        low, high = bounds(steps, by_size=False)
+        place = min(max(math.log(multiplier), low), high)
+        if math.isfinite(high - low):
+            return math.exp(place)
+        last, farther = steps[-1], FARTHER * misses(steps)
+        if last.holds or not self._has_all_left(last):
+            return math.exp(place - farther / SLOPE)
+        return last.multiplier * math.exp((AIM - last.excess - farther) / STEPS_SLOPE)
 
     def _probed(self, place: float, offset: float, ends: tuple[float, float], slope: float, target: Target) -> float:
         """Log of the multiplier, between `ends`, whose probe and `offset` together are just below the target."""
@@ -291,20 +294,15 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _piloted(self, multiplier: float, target: Target) -> float:
         """Expected change of the excess by a descent, learned from a pilot. Scenes differ too much for a constant."""
         kept, step_sizes = self._choice(multiplier)
-        schedule = self._schedule(PILOT, kept.planes, multiplier=multiplier)
+        schedule = self._schedule(descents.PILOT, kept.planes, multiplier=multiplier)
         grid, _ = self._distilled(kept, step_sizes, schedule)
         found = target.excess(0, self.measure(values_of(grid, self.rounds.storage)))
-        return found - self._probe(multiplier, target) - PILOT_POWER * math.log(PILOT)
-
-    def _passes(self) -> float:
-        """Steps of the descent to a candidate for each scored pose."""
-        return self.steps / len(self.rounds.original.cameras)
+        return found - self._probe(multiplier, target) - descents.PILOT_POWER * math.log(descents.PILOT)
 
     def _refitted_part(self) -> float:
         """Expected loss after the first candidate's refit or descent, divided by the loss before it."""
         if self.steps:
-            part = DISTILLED * math.pow(max(self._passes(), 1.0), DISTILLED_POWER)
-            return WARMED * part if self._begin else part
+            return self._descents.expected(self._begin > 0)
         return self.effort.refitted * FURTHER ** (self.effort.refit_rounds - 1)
 
     def _choice(self, multiplier: float) -> tuple[Kept, StepSizes]:

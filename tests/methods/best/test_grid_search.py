@@ -21,26 +21,29 @@ from flexgs_edge.methods.best import grid_search
 from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
+from flexgs_edge.methods.best.descents import (
+    DISTILLED,
+    DISTILLED_POWER,
+    FULL_PASSES,
+    INTERLEAVED,
+    INTERLEAVED_LAST,
+    LEAST_FIT,
+    MENDED_ENOUGH,
+    MOST_FIT,
+    PILOT,
+    PILOT_POWER,
+    rate_from,
+)
 from flexgs_edge.methods.best.effort import (
     EFFORTS,
     LARGEST_STEP,
     LEAST_STEPS,
     Effort,
-    Warming,
     distil_steps,
     sampled_poses,
     sampling_steps,
 )
-from flexgs_edge.methods.best.grid_search import (
-    DISTILLED,
-    DISTILLED_POWER,
-    FULL_PASSES,
-    PILOT,
-    PILOT_POWER,
-    WARMING_LAST,
-    GridSearch,
-    rate_from,
-)
+from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.multiplier import EXTRA_STEPS
 from flexgs_edge.methods.best.refit.distil import Schedule
@@ -400,7 +403,7 @@ def test_a_size_that_is_missed_with_all_rows_is_met_by_coarser_steps() -> None:
             return round(super().size_of(grid) * (1.5 if (grid.opacity == grid.opacity.max()).all() else 1.0))
 
     class AllLeft(Mending):
-        def _left_too_few(self, missed: Candidate) -> bool:
+        def _has_all_left(self, step: Candidate) -> bool:
             return True
 
     Mending.calls = []
@@ -463,25 +466,72 @@ def test_a_mended_result_does_not_take_the_place_of_a_smaller_one(monkeypatch: p
 @pytest.mark.parametrize("target", [MaxDrop(1.0), MaxSize(2000)])
 def test_descents_between_the_rounds(target: Target, monkeypatch: pytest.MonkeyPatch) -> None:
     """They come before the first candidate, with a share of its steps, and all costs are measured anew behind them."""
-    counts: list[tuple[int, int]] = []
+    counts, losses = between(Mended(0.5, 1.0), target, 20, monkeypatch)
+    if isinstance(target, MaxSize):
+        assert counts[0] * 50 / 8 < MOST_FIT * 2000 and 0.75 * LEAST_FIT * 2000 < counts[-1] * 50 / 8 < LEAST_FIT * 2000
+        assert 3 < len(counts) < 20
+    else:
+        # The last one leaves too much for another.
+        assert all(before >= INTERLEAVED for before, _ in losses)
+        assert all(after < MENDED_ENOUGH for _, after in losses[:-1]) and losses[-1][1] >= MENDED_ENOUGH
+        assert 1 < len(counts) < 20
+
+
+def test_no_more_descents_between_the_rounds_than_an_effort_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len(between(Mended(0.5, 1.0), MaxDrop(1.0), 1, monkeypatch)[0]) == 1
+
+
+def test_where_all_that_is_left_stays_only_steps_get_finer() -> None:
+    rounds = FakeRounds()
+    finder = KnownSearch(rounds, lambda _: 0, lambda *_: None, EFFORT, steps=100)  # type: ignore[arg-type]
+    rounds.renew(lambda: (np.arange(500), take_rows(rounds.snapshots[0].planes, np.arange(500))))
+    finder._begin = 1
+    quality = Measurement(0.3, 30.0, 0.3)
+
+    def step(excess: float, multiplier: float = 1.0, count: int = 490) -> Candidate:
+        return Candidate(multiplier, count, 0, 100, quality, excess, 0.0)
+
+    far, near = (finder._aim(0.9, [step(0.1, count=count)], MaxDrop(1.0)) for count in (490, 400))
+    assert far == pytest.approx(math.exp(-0.16 / 0.35)) and near == pytest.approx(0.9 * math.exp(-0.05 / 0.7))
+    # Between two whole results, their line decides.
+    assert finder._aim(0.8, [step(0.1), step(-0.1, 0.7)], MaxDrop(1.0)) == pytest.approx(0.8)
+    # Finer steps gain little: others are missing.
+    assert finder._used_up([step(0.30), step(0.29, 0.8)]) and not finder._used_up([step(0.30), step(0.25, 0.8)])
+    assert not finder._used_up([step(0.1), step(0.09, 0.8)])
+    assert not finder._used_up([step(0.30), step(0.29, 0.8, 400)]) and not finder._used_up([step(0.3)])
+
+
+def between(
+    world: Mended, target: Target, most: int, monkeypatch: pytest.MonkeyPatch
+) -> tuple[list[int], list[tuple[float, float]]]:
+    """Rows of each descent between the rounds, and the losses before and after it."""
+    counts: list[int] = []
+    losses: list[tuple[float, float]] = []
 
     def moved(planes: dict[str, np.ndarray], degrees: np.ndarray, original: Any, schedule: Schedule) -> Any:
-        assert schedule.last == WARMING_LAST
-        counts.append((schedule.iterations, len(degrees)))
+        assert schedule.last == INTERLEAVED_LAST and schedule.iterations == 50
+        counts.append(len(degrees))
         return {**planes, "opacity_logits": np.full_like(planes["opacity_logits"], MARK)}
+
+    class Watched(Mending):
+        def _descend_between(self) -> None:
+            before = self._left()
+            super()._descend_between()
+            losses.append((before, self._left()))
+
+        def _left(self) -> float:
+            by_size = target.limit_bytes is not None
+            return 0.0 if by_size else math.exp(self._guess(self.rounds.snapshots[-1].planes, target))
 
     monkeypatch.setattr(grid_search, "distil", moved)
     Mending.calls = calls = []
-    rounds = FakeRounds()
-    effort = replace(EFFORT, warming=(Warming(0.05, 4.0, 0.25), Warming(0.15, 2.0, 0.5)))
-    result = search(Mended(1.0, 1.0), target, rounds, kind=Mending, refit=True, steps=100, effort=effort)
-    assert result.reached and [steps for steps, _ in counts] == [25, 50]
-    assert 600 > counts[0][1] > counts[1][1] > result.chosen.count
+    effort = replace(EFFORT, interleaved=most)
+    result = search(world, target, FakeRounds(), kind=Watched, refit=True, steps=100, effort=effort)
+    assert result.reached and sorted(counts, reverse=True) == counts and counts[-1] >= result.chosen.count
     # No pilot, and candidates start from values that have moved.
     descended = len({step.multiplier for step in result.steps})
     assert [(steps, before) for steps, _, before in calls] == [(100, MARK)] * descended
-    if isinstance(target, MaxSize):
-        assert counts[0][1] * 50 / 8 < 4 * 2000 and counts[1][1] * 50 / 8 < 2 * 2000
+    return counts, losses
 
 
 @pytest.mark.parametrize(("steps", "after"), [(100, 1), (100, 0), (0, 1)])

@@ -1,0 +1,72 @@
+"""How long the descents of a search are, how fast they go, and how much of a loss they are expected to mend."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule
+
+DISTILLED, DISTILLED_POWER = 0.46, -0.2
+"""Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
+the power by which it changes with the steps: docs/results/tuning.md#distilled"""
+MENDED = 2.7
+"""Factor on it if descents between the rounds have mended a part already: docs/results/tuning.md#distilled"""
+FULL_PASSES = 10
+"""Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
+goes the course `SHORT`: docs/results/tuning.md#full_passes"""
+FULL_RATES, LEAST_RATE = 41.0, 0.25
+"""Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
+PILOT, PILOT_POWER = 0.5, -0.1
+"""A pilot is a shorter descent, which tells how much a candidate's will mend: its steps as a share of the candidate's, and the
+power by which the loss changes with the steps. After descents between the rounds there is none: docs/results/tuning.md#pilot"""
+PRUNED_DISTILLED = 1.6
+"""`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
+INTERLEAVED, MENDED_ENOUGH = 0.6, 0.85
+"""Pruning stops for a descent at this share of the loss that the target allows, and the first candidate comes once a descent
+leaves more than that share: docs/results/tuning.md#interleaved"""
+MOST_FIT, LEAST_FIT, FEWER = 1.6, 0.8, 0.88
+"""With a target for the size, pruning stops for the first descent at so many times the Gaussians that fit, for the last one at
+so many, and between them at this share of the number before: docs/results/tuning.md#interleaved"""
+INTERLEAVED_LAST = 0.2
+"""Rates at the end of a descent between rounds, as a share of those at its beginning: docs/results/tuning.md#passes"""
+
+
+def rate_from(fidelity: float | None) -> float:
+    """Share of the full rates for a descent that starts at `fidelity` dB; it follows the root of the mean squared error.
+
+    With little error left, full steps would break more than they repair: docs/results/tuning.md#rate_from
+    """
+    return 1.0 if fidelity is None else max(min(1.0, 10 ** ((FULL_RATES - fidelity) / 20)), LEAST_RATE)
+
+
+@dataclass(frozen=True)
+class Descents:
+    """The descents of a search.
+
+    Parameters
+    ----------
+    steps : int
+        Of the descent to a candidate; 0 for none.
+    poses : int
+        Scored poses.
+    """
+
+    steps: int
+    poses: int
+
+    @property
+    def passes(self) -> float:
+        """Steps of the descent to a candidate for each scored pose."""
+        return self.steps / self.poses
+
+    def schedule(self, share: float, fidelity: float | None, last: float = LAST, multiplier: float = 0.0) -> Schedule:
+        """A descent with `share` of a candidate's steps, from planes of this fidelity."""
+        rate = min(math.sqrt(FULL_PASSES / self.passes), 1.0) * rate_from(fidelity)
+        course = LONG if self.passes >= FULL_PASSES else SHORT
+        return Schedule(math.ceil(share * self.steps), rate, last, multiplier=multiplier, course=course)
+
+    def expected(self, interleaved: bool) -> float:
+        """Expected loss after the first candidate's descent, divided by the loss before it."""
+        part = DISTILLED * math.pow(max(self.passes, 1.0), DISTILLED_POWER)
+        return MENDED * part if interleaved else part
