@@ -10,7 +10,7 @@ from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule
 DISTILLED, DISTILLED_POWER = 0.46, -0.2
 """Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
 the power by which it changes with the steps: docs/results/tuning.md#distilled"""
-MENDED = 2.7
+MENDED = 3.0
 """Factor on it if descents between the rounds have mended a part already: docs/results/tuning.md#distilled"""
 FULL_PASSES = 10
 """Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
@@ -23,8 +23,8 @@ power by which the loss changes with the steps. After descents between the round
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
 INTERLEAVED, MENDED_ENOUGH = 0.6, 0.85
-"""Pruning stops for a descent at this share of the loss that the target allows, and the first candidate comes once a descent
-leaves more than that share: docs/results/tuning.md#interleaved"""
+"""Pruning stops for a descent at this share of the loss that the target allows; the first candidate comes once two descents in a
+row leave more than that share: docs/results/tuning.md#interleaved"""
 MOST_FIT, LEAST_FIT, FEWER = 1.6, 0.8, 0.88
 """With a target for the size, pruning stops for the first descent at so many times the Gaussians that fit, for the last one at
 so many, and between them at this share of the number before: docs/results/tuning.md#interleaved"""
