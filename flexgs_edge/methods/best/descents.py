@@ -22,7 +22,7 @@ PILOT, PILOT_POWER = 0.5, -0.1
 power by which the loss changes with the steps. After descents between the rounds there is none: docs/results/tuning.md#pilot"""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
-INTERLEAVED, MENDED_ENOUGH = 0.6, 0.85
+INTERLEAVED, MENDED_ENOUGH = 0.6, 0.8
 """Pruning stops for a descent at this share of the loss that the target allows; the first candidate comes once two descents in a
 row leave more than that share: docs/results/tuning.md#interleaved"""
 MOST_FIT, LEAST_FIT, FEWER = 1.6, 0.8, 0.88
