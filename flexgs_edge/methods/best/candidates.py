@@ -24,8 +24,8 @@ SIZE_SLOPE = -0.45
 LARGEST_STRIDE = 1.2
 """Largest change of the log of the multiplier between two candidates."""
 LEAST_SLOPE = 0.5
-"""Least share of the expected slope that we take from two candidates on one side of the target. They may differ by chance, and a
-far candidate is costly: docs/results/tuning.md#least_slope"""
+"""Least share of the expected slope that we take from candidates that all hold. They may differ by chance, and one that goes far
+beyond the target is lost: docs/results/tuning.md#least_slope"""
 
 
 @dataclass(frozen=True)
@@ -110,4 +110,6 @@ def next_multiplier(steps: Sequence[Candidate], target: Target) -> float:
     """The multiplier at which the excess should be just below zero."""
     slope = SIZE_SLOPE if target.limit_bytes is not None else SLOPE
     points = weighed([(math.log(s.multiplier), s.excess) for s in steps])
-    return math.exp(next_point(points, slope, LARGEST_STRIDE, LEAST_SLOPE))
+    if all(step.holds for step in steps):
+        return math.exp(next_point(points, slope, LARGEST_STRIDE, LEAST_SLOPE))
+    return math.exp(next_point(points, slope, LARGEST_STRIDE))
