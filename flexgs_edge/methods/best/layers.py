@@ -31,6 +31,8 @@ LEAST_LAYERED, FIRST_LAYER, MOST_COST, LAYER_POSES = 1_000_000, 0.125, 1.02, 32
 """Where nothing is said, files from so many bytes on get two layers. A smaller file comes within a second over 10 Mbit/s. The
 first layer has this share of the bits. Most bytes of a layered file over those of one without, and most poses that decide:
 docs/results/web.md#layers"""
+MOST_LAYERED = 1 << 18
+"""Most rows of such a file. Sorting takes arrays of all rows, which no memory limit has counted."""
 ROUND = 0.8
 """Share of the bits that stays before costs are measured again. Removed Gaussians interact, so costs go out of date."""
 

@@ -279,7 +279,8 @@ def test_layers_are_the_same_scene_and_worth_most_first(project: Path, tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("least", "cost", "limit", "layers"), [(10**9, 2.0, 0, 1), (0, 2.0, 0, 2), (0, 1.0, 0, 1), (0, 2.0, 1, 1)]
+    ("least", "most", "cost", "limit", "layers"),
+    [(10**9, 10**9, 2.0, 0, 1), (0, 10**9, 2.0, 0, 2), (0, 10**9, 1.0, 0, 1), (0, 10**9, 2.0, 1, 1), (0, 9, 2.0, 0, 1)],
 )
 def test_large_files_have_two_layers_where_they_cost_little(
     tiny: tuple[Path, CompressResult],
@@ -287,11 +288,13 @@ def test_large_files_have_two_layers_where_they_cost_little(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     least: int,
+    most: int,
     cost: float,
     limit: int,
     layers: int,
 ) -> None:
     monkeypatch.setattr("flexgs_edge.methods.best.method.LEAST_LAYERED", least)
+    monkeypatch.setattr("flexgs_edge.methods.best.method.MOST_LAYERED", most)
     monkeypatch.setattr("flexgs_edge.methods.best.layers.MOST_COST", cost)
     # As it is, the file fits by a few bytes, which a second layer would not.
     target = {"max_size": tiny[1].size + 20} if limit else {"max_drop": 1.0}
