@@ -10,7 +10,7 @@ from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule
 DISTILLED, DISTILLED_POWER = 0.46, -0.2
 """Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
 the power by which it changes with the steps: docs/results/tuning.md#distilled"""
-MENDED = 3.0
+AFTER_INTERLEAVED = 3.0
 """Factor on it if descents between the rounds have mended a part already: docs/results/tuning.md#distilled"""
 FULL_PASSES = 10
 """Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
@@ -22,14 +22,20 @@ PILOT, PILOT_POWER = 0.5, -0.1
 power by which the loss changes with the steps. After descents between the rounds there is none: docs/results/tuning.md#pilot"""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
-INTERLEAVED, MENDED_ENOUGH = 0.6, 0.8
+INTERLEAVE_AT, INTERLEAVE_TO = 0.6, 0.8
 """Pruning stops for a descent at this share of the loss that the target allows; the first candidate comes once two descents in a
 row leave more than that share: docs/results/tuning.md#interleaved"""
-MOST_FIT, LEAST_FIT, FEWER = 1.6, 0.8, 0.88
+MOST_FIT, LEAST_FIT, NEXT_FIT = 1.6, 0.8, 0.88
 """With a target for the size, pruning stops for the first descent at so many times the Gaussians that fit, for the last one at
 so many, and between them at this share of the number before: docs/results/tuning.md#interleaved"""
-INTERLEAVED_LAST = 0.2
-"""Rates at the end of a descent between rounds, as a share of those at its beginning: docs/results/tuning.md#passes"""
+INTERLEAVED_SHARE, INTERLEAVED_LAST = 0.5, 0.2
+"""Steps of a descent between rounds, as a share of those of the descent to a candidate, and its last rates over its first:
+docs/results/tuning.md#interleaved"""
+ALL_LEFT = 0.97
+"""A candidate with this share of the Gaussians that there are gains hardly anything by the others."""
+STEPS_SLOPE, LEAST_STEPS_SLOPE, NEAR_TARGET = 0.35, 0.1, 0.1
+"""Expected slope of the log of the loss over that of the multiplier where all Gaussians that are left stay, so that steps alone
+get finer. At a slope below the second, and an excess above the third, others are missing: docs/results/tuning.md#interleaved"""
 
 
 def rate_from(fidelity: float | None) -> float:
@@ -69,4 +75,4 @@ class Descents:
     def expected(self, interleaved: bool) -> float:
         """Expected loss after the first candidate's descent, divided by the loss before it."""
         part = DISTILLED * math.pow(max(self.passes, 1.0), DISTILLED_POWER)
-        return MENDED * part if interleaved else part
+        return AFTER_INTERLEAVED * part if interleaved else part

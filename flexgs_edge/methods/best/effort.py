@@ -22,9 +22,6 @@ docs/results/tuning.md#least_views"""
 REFITTED = 0.66
 """Expected loss after the first round of the colour refit, divided by the loss before it, until a candidate tells:
 docs/results/tuning.md#refitted"""
-INTERLEAVED_SHARE = 0.5
-"""Steps of a descent between rounds of pruning, as a share of those of the descent to a candidate:
-docs/results/tuning.md#interleaved"""
 LARGEST_STEP = 4
 """Largest distance in pixels between those that we look at. Splats of one or two pixels must not fall between them
 in every view."""

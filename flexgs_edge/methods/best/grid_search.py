@@ -26,7 +26,7 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best import descents
 from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOPE, Candidate, RateResult, bounds, misses
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
-from flexgs_edge.methods.best.effort import INTERLEAVED_SHARE, Effort
+from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.landing import land, land_on_quality
 from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART, Measure, MultiplierSearch
@@ -57,11 +57,6 @@ docs/results/tuning.md#decay"""
 FARTHER = 0.05
 """How much farther below the target we aim for each candidate in a row that missed it, from the second on; behind descents from
 the first on, since what is left is landed: docs/results/tuning.md#follow"""
-ALL_LEFT = 0.97
-"""A candidate with this share of the Gaussians that there are gains hardly anything by the others."""
-STEPS_SLOPE, LITTLE, NEARLY = 0.35, 0.1, 0.1
-"""Expected slope of the log of the loss over that of the multiplier where all Gaussians that are left stay, so that steps alone
-get finer. At a slope below the second, and an excess above the third, others are missing: docs/results/tuning.md#interleaved"""
 PROBES = 4
 """Most probes between two candidates."""
 FARTHEST = 2.0
@@ -155,20 +150,25 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _used_up(self, steps: Sequence[Candidate]) -> bool:
         """Also if the last two have nearly all that the descents between the rounds left, and finer steps gain little."""
         last = steps[-2:]
-        if len(last) == 2 and all(map(self._has_all_left, last)) and last[1].excess > NEARLY:
+        if len(last) == 2 and all(map(self._has_all_left, last)) and last[1].excess > descents.NEAR_TARGET:
             finer = math.log(last[0].multiplier / last[1].multiplier)
-            if last[0].excess - last[1].excess < LITTLE * finer:
+            if last[0].excess - last[1].excess < descents.LEAST_STEPS_SLOPE * finer:
                 return True
         return super()._used_up(steps)
 
     def _has_all_left(self, step: Candidate) -> bool:
         """Whether a candidate has nearly all Gaussians that the descents between the rounds have left."""
-        return self._begin > 0 and step.count >= ALL_LEFT * self.rounds.snapshots[self._begin].count
+        return self._begin > 0 and step.count >= descents.ALL_LEFT * self.rounds.snapshots[self._begin].count
 
     def _start(self, target: Target) -> float:
+        self._interleave(target)
+        return super()._start(target)
+
+    def _interleave(self, target: Target) -> None:
+        """Prune and descend in turn, until descents mend too little, or as few Gaussians are left as a size asks for."""
         fit, before, after = descents.MOST_FIT, -math.inf, -math.inf
         for _ in range(self._interleaved):
-            self._prune(target, descents.INTERLEAVED, fit)
+            self._prune(target, descents.INTERLEAVE_AT, fit)
             self._descend_between()
             if target.limit_bytes is None:
                 left = self.rounds.snapshots[-1].planes
@@ -176,19 +176,18 @@ class GridSearch(MultiplierSearch[GridScene]):
                     self._learn_lead(left, target)
                 # One alone may leave more by chance.
                 before, after = after, self._guess(left, target)
-                if min(before, after) >= math.log(descents.MENDED_ENOUGH):
+                if min(before, after) >= math.log(descents.INTERLEAVE_TO):
                     break
             elif fit <= descents.LEAST_FIT:
                 break
-            fit = max(descents.FEWER * fit, descents.LEAST_FIT)
-        return super()._start(target)
+            fit = max(descents.NEXT_FIT * fit, descents.LEAST_FIT)
 
     def _descend_between(self) -> None:
         """Cut half a round, and descend off the grid from what is left."""
 
         def change() -> tuple[np.ndarray, dict[str, np.ndarray]]:
             kept = self.kept(self._cut(self.rounds.snapshots[-1]))
-            schedule = self._schedule(INTERLEAVED_SHARE, kept.planes, last=descents.INTERLEAVED_LAST)
+            schedule = self._schedule(descents.INTERLEAVED_SHARE, kept.planes, last=descents.INTERLEAVED_LAST)
             return kept.rows, distil(kept.planes, kept.degrees, self.rounds.original, schedule)
 
         self.rounds.renew(change)
@@ -276,7 +275,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         last, farther = steps[-1], FARTHER * misses(steps)
         if last.holds or not self._has_all_left(last):
             return math.exp(place - farther / SLOPE)
-        return last.multiplier * math.exp((AIM - last.excess - farther) / STEPS_SLOPE)
+        return last.multiplier * math.exp((AIM - last.excess - farther) / descents.STEPS_SLOPE)
 
     def _probed(self, place: float, offset: float, ends: tuple[float, float], slope: float, target: Target) -> float:
         """Log of the multiplier, between `ends`, whose probe and `offset` together are just below the target."""

@@ -31,7 +31,7 @@ from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
 from flexgs_edge.methods.best.effort import distil_steps, effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.grid_search import GridSearch
-from flexgs_edge.methods.best.keep import LAYERS_COST, kept_as_it_is
+from flexgs_edge.methods.best.keep import kept_as_it_is, layers_cost
 from flexgs_edge.methods.best.layers import HALF, LEAST_LAYERED, MOST_LAYERED, assign_layers, layered_where_cheap
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
 from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
@@ -165,8 +165,7 @@ def grid_search(
     """Make searches for the grid of a `.fgs`."""
 
     def size_of(grid: GridScene) -> int:
-        size = coder.size(grid)
-        return size if options.layers in (None, 1) else round(LAYERS_COST * size)
+        return round(layers_cost(options.layers) * coder.size(grid))
 
     plan = effort_of(options)
 

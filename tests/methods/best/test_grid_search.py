@@ -25,10 +25,10 @@ from flexgs_edge.methods.best.descents import (
     DISTILLED,
     DISTILLED_POWER,
     FULL_PASSES,
-    INTERLEAVED,
+    INTERLEAVE_AT,
+    INTERLEAVE_TO,
     INTERLEAVED_LAST,
     LEAST_FIT,
-    MENDED_ENOUGH,
     MOST_FIT,
     PILOT,
     PILOT_POWER,
@@ -472,8 +472,8 @@ def test_descents_between_the_rounds(target: Target, monkeypatch: pytest.MonkeyP
         assert 3 < len(counts) < 20
     else:
         # The last two leave too much for another.
-        assert all(before >= INTERLEAVED for before, _ in losses)
-        enough = [after >= MENDED_ENOUGH for _, after in losses]
+        assert all(before >= INTERLEAVE_AT for before, _ in losses)
+        enough = [after >= INTERLEAVE_TO for _, after in losses]
         assert enough[-2:] == [True, True] and not any(a and b for a, b in zip(enough[:-2], enough[1:-1], strict=True))
         assert 1 < len(counts) < 20
 
