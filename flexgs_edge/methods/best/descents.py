@@ -10,8 +10,9 @@ from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule
 DISTILLED, DISTILLED_POWER = 0.46, -0.2
 """Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
 the power by which it changes with the steps: docs/results/tuning.md#distilled"""
-AFTER_INTERLEAVED = 3.0
-"""Factor on it if descents between the rounds have mended a part already: docs/results/tuning.md#distilled"""
+BEHIND_SHORT, BEHIND_LONG = -0.05, 0.02
+"""Log of the loss after a first candidate's descent, `SHORT` or `LONG`, over the middle of what the last descent between rounds
+left and of the probe: docs/results/tuning.md#distilled"""
 FULL_PASSES = 10
 """Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
 goes the course `SHORT`: docs/results/tuning.md#full_passes"""
@@ -22,12 +23,12 @@ PILOT, PILOT_POWER = 0.5, -0.1
 power by which the loss changes with the steps. After descents between the rounds there is none: docs/results/tuning.md#pilot"""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
-INTERLEAVE_AT, INTERLEAVE_TO = 0.6, 0.8
-"""Pruning stops for a descent at this share of the loss that the target allows; the first candidate comes once two descents in a
-row leave more than that share: docs/results/tuning.md#interleaved"""
-MOST_FIT, LEAST_FIT, NEXT_FIT = 1.6, 0.8, 0.88
-"""With a target for the size, pruning stops for the first descent at so many times the Gaussians that fit, for the last one at
-so many, and between them at this share of the number before: docs/results/tuning.md#interleaved"""
+INTERLEAVE_TO, MOST_LEFT = 0.8, 0.9
+"""The first candidate comes once two descents in a row leave more than the first share of the loss that the target allows. One
+that leaves more than the second does not count: docs/results/tuning.md#interleaved"""
+MOST_FIT, LEAST_FIT, FIT_DESCENTS = 1.6, 0.8, 7
+"""With a target for the size, pruning stops for the first descent at so many times the Gaussians that fit, for the last one at so
+many; and most descents: docs/results/tuning.md#interleaved"""
 INTERLEAVED_SHARE, INTERLEAVED_LAST = 0.5, 0.2
 """Steps of a descent between rounds, as a share of those of the descent to a candidate, and its last rates over its first:
 docs/results/tuning.md#interleaved"""
@@ -36,6 +37,12 @@ ALL_LEFT = 0.97
 STEPS_SLOPE, LEAST_STEPS_SLOPE, NEAR_TARGET = 0.35, 0.1, 0.1
 """Expected slope of the log of the loss over that of the multiplier where all Gaussians that are left stay, so that steps alone
 get finer. At a slope below the second, and an excess above the third, others are missing: docs/results/tuning.md#interleaved"""
+
+
+def fits(most: int) -> list[float]:
+    """At how many times the Gaussians that a size allows pruning stops for each of at most so many descents."""
+    count = min(most, FIT_DESCENTS)
+    return [MOST_FIT * (LEAST_FIT / MOST_FIT) ** (k / max(count - 1, 1)) for k in range(count)]
 
 
 def rate_from(fidelity: float | None) -> float:
@@ -69,10 +76,15 @@ class Descents:
     def schedule(self, share: float, fidelity: float | None, last: float = LAST, multiplier: float = 0.0) -> Schedule:
         """A descent with `share` of a candidate's steps, from planes of this fidelity."""
         rate = min(math.sqrt(FULL_PASSES / self.passes), 1.0) * rate_from(fidelity)
-        course = LONG if self.passes >= FULL_PASSES else SHORT
+        course = LONG if self._long else SHORT
         return Schedule(math.ceil(share * self.steps), rate, last, multiplier=multiplier, course=course)
 
-    def expected(self, interleaved: bool) -> float:
-        """Expected loss after the first candidate's descent, divided by the loss before it."""
-        part = DISTILLED * math.pow(max(self.passes, 1.0), DISTILLED_POWER)
-        return AFTER_INTERLEAVED * part if interleaved else part
+    def after(self, excess: float, left: float | None = None) -> float:
+        """Expected excess after a first candidate's descent, from that before it, and from that which the descent before left."""
+        if left is None:
+            return excess + math.log(DISTILLED * math.pow(max(self.passes, 1.0), DISTILLED_POWER))
+        return (left + excess) / 2 + (BEHIND_LONG if self._long else BEHIND_SHORT)
+
+    @property
+    def _long(self) -> bool:
+        return self.passes >= FULL_PASSES

@@ -64,6 +64,8 @@ class Effort:
     interleaved : int
         Most descents between rounds of pruning, before the first candidate, so that pruning knows what mends itself:
         docs/results/tuning.md#interleaved
+    interleave_at : float
+        Pruning stops for such a descent at this share of the loss that the target allows.
     descends : int
         Least Gaussians of a scene that descends; of others, colours are refitted. Small scenes gain nothing by it:
         docs/results/tuning.md#descends
@@ -81,6 +83,7 @@ class Effort:
     probed: int = 8
     passes: float = 0.0
     interleaved: int = 0
+    interleave_at: float = 0.8
     far: float = 0.15
     descends: int = 0
 
@@ -168,6 +171,7 @@ EFFORTS = {
         pixels=24,
         refitted=0.7,
         passes=6.0,
+        interleaved=2,
         descends=10_000,
     ),
     "max": Effort(
@@ -181,6 +185,7 @@ EFFORTS = {
         pixels=24,
         passes=12.0,
         interleaved=16,
+        interleave_at=0.6,
     ),
 }
 

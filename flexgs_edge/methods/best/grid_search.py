@@ -103,7 +103,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         # Without a refit of SH, a candidate takes nothing over from the one before. Descents begin anew as well.
         self._drift = DRIFT if effort.refit_rounds and not steps else 0.0
         self._expected = 0.0
-        self._interleaved = effort.interleaved if steps else 0
+        self._interleaved, self._left = effort.interleaved if steps else 0, 0.0
         self._removal: list[tuple[GridScene, np.ndarray]] = []
         """Results that may be the answer, with the costs of the removal of each of their rows."""
 
@@ -127,12 +127,12 @@ class GridSearch(MultiplierSearch[GridScene]):
         found = super().run(target, best_effort=True)
         if not found.reached and self._has_all_left(found.chosen):
             LOG.info("the descents between the rounds left too few Gaussians: descending from more")
-            self._interleaved, self._begin, self._slopes = 0, 0, None
+            self._interleaved, self._begin, self._left, self._slopes = 0, 0, 0.0, None
             found = self._also(found, super().run(target, best_effort=True), target)
         if found.reached:
             return found
         LOG.info("no descent reaches the target: colours are refitted instead")
-        self._interleaved, self._begin = 0, 0
+        self._interleaved, self._begin, self._left = 0, 0, 0.0
         self.steps, self.pruned_part, self.keeps_best = 0, PRUNED_PART, False
         self._refitted, self._slopes = None, None
         self._drift = DRIFT if self.effort.refit_rounds else 0.0
@@ -166,21 +166,23 @@ class GridSearch(MultiplierSearch[GridScene]):
 
     def _interleave(self, target: Target) -> None:
         """Prune and descend in turn, until descents mend too little, or as few Gaussians are left as a size asks for."""
-        fit, before, after = descents.MOST_FIT, -math.inf, -math.inf
-        for _ in range(self._interleaved):
-            self._prune(target, descents.INTERLEAVE_AT, fit)
+        by_size, after = target.limit_bytes is not None, -math.inf
+        for fit in descents.fits(self._interleaved) if by_size else [1.0] * self._interleaved:
+            self._prune(target, self.effort.interleave_at, fit)
             self._descend_between()
-            if target.limit_bytes is None:
-                left = self.rounds.snapshots[-1].planes
+            last, before = len(self.rounds.snapshots) - 1, after
+            if not by_size:
+                planes = self.rounds.snapshots[last].planes
                 if bounds_ssim(target):
-                    self._learn_lead(left, target)
-                # One alone may leave more by chance.
-                before, after = after, self._guess(left, target)
-                if min(before, after) >= math.log(descents.INTERLEAVE_TO):
+                    self._learn_lead(planes, target)
+                after = self._guess(planes, target)
+                if after >= math.log(descents.MOST_LEFT):
                     break
-            elif fit <= descents.LEAST_FIT:
+                self._left = after
+            self._begin = last
+            # One alone may leave more by chance.
+            if min(before, after) >= math.log(descents.INTERLEAVE_TO):
                 break
-            fit = max(descents.NEXT_FIT * fit, descents.LEAST_FIT)
 
     def _descend_between(self) -> None:
         """Cut half a round, and descend off the grid from what is left."""
@@ -191,7 +193,6 @@ class GridSearch(MultiplierSearch[GridScene]):
             return kept.rows, distil(kept.planes, kept.degrees, self.rounds.original, schedule)
 
         self.rounds.renew(change)
-        self._begin = len(self.rounds.snapshots) - 1
 
     def _schedule(self, share: float, planes: Planes, last: float = LAST, multiplier: float = 0.0) -> Schedule:
         """A descent from these planes with `share` of a candidate's steps."""
@@ -212,17 +213,15 @@ class GridSearch(MultiplierSearch[GridScene]):
         return to_grid(planes, degrees, step_sizes, self.rounds.original.origin, storage=storage)
 
     def _probe_slopes(self, snapshot: Snapshot) -> Slopes:
-        original = self.rounds.original
-        renderer, planes = original.bench.renderer, snapshot.planes
-        return probe_slopes(renderer, planes, original.origin, original.cameras, self.effort.probed)
+        original, planes = self.rounds.original, snapshot.planes
+        return probe_slopes(original.bench.renderer, planes, original.origin, original.cameras, self.effort.probed)
 
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes) -> Planes:
         return distil(kept.planes, kept.degrees, self.rounds.original, schedule, step_sizes)
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
-        original = self.rounds.original
-        subsets = self.effort.subsets_of(len(original.cameras))
-        return refit_colours(planes, degrees, original, rounds=times, bands=bands, subsets=subsets)
+        subsets = self.effort.subsets_of(len(self.rounds.original.cameras))
+        return refit_colours(planes, degrees, self.rounds.original, rounds=times, bands=bands, subsets=subsets)
 
     def _probe(self, multiplier: float, target: Target) -> float:
         """Excess of a probe: the grid of a multiplier, without a refit of its own."""
@@ -236,11 +235,9 @@ class GridSearch(MultiplierSearch[GridScene]):
         by_size = target.limit_bytes is not None
         if steps and self.steps and not by_size:
             return self._follow(multiplier, steps)
-        slope = SIZE_SLOPE if by_size else SLOPE
-        offset = math.log(self._refitted_part()) if self.refit and not by_size else 0.0
-        if by_size:
-            # A result that is a little too large can be landed, one that is too small cannot.
-            offset = (PRICED if self.steps else 0.0) - ABOVE
+        first, slope = self.refit and not (steps or by_size), SIZE_SLOPE if by_size else SLOPE
+        # A result that is a little too large can be landed, one that is too small cannot.
+        offset = (PRICED if self.steps else 0.0) - ABOVE if by_size else 0.0
         if steps:
             offset = steps[-1].excess - self._probe(steps[-1].multiplier, target)
             if by_size and steps[-1].holds:
@@ -261,9 +258,11 @@ class GridSearch(MultiplierSearch[GridScene]):
             return math.exp(place)
         # If nothing holds and the curve is flat, the search must not run away to infinity.
         ends = max(low, place - FARTHEST), min(high, place + FARTHEST)
-        place = self._probed(place, offset, ends, slope, target)
+        expect = self._after_first if first else (lambda excess: excess + offset)
+        place = self._probed(place, expect, ends, slope, target)
         if self.steps and not (steps or by_size or self._begin):
-            place = self._probed(place, self._piloted(math.exp(place), target), ends, slope, target)
+            piloted = self._piloted(math.exp(place), target)
+            place = self._probed(place, lambda excess: excess + piloted, ends, slope, target)
         return math.exp(place)
 
     def _follow(self, multiplier: float, steps: Sequence[Candidate]) -> float:
@@ -277,12 +276,14 @@ class GridSearch(MultiplierSearch[GridScene]):
             return math.exp(place - farther / SLOPE)
         return last.multiplier * math.exp((AIM - last.excess - farther) / descents.STEPS_SLOPE)
 
-    def _probed(self, place: float, offset: float, ends: tuple[float, float], slope: float, target: Target) -> float:
-        """Log of the multiplier, between `ends`, whose probe and `offset` together are just below the target."""
+    def _probed(
+        self, place: float, expect: Callable[[float], float], ends: tuple[float, float], slope: float, target: Target
+    ) -> float:
+        """Log of the multiplier, between `ends`, from whose probe we `expect` a candidate just below the target."""
         seen: list[tuple[float, float]] = []
         self._expected = AIM
         for _ in range(PROBES):
-            excess = self._probe(math.exp(place), target) + offset
+            excess = expect(self._probe(math.exp(place), target))
             if abs(excess - AIM) < -AIM:
                 self._expected = excess
                 break
@@ -300,11 +301,11 @@ class GridSearch(MultiplierSearch[GridScene]):
         found = target.excess(0, self.measure(values_of(grid, self.rounds.storage)))
         return found - self._probe(multiplier, target) - descents.PILOT_POWER * math.log(descents.PILOT)
 
-    def _refitted_part(self) -> float:
-        """Expected loss after the first candidate's refit or descent, divided by the loss before it."""
+    def _after_first(self, excess: float) -> float:
+        """Expected excess after the first candidate's refit or descent, from that before it."""
         if self.steps:
-            return self._descents.expected(self._begin > 0)
-        return self.effort.refitted * FURTHER ** (self.effort.refit_rounds - 1)
+            return self._descents.after(excess, self._left if self._begin else None)
+        return excess + math.log(self.effort.refitted * FURTHER ** (self.effort.refit_rounds - 1))
 
     def _choice(self, multiplier: float) -> tuple[Kept, StepSizes]:
         """The rows that a multiplier keeps, with the colours of the last refit, and the grid's step sizes."""
@@ -376,13 +377,7 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _landed_on_quality(self, found: RateResult[GridScene], target: Target) -> RateResult[GridScene]:
         """The answer without the Gaussians that it could do without."""
         steps = list(found.steps)
-        try:
-            best = self._thinned(found.chosen, found.product, target, target, steps)
-        except KeyboardInterrupt:
-            if not self.keeps_best:
-                raise
-            self.interrupted()
-            return found
+        best = self._thinned(found.chosen, found.product, target, target, steps)
         return replace(found, product=best[1], chosen=best[0], steps=tuple(steps))
 
     def _mended(
@@ -394,13 +389,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         """
         if target.limit_bytes is not None or means(target).excess(missed.size, missed.measurement) > -ROOM:
             return None
-        try:
-            step, grid = self._thinned(missed, product, target, means(target), tried)
-        except KeyboardInterrupt:
-            if not self.keeps_best:
-                raise
-            self.interrupted()
-            return None
+        step, grid = self._thinned(missed, product, target, means(target), tried)
         return (step, grid) if step.holds else None
 
     def _thinned(
@@ -423,8 +412,14 @@ class GridSearch(MultiplierSearch[GridScene]):
             return goal.excess(size, step.measurement)
 
         known = next((removal for made, removal in self._removal if made is grid), None)
-        if known is not None:
-            land_on_quality(grid, known, goal.excess(chosen.size, chosen.measurement), attempt, self.rounds.storage)
+        try:
+            if known is not None:
+                excess = goal.excess(chosen.size, chosen.measurement)
+                land_on_quality(grid, known, excess, attempt, self.rounds.storage, descended=self.steps > 0)
+        except KeyboardInterrupt:
+            if not self.keeps_best:
+                raise
+            self.interrupted()
         return best
 
     def _finish(self, kept: Kept, step_sizes: StepSizes) -> tuple[GridScene, np.ndarray]:

@@ -17,8 +17,9 @@ NEAR = 0.002
 """How far below the limit, as a share of it, we are content."""
 TRIES = 4
 """Most times that the file is coded on the way."""
-SHARE = 0.5
-"""Share of the Gaussians to remove at first, for each unit of the log of what a quality allows: docs/results/tuning.md#landing"""
+SHARE, DESCENDED_SHARE = 0.5, 0.33
+"""Share of the Gaussians to remove at first, for each unit of the log of what a quality allows; and behind a descent, where each
+matters more: docs/results/tuning.md#landing"""
 NEAR_QUALITY = 0.02
 """How far below what it allows, as a share of it, we are content."""
 QUALITY_TRIES = 2
@@ -75,7 +76,12 @@ def land(
 
 
 def land_on_quality(
-    grid: GridScene, removal: np.ndarray, excess: float, attempt: Callable[[GridScene], float], storage: Storage
+    grid: GridScene,
+    removal: np.ndarray,
+    excess: float,
+    attempt: Callable[[GridScene], float],
+    storage: Storage,
+    descended: bool = False,
 ) -> None:
     """Remove the Gaussians whose removal costs least, until a quality hardly holds.
 
@@ -91,10 +97,12 @@ def land_on_quality(
         Makes and measures the result of a grid, and returns its excess.
     storage : Storage
         Holds the grids.
+    descended : bool
+        The result comes from a descent.
     """
     cheapest = np.argsort(removal, kind="stable")
     within, beyond, aim = (0, excess), _beyond(removal), -NEAR_QUALITY / 2
-    each = 1 / (SHARE * grid.count)
+    each = 1 / ((DESCENDED_SHARE if descended else SHARE) * grid.count)
     for number in range(QUALITY_TRIES + 1 if excess < -NEAR_QUALITY else 0):
         if number == QUALITY_TRIES and within[0]:
             return

@@ -22,16 +22,20 @@ from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.descents import (
+    BEHIND_LONG,
+    BEHIND_SHORT,
     DISTILLED,
     DISTILLED_POWER,
+    FIT_DESCENTS,
     FULL_PASSES,
-    INTERLEAVE_AT,
     INTERLEAVE_TO,
     INTERLEAVED_LAST,
     LEAST_FIT,
     MOST_FIT,
+    MOST_LEFT,
     PILOT,
     PILOT_POWER,
+    fits,
     rate_from,
 )
 from flexgs_edge.methods.best.effort import (
@@ -345,6 +349,19 @@ def test_descents_with_less_to_mend_go_at_smaller_rates() -> None:
     assert rate_from(53.0) == pytest.approx(0.25, abs=0.002) and rate_from(90.0) == 0.25
 
 
+def test_a_candidate_behind_descents_ends_halfway_between_what_they_left_and_its_probe() -> None:
+    finder = KnownSearch(FakeRounds(), lambda _: 0, lambda *_: None, EFFORT, steps=120)  # type: ignore[arg-type]
+    passes = 120 / len(finder.rounds.original.cameras)
+    assert finder._after_first(0.1) == pytest.approx(0.1 + math.log(DISTILLED * passes**DISTILLED_POWER))
+    finder._begin, finder._left = 1, -0.2
+    assert finder._after_first(0.4) == pytest.approx(0.1 + (BEHIND_LONG if passes >= FULL_PASSES else BEHIND_SHORT))
+
+
+def test_the_last_descent_before_a_size_has_about_the_rows_that_fit() -> None:
+    assert fits(20) == fits(FIT_DESCENTS) and fits(2) == [MOST_FIT, LEAST_FIT] and fits(1) == [MOST_FIT] and not fits(0)
+    assert sorted(fits(5), reverse=True) == fits(5)
+
+
 class Mending(KnownSearch):
     """Descents mark opacities; `calls` has the steps, rate and first opacity of each."""
 
@@ -471,10 +488,12 @@ def test_descents_between_the_rounds(target: Target, monkeypatch: pytest.MonkeyP
         assert counts[0] * 50 / 8 < MOST_FIT * 2000 and 0.75 * LEAST_FIT * 2000 < counts[-1] * 50 / 8 < LEAST_FIT * 2000
         assert 3 < len(counts) < 20
     else:
-        # The last two leave too much for another.
-        assert all(before >= INTERLEAVE_AT for before, _ in losses)
+        # The last two leave too much for another, or the last one far too much.
+        assert all(before >= EFFORT.interleave_at for before, _ in losses)
         enough = [after >= INTERLEAVE_TO for _, after in losses]
-        assert enough[-2:] == [True, True] and not any(a and b for a, b in zip(enough[:-2], enough[1:-1], strict=True))
+        assert enough[-2:] == [True, True] or losses[-1][1] >= MOST_LEFT
+        assert not any(a and b for a, b in zip(enough[:-2], enough[1:-1], strict=True))
+        assert all(after < MOST_LEFT for _, after in losses[:-1])
         assert 1 < len(counts) < 20
 
 
@@ -516,11 +535,11 @@ def between(
 
     class Watched(Mending):
         def _descend_between(self) -> None:
-            before = self._left()
+            before = self._loss()
             super()._descend_between()
-            losses.append((before, self._left()))
+            losses.append((before, self._loss()))
 
-        def _left(self) -> float:
+        def _loss(self) -> float:
             by_size = target.limit_bytes is not None
             return 0.0 if by_size else math.exp(self._guess(self.rounds.snapshots[-1].planes, target))
 
@@ -528,7 +547,11 @@ def between(
     Mending.calls = calls = []
     effort = replace(EFFORT, interleaved=most)
     result = search(world, target, FakeRounds(), kind=Watched, refit=True, steps=100, effort=effort)
-    assert result.reached and sorted(counts, reverse=True) == counts and counts[-1] >= result.chosen.count
+    assert result.reached and sorted(counts, reverse=True) == counts
+    # One that leaves too much does not count.
+    assert [count for count, (_, after) in zip(counts, losses, strict=True) if after < MOST_LEFT][
+        -1
+    ] >= result.chosen.count
     # No pilot, and candidates start from values that have moved.
     descended = len({step.multiplier for step in result.steps})
     assert [(steps, before) for steps, _, before in calls] == [(100, MARK)] * descended
@@ -554,6 +577,18 @@ def test_an_interrupted_search_with_descents_keeps_the_best(steps: int, after: i
     else:
         with pytest.raises(KeyboardInterrupt):
             search(powers(), MaxDrop(1.0), kind=Interrupted, steps=steps)
+
+
+def test_an_interrupted_landing_keeps_the_best(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(grid_search, "land_on_quality", interrupted)
+    Mending.calls = []
+    found = search(Mended(0.5, 1.0), MaxDrop(1.0), kind=Mending, steps=100)
+    assert found.reached and found.chosen in found.steps
+    with pytest.raises(KeyboardInterrupt):
+        search(Mended(0.5, 1.0), MaxDrop(1.0), kind=Mending, steps=0)
 
 
 def test_a_refit_goes_on_from_the_last_one_where_the_degree_is_the_same() -> None:

@@ -10,7 +10,16 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.memory.storage import IN_MEMORY
-from flexgs_edge.methods.best.landing import NEAR_QUALITY, QUALITY_TRIES, REACH, TRIES, land, land_on_quality
+from flexgs_edge.methods.best.landing import (
+    DESCENDED_SHARE,
+    NEAR_QUALITY,
+    QUALITY_TRIES,
+    REACH,
+    SHARE,
+    TRIES,
+    land,
+    land_on_quality,
+)
 from flexgs_edge.scene.fields import FIELD
 from synthetic import random_scene
 
@@ -95,6 +104,18 @@ def test_lands_just_below_a_quality(grid: GridScene, excess: float, power: float
     missed = all(found > 0.0 for _, found in seen[:QUALITY_TRIES])
     assert len(seen) <= QUALITY_TRIES + missed and len({gone for gone, _ in seen}) == len(seen)
     assert best >= min(0.9 * excess, -NEAR_QUALITY) and (power != 1.0 or best >= -NEAR_QUALITY)
+
+
+def test_fewer_go_behind_a_descent(grid: GridScene) -> None:
+    asked: list[int] = []
+
+    def attempt(smaller: GridScene) -> float:
+        asked.append(COUNT - smaller.count)
+        return -0.001
+
+    for descended in (False, True):
+        land_on_quality(grid, np.zeros(COUNT), -0.11, attempt, IN_MEMORY, descended)
+    assert asked == [round(0.1 * share * COUNT) for share in (SHARE, DESCENDED_SHARE)]
 
 
 def test_a_quality_that_is_met_is_left_alone(grid: GridScene) -> None:
