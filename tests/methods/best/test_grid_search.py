@@ -17,7 +17,7 @@ from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, MinFidelity,
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
-from flexgs_edge.methods.best import grid_search
+from flexgs_edge.methods.best import descents, grid_search
 from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
@@ -349,12 +349,16 @@ def test_descents_with_less_to_mend_go_at_smaller_rates() -> None:
     assert rate_from(53.0) == pytest.approx(0.25, abs=0.002) and rate_from(90.0) == 0.25
 
 
-def test_a_candidate_behind_descents_ends_halfway_between_what_they_left_and_its_probe() -> None:
-    finder = KnownSearch(FakeRounds(), lambda _: 0, lambda *_: None, EFFORT, steps=120)  # type: ignore[arg-type]
-    passes = 120 / len(finder.rounds.original.cameras)
+@pytest.mark.parametrize(("passes", "behind"), [(FULL_PASSES, BEHIND_LONG), (FULL_PASSES // 2, BEHIND_SHORT)])
+def test_a_candidate_behind_descents_ends_halfway_between_what_they_left_and_its_probe(
+    passes: int, behind: float
+) -> None:
+    rounds = FakeRounds()
+    steps = passes * len(rounds.original.cameras)
+    finder = KnownSearch(rounds, lambda _: 0, lambda *_: None, EFFORT, steps=steps)  # type: ignore[arg-type]
     assert finder._after_first(0.1) == pytest.approx(0.1 + math.log(DISTILLED * passes**DISTILLED_POWER))
     finder._begin, finder._left = 1, -0.2
-    assert finder._after_first(0.4) == pytest.approx(0.1 + (BEHIND_LONG if passes >= FULL_PASSES else BEHIND_SHORT))
+    assert finder._after_first(0.4) == pytest.approx(0.1 + behind)
 
 
 def test_the_last_descent_before_a_size_has_about_the_rows_that_fit() -> None:
@@ -480,20 +484,23 @@ def test_a_mended_result_does_not_take_the_place_of_a_smaller_one(monkeypatch: p
     assert finder.run(MaxDrop(0.5), best_effort=True).chosen.size == 100
 
 
-@pytest.mark.parametrize("target", [MaxDrop(1.0), MaxSize(2000)])
-def test_descents_between_the_rounds(target: Target, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("target", "most_left"), [(MaxDrop(1.0), MOST_LEFT), (MaxDrop(1.0), 9.0), (MaxSize(2000), 9.0)]
+)
+def test_descents_between_the_rounds(target: Target, most_left: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """They come before the first candidate, with a share of its steps, and all costs are measured anew behind them."""
+    monkeypatch.setattr(descents, "MOST_LEFT", most_left)
     counts, losses = between(Mended(0.5, 1.0), target, 20, monkeypatch)
     if isinstance(target, MaxSize):
         assert counts[0] * 50 / 8 < MOST_FIT * 2000 and 0.75 * LEAST_FIT * 2000 < counts[-1] * 50 / 8 < LEAST_FIT * 2000
         assert 3 < len(counts) < 20
     else:
-        # The last two leave too much for another, or the last one far too much.
+        # The last two leave too much for another, or the last one so much that it does not count.
         assert all(before >= EFFORT.interleave_at for before, _ in losses)
         enough = [after >= INTERLEAVE_TO for _, after in losses]
-        assert enough[-2:] == [True, True] or losses[-1][1] >= MOST_LEFT
+        assert losses[-1][1] >= MOST_LEFT if most_left == MOST_LEFT else enough[-2:] == [True, True]
         assert not any(a and b for a, b in zip(enough[:-2], enough[1:-1], strict=True))
-        assert all(after < MOST_LEFT for _, after in losses[:-1])
+        assert all(after < most_left for _, after in losses[:-1])
         assert 1 < len(counts) < 20
 
 
@@ -548,10 +555,8 @@ def between(
     effort = replace(EFFORT, interleaved=most)
     result = search(world, target, FakeRounds(), kind=Watched, refit=True, steps=100, effort=effort)
     assert result.reached and sorted(counts, reverse=True) == counts
-    # One that leaves too much does not count.
-    assert [count for count, (_, after) in zip(counts, losses, strict=True) if after < MOST_LEFT][
-        -1
-    ] >= result.chosen.count
+    counted = [count for count, (_, after) in zip(counts, losses, strict=True) if after < descents.MOST_LEFT]
+    assert counted[-1] >= result.chosen.count
     # No pilot, and candidates start from values that have moved.
     descended = len({step.multiplier for step in result.steps})
     assert [(steps, before) for steps, _, before in calls] == [(100, MARK)] * descended
