@@ -204,8 +204,8 @@ MUTATIONS = (
     Mutation(
         "GPU form: hit counted on the splat that ends",
         "blend_gpu.cl",
-        "if (ANY(hit)) atomic_add(&counts, hit_count(hit))",
-        "if (ANY(hit | MASK(t < (FW)0.0f))) atomic_add(&counts, hit_count(hit | MASK(t < (FW)0.0f)))",
+        "if (ANY(hit)) atomic_add(counts + turn, hit_count(hit))",
+        "if (ANY(hit | MASK(t < (FW)0.0f))) atomic_add(counts + turn, hit_count(hit | MASK(t < (FW)0.0f)))",
         "gpu",
     ),
     Mutation("GPU form: pixels outside are open", "blend_gpu.cl", "(FW)1.0f, (FW)-1.0f", "(FW)1.0f, (FW)1.0f", "gpu"),

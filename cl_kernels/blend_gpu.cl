@@ -12,6 +12,7 @@
 
 #define BATCH 64          // splats in local memory at a time
 #define ITEMS (256 / W)   // work-items of a tile
+#define TOGETHER 4        // splats whose sums are taken at once, by 16 work-items each: barriers cost more than sums
 
 #ifndef BLEND_HELPERS
 #define BLEND_HELPERS
@@ -27,6 +28,8 @@ inline uint hit_count(IW m) {
 
 #undef SUMS
 #undef SUM_UNIT
+#undef PARTS
+#define PARTS (STATS == 2 || STATS >= 4 ? 2 : 1)   // values of a splat and pixel that sums are made of
 #if STATS == 1
 #define SUMS 1
 #define SUM_UNIT FIXED_WEIGHT
@@ -73,8 +76,11 @@ __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void BLEND(
   __local uint2 list[BATCH];
   __local int open;
 #if STATS
-  __local float parts[SUMS][256];
-  __local uint counts;
+  __local float parts[PARTS][TOGETHER][256];
+  __local uint counts[TOGETHER];
+#endif
+#if STATS > 2
+  __local float rests[3][256];
 #endif
   // Pixels follow the blocks: place q is pixel q % 16 of block q / 16, and item p has W places. `state` has the same layout.
   const int p = get_local_id(0), b = p * W >> 4, lane = p * W & 15;
@@ -100,12 +106,18 @@ __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void BLEND(
 #if STATS > 2
   const FW rest_r = LOADF(rest, here), rest_g = LOADF(rest, plane + here);
   const FW rest_b = LOADF(rest, 2 * plane + here);
+  STOREF(rest_r, rests[0], p * W);
+  STOREF(rest_g, rests[1], p * W);
+  STOREF(rest_b, rests[2], p * W);
 #if STATS == 5
   // As in blend_cpu.cl: red keeps the product of the light to come with the residual.
   if (!resume)
     red = fma(LOADF(image, 2 * plane + here), rest_b,
               fma(LOADF(image, plane + here), rest_g, LOADF(image, here) * rest_r));
 #endif
+#endif
+#if STATS
+  if (p < TOGETHER) counts[p] = 0;
 #endif
   ends += (size_t)(blocks - 1) * get_num_groups(0);
   const uint first = tile ? ends[tile - 1] : 0u, last = ends[tile];
@@ -141,7 +153,7 @@ __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void BLEND(
 #endif
       }
 #if STATS
-      if (p == 0) counts = 0;
+      const uint turn = n % TOGETHER;
 #if STATS == 2 || STATS == 4
       const FW ratio = weight / t;
       const FW er = fma((FW)splats[n][6], t, red - whole_r), eg = fma((FW)splats[n][7], t, green - whole_g);
@@ -153,49 +165,46 @@ __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void BLEND(
       red = fma(-weight, own_light, red);
       const FW error = pick(MASK(alpha < (FW)ALPHA_MAX), light, (FW)0.0f);   // gradient of the exponent
 #endif
-#if STATS == 2
-      STOREF(error, parts[0], p * W);
-      STOREF(weight, parts[1], p * W);
-#else
-      STOREF(weight, parts[0], p * W);
+      STOREF(weight, parts[0][turn], p * W);
+#if PARTS == 2
+      STOREF(error, parts[1][turn], p * W);
 #endif
-#if STATS >= 3
-      STOREF(rest_r, parts[1], p * W);
-      STOREF(rest_g, parts[2], p * W);
-      STOREF(rest_b, parts[3], p * W);
-#endif
-#if STATS >= 4
-      STOREF(error, parts[4], p * W);
-#endif
+      if (ANY(hit)) atomic_add(counts + turn, hit_count(hit));
+      if (turn + 1 < TOGETHER && n + 1 < size) continue;
       barrier(CLK_LOCAL_MEM_FENCE);
-      if (ANY(hit)) atomic_add(&counts, hit_count(hit));
-      // Each lane sums over the blocks in order, then the pairwise tree over lanes: the order and fused steps of blend_cpu.cl.
+      // Work-item p sums lane p % 16 of a splat over the blocks in order. The pairwise tree over lanes follows: the order and fused
+      // steps of blend_cpu.cl.
+      const uint l = p % 16, splat = n - turn + p / 16;
+      const bool summing = p / 16 <= turn;
+      const uint seen = summing ? counts[p / 16] : 0u;
       float sum[SUMS];
 #pragma unroll
       for (int c = 0; c < SUMS; ++c) sum[c] = 0.0f;
-      if (p < 16) {
+      if (summing) {
+        __local const float *weights = parts[0][p / 16], *errors = parts[PARTS - 1][p / 16];
 #pragma unroll
         for (int j = 0; j < 256; j += 16) {
-          const int k = j + p;
-#if STATS != 5
-          sum[0] += parts[0][k];
-#endif
+          const int k = j + (int)l;
 #if STATS == 2
-          sum[1] = fma(parts[1][k], parts[1][k], sum[1]);
-#elif STATS == 3 || STATS == 4
+          sum[0] += errors[k];
+          sum[1] = fma(weights[k], weights[k], sum[1]);
+#elif STATS != 5
+          sum[0] += weights[k];
+#endif
+#if STATS == 3 || STATS == 4
 #pragma unroll
-          for (int c = 1; c < 4; ++c) sum[c] = fma(parts[0][k], parts[c][k], sum[c]);
+          for (int c = 0; c < 3; ++c) sum[c + 1] = fma(weights[k], rests[c][k], sum[c + 1]);
 #endif
 #if STATS == 4
-          sum[4] += parts[4][k];
-          sum[5] = fma(parts[0][k], parts[0][k], sum[5]);
+          sum[4] += errors[k];
+          sum[5] = fma(weights[k], weights[k], sum[5]);
 #elif STATS == 5
 #pragma unroll
-          for (int c = 0; c < 3; ++c) sum[c] = fma(parts[0][k], parts[c + 1][k], sum[c]);
-          const float kx = (float)((int)(tile % tiles_x) * TILE + BLOCK * (k >> 4 & 3) + (k & 3)) - splats[n][0];
-          const float ky = (float)((int)(tile / tiles_x) * TILE + BLOCK * (k >> 6) + (k >> 2 & 3)) - splats[n][1];
-          const float slope_x = parts[4][k] * kx, slope_y = parts[4][k] * ky;
-          sum[3] += parts[4][k];
+          for (int c = 0; c < 3; ++c) sum[c] = fma(weights[k], rests[c][k], sum[c]);
+          const float kx = (float)((int)(tile % tiles_x) * TILE + BLOCK * (k >> 4 & 3) + (k & 3)) - splats[splat][0];
+          const float ky = (float)((int)(tile / tiles_x) * TILE + BLOCK * (k >> 6) + (k >> 2 & 3)) - splats[splat][1];
+          const float slope_x = errors[k] * kx, slope_y = errors[k] * ky;
+          sum[3] += errors[k];
           sum[4] += slope_x;
           sum[5] += slope_y;
           sum[6] = fma(slope_x, kx, sum[6]);
@@ -205,25 +214,21 @@ __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void BLEND(
         }
       }
       barrier(CLK_LOCAL_MEM_FENCE);
-      if (p < 16)
+      __local float *lanes = parts[0][0] + p / 16 * (SUMS * 16);
+      if (summing)
 #pragma unroll
-        for (int c = 0; c < SUMS; ++c) parts[c][p] = sum[c];
+        for (int c = 0; c < SUMS; ++c) lanes[c * 16 + l] = sum[c];
+      if (p < TOGETHER) counts[p] = 0;
       barrier(CLK_LOCAL_MEM_FENCE);
-      if (p == 0 && counts) {
-        const uint row = list[n].x;
+      if (seen && l < SUMS) {
+        const uint row = list[splat].x, c = l;
+        __local const float *s = lanes + c * 16;
 #if STATS == 1
-        atomic_add(hits + row, counts);
+        atomic_add(hits + row, seen);
 #endif
-#pragma unroll
-        for (int c = 0; c < SUMS; ++c) {
-          __local float *s = parts[c];
-#pragma unroll
-          for (int l = 0; l < 8; ++l) s[l] += s[l + 8];
-#pragma unroll
-          for (int l = 0; l < 4; ++l) s[l] += s[l + 4];
-          add_fixed(sums + ((size_t)row * SUMS + c) * 2, (s[0] + s[2]) + (s[1] + s[3]), SUM_UNIT,
-                    tile_largest((uint)get_num_groups(0)));
-        }
+        const float even = ((s[0] + s[8]) + (s[4] + s[12])) + ((s[2] + s[10]) + (s[6] + s[14]));
+        const float odd = ((s[1] + s[9]) + (s[5] + s[13])) + ((s[3] + s[11]) + (s[7] + s[15]));
+        add_fixed(sums + ((size_t)row * SUMS + c) * 2, even + odd, SUM_UNIT, tile_largest((uint)get_num_groups(0)));
       }
       barrier(CLK_LOCAL_MEM_FENCE);
 #endif

@@ -88,8 +88,50 @@ __kernel void sort_scatter(
 }
 
 // Offsets of every cell and block, in place: cell by cell, and block by block within a cell. values[blocks * cells] gets the total.
-// One work-item is enough: a second launch would cost more than its counting.
+// On a CPU, one work-item is enough: a second launch would cost more than its counting. A GPU takes one work-group.
 // Each block has a row of its own. If the blocks of a cell lay side by side, two cores would fight over every cache line.
+#ifdef GROUP
+#define AHEAD_BLOCKS 8   // blocks read before the first of them is written, so that reads do not wait for each other
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void exclusive_scan(
+    const uint cells,
+    const uint blocks,
+    __global uint *values)            // [blocks, cells] and the total
+{
+  __local uint sums[GROUP];
+  const uint p = get_local_id(0);
+  uint before = 0;   // sum of all cells before those of this turn
+  for (uint first = 0; first < cells; first += GROUP) {
+    const uint cell = first + p;
+    uint own = 0;
+    if (cell < cells)
+      for (uint block = 0; block < blocks; ++block) own += values[(size_t)block * cells + cell];
+    sums[p] = own;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint reach = 1; reach < GROUP; reach *= 2) {
+      const uint more = p < reach ? 0u : sums[p - reach];
+      barrier(CLK_LOCAL_MEM_FENCE);
+      sums[p] += more;
+      barrier(CLK_LOCAL_MEM_FENCE);
+    }
+    uint sum = before + sums[p] - own;
+    before += sums[GROUP - 1];
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (cell < cells)
+      for (uint from = 0; from < blocks; from += AHEAD_BLOCKS) {
+        uint counts[AHEAD_BLOCKS];
+#pragma unroll
+        for (uint k = 0; k < AHEAD_BLOCKS; ++k)
+          counts[k] = from + k < blocks ? values[(size_t)(from + k) * cells + cell] : 0u;
+#pragma unroll
+        for (uint k = 0; k < AHEAD_BLOCKS; ++k) {
+          if (from + k < blocks) values[(size_t)(from + k) * cells + cell] = sum;
+          sum += counts[k];
+        }
+      }
+  }
+  if (p == 0) values[(size_t)blocks * cells] = before;
+}
+#else
 __kernel void exclusive_scan(
     const uint cells,
     const uint blocks,
@@ -105,3 +147,4 @@ __kernel void exclusive_scan(
     }
   values[(size_t)blocks * cells] = sum;
 }
+#endif

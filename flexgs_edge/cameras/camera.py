@@ -9,6 +9,7 @@ import numpy as np
 
 from flexgs_edge.constants import DEFAULT_HOLDOUT, DILATION
 from flexgs_edge.errors import InputError
+from flexgs_edge.small_matrices import inverse, product
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +64,7 @@ class Camera:
         """[3] f64, the camera's place in the world."""
         # Not by the transpose: files keep rotations to six digits, which 1e6 units from the origin is an error of a
         # unit.
-        place: np.ndarray = np.linalg.solve(self.rotation, -self.translation)
-        return place
+        return product(inverse(self.rotation), -self.translation)
 
     def scaled(self, width: int, height: int) -> Camera:
         """The same view at another size in pixels."""
@@ -105,7 +105,7 @@ class Camera:
 
     def moved(self, origin: np.ndarray) -> Camera:
         """The same view for a scene whose positions are relative to `origin` ([3] f64, world)."""
-        return replace(self, translation=self.translation + self.rotation @ np.asarray(origin, np.float64))
+        return replace(self, translation=self.translation + product(self.rotation, np.asarray(origin, np.float64)))
 
 
 def split_views(count: int, holdout: int = DEFAULT_HOLDOUT) -> tuple[list[int], list[int]]:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.small_matrices import nearest_rotation, product
 
 NEARER, FARTHER = 0.5, 2.0
 """Distances of made poses from the scene, in distances of the given pose. Scenes differ in which views are missing, so we
@@ -26,10 +27,13 @@ def at_distance(camera: Camera, depth: float, factor: float) -> Camera:
 
 def between(first: Camera, second: Camera) -> Camera:
     """The camera half way between two, with the lens of the first; its rotation is the nearest one to the mean."""
-    left, _, right = np.linalg.svd(first.rotation + second.rotation)
-    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    rotation = nearest_rotation(first.rotation + second.rotation)
+    if not np.isfinite(rotation).all():
+        rotation = first.rotation  # they are half a turn apart, and no rotation is nearest
     center = (first.center + second.center) / 2
-    return replace(first, name=f"{first.name} to {second.name}", rotation=rotation, translation=-rotation @ center)
+    return replace(
+        first, name=f"{first.name} to {second.name}", rotation=rotation, translation=product(-rotation, center)
+    )
 
 
 def poses_between(cameras: Sequence[Camera]) -> list[Camera]:
@@ -42,7 +46,7 @@ def poses_between(cameras: Sequence[Camera]) -> list[Camera]:
     pairs: dict[tuple[int, int], None] = {}
     for i in range(len(cameras)):
         away = np.square(centres - centres[i]).sum(axis=1)
-        away[ahead @ ahead[i] < LEAST_ALIKE] = np.inf
+        away[product(ahead, ahead[i]) < LEAST_ALIKE] = np.inf
         away[i] = np.inf
         nearest = int(np.argmin(away))
         if 0.0 < away[nearest] < np.inf:

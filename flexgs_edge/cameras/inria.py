@@ -11,6 +11,7 @@ from typing import Any
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.json_values import Entry, check_names, kind, load_json
 from flexgs_edge.errors import FormatError
+from flexgs_edge.small_matrices import product
 
 
 def read_inria(path: str | os.PathLike[str]) -> list[Camera]:
@@ -67,4 +68,6 @@ def _camera(entry: Entry) -> Camera:
     turn = entry.array("rotation", (3, 3))
     entry.check_rotation("rotation", turn)
     rotation = turn.T
-    return Camera(name, width, height, rotation, -rotation @ position, fx, fy, (width - 1) / 2, (height - 1) / 2)
+    return Camera(
+        name, width, height, rotation, product(-rotation, position), fx, fy, (width - 1) / 2, (height - 1) / 2
+    )

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.small_matrices import product
 
 DIGITS = 6
 """Decimals in comparisons of squared distances, so that rounding in a scene that was moved does not break ties of a
@@ -46,14 +47,14 @@ def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, c
         gain = (np.where(seen, 1.0 / (1.0 + known), 0.0).sum(axis=1) / max(points.shape[1], 1)).round(GAIN_DIGITS)
         gain[order] = -1.0
         order.append(int(np.argmax(gain)))
-        cosine = np.einsum("can,an->cn", away, away[order[-1]])
+        cosine = (away * away[order[-1]]).sum(axis=1)
         known += seen[order[-1]] * np.maximum(1.0 - (1.0 - cosine) / SAME_VIEW, 0.0)
     return order
 
 
 def in_picture(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
     """[n] bool, the points ([3, n] f64) that project into the picture of a camera."""
-    x, y, z = camera.rotation @ points + camera.translation[:, None]
+    x, y, z = product(camera.rotation, points) + camera.translation[:, None]
     with np.errstate(all="ignore"):
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside: np.ndarray = (z > near) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)

@@ -19,6 +19,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.json_values import Entry, check_names, kind, load_json
 from flexgs_edge.cameras.photos import SUFFIXES, photo_size
 from flexgs_edge.errors import FormatError, InputError
+from flexgs_edge.small_matrices import product
 
 DATAPARSER = "dataparser_transforms.json"
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -114,8 +115,8 @@ class _Similarity:
         # `applied_*`.
         if top.has("applied_transform"):
             applied, moved = _rigid(top, "applied_transform")
-            linear = linear @ applied.T
-            shift = shift - linear @ moved
+            linear = product(linear, applied.T)
+            shift = shift - product(linear, moved)
         if top.has("applied_scale"):
             applied_scale = top.finite("applied_scale", "a factor above 0")
             if applied_scale <= 0:
@@ -125,7 +126,7 @@ class _Similarity:
 
     def moved(self, turn: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Move a pose (camera to world)."""
-        return self.linear @ turn, self.scale * (self.linear @ position + self.shift)
+        return product(self.linear, turn), self.scale * (product(self.linear, position) + self.shift)
 
 
 def _rigid(entry: Entry, key: str) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +150,7 @@ def _camera(
             "or use --ignore-distortion to take the poses alone, without photos"
         )
     turn, position = frame_change.moved(*_rigid(frame, "transform_matrix"))
-    rotation = FLIP @ turn.T
+    rotation = product(FLIP, turn.T)
     width, height = _size(path, top, frame, file_path)
     fx, fy = _focals(top, frame, width, height)
     cx, cy = (
@@ -158,7 +159,7 @@ def _camera(
         else (side - 1) / 2
         for key, side in (("cx", width), ("cy", height))
     )
-    return Camera(name, width, height, rotation, -rotation @ position, fx, fy, cx, cy, distortion)
+    return Camera(name, width, height, rotation, product(-rotation, position), fx, fy, cx, cy, distortion)
 
 
 def _has(top: Entry, frame: Entry, key: str) -> bool:

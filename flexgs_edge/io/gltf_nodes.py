@@ -15,8 +15,9 @@ import numpy as np
 
 from flexgs_edge.errors import FormatError
 from flexgs_edge.io.gltf_json import Record
-from flexgs_edge.scene.rotations import combined, matrices, quats_of, times
+from flexgs_edge.scene.rotations import matrices, quats_of, times
 from flexgs_edge.scene.turn_sh import band_matrices, turn_sh
+from flexgs_edge.small_matrices import product
 
 _SAME = 1e-6
 """Largest difference between the scales of axes that count as one: the rounding of float32."""
@@ -128,7 +129,7 @@ class Move:
         # Values that are not finite pass on to the checks of a scene.
         with np.errstate(over="ignore", invalid="ignore"):
             if field == "means":
-                return combined(self.linear, values)
+                return product(self.linear, values)
             if field == "sh_rest":
                 return turn_sh(values, self._bands)
             if self._uniform:
@@ -147,7 +148,7 @@ class Move:
         most = log_scales[:, good].max(axis=0)
         most = np.where(np.isneginf(most), 0.0, most)
         axes = matrices(quats[:, good] / largest[good]) * np.exp(log_scales[:, good] - most).T[:, None, :]
-        moved = combined(self.linear / self.size, axes.transpose(1, 0, 2)).transpose(1, 0, 2)
+        moved = product(self.linear / self.size, axes.transpose(1, 0, 2)).transpose(1, 0, 2)
         left, scales, _ = np.linalg.svd(moved)
         left[np.linalg.det(left) < 0, :, 2] *= -1
         found["quats"][:, good] = quats_of(left)

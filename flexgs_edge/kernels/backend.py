@@ -26,7 +26,7 @@ class KernelSpec:
         One letter for each argument: u uint32, i int32, f float32, b array.
     per : str
         The work of one item: `rows` (a vector of W rows; the launch size counts rows), `item` (one of the launch size),
-        `tile` (one work-item a tile on CPUs, a group of 256 on GPUs).
+        `tile` (one work-item a tile on CPUs, a group of 256 on GPUs), `group` (one work-item on CPUs, one group on GPUs).
     stats : int, optional
         Kind of statistics, for blends.
     widest : int
@@ -49,7 +49,7 @@ KERNELS: dict[str, KernelSpec] = {
     "sort_scatter_first": KernelSpec("sort.cl", "ubbbb"),
     "sort_count": KernelSpec("sort.cl", "uubb"),
     "sort_scatter": KernelSpec("sort.cl", "uubbbbb"),
-    "exclusive_scan": KernelSpec("sort.cl", "uub"),
+    "exclusive_scan": KernelSpec("sort.cl", "uub", "group"),
     # Most splats touch at most 8 block rows, so vectors of 16 would be slower.
     "tile_room": KernelSpec("tiles.cl", "uubbb", widest=8),
     "tile_count": KernelSpec("tiles.cl", "uuffibbbbb", widest=8),

@@ -19,7 +19,7 @@ def steps_of(name: str, size: tuple[int, ...], args: tuple[Any, ...]) -> int:
     """Steps of the longest work-item of the passes whose steps grow with the scene or the view; 0 for other kernels."""
     if name == "exclusive_scan":
         cells, blocks = args[:2]
-        # One more than the scan takes a tile: a list has room for one pair a tile, and all may lie in one tile.
+        # More than the scan of one work-group takes: a list has room for one pair a tile, and a blend takes all in one tile.
         return int(cells * (blocks + 2))
     if name.startswith("sort_"):
         return int(args[0] // size[0] + _DIGITS)

@@ -22,6 +22,10 @@ from flexgs_edge.memory.budget import MemoryBudget
 
 GPU_GROUP = 64
 """Size of a work-group on GPUs for kernels with one row a work-item; it divides the padding of planes."""
+SCAN_GROUPS = (1024, 256, 64)
+"""Sizes of the work-group that scans on GPUs: the largest that the device allows."""
+GPU_BLOCKS = (64, 256)
+"""Least and most work-items of the serial passes on GPUs; between them, two for each compute unit."""
 
 
 class OpenCLBackend:
@@ -66,10 +70,18 @@ class OpenCLBackend:
             expected = ", ".join(map(str, widths))
             raise DeviceError(f"vector width {self.width} of the {self.form} form: expected one of {expected}")
         self.name = f"{info.name} ({info.platform})"
+        # By default, OpenCL allows a quotient 2.5 units in the last place of error, and a root 3.
+        rounds = (
+            info.handle is not None and info.handle.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
+        )
+        self._options = ("-cl-fp32-correctly-rounded-divide-sqrt",) if rounds else ()
         # Hints and conversions that are not OpenCL C: only PoCL's compiler is known to take them, and only it gains by them.
         self._builtins = "portable computing" in info.platform.lower()
         # Blocks of the serial passes: enough to keep all compute units busy, few enough for short scans.
-        self.sort_blocks = self.tile_blocks = max(8 * info.compute_units, 16) if self.form == "cpu" else 64
+        least, most = GPU_BLOCKS
+        gpu_blocks = min(max(2 * info.compute_units, least), most)
+        self.sort_blocks = self.tile_blocks = max(8 * info.compute_units, 16) if self.form == "cpu" else gpu_blocks
+        self._scan_group = next((size for size in SCAN_GROUPS if size <= info.max_work_group), 1)
         self.most_pairs = 0
         if info.loop_steps:
             self.sort_blocks = self.tile_blocks = LIMITED_BLOCKS
@@ -126,7 +138,9 @@ class OpenCLBackend:
         """Enqueue the kernel `name` over `size` rows, items or tiles."""
         spec = KERNELS.get(name) or CODEC_KERNELS[name]
         if name not in self._kernels:
-            options = [f"-DW={min(self.width, spec.widest)}"]
+            options = [f"-DW={min(self.width, spec.widest)}", *self._options]
+            if self.form == "gpu":
+                options.append(f"-DGROUP={self._scan_group}")
             if self.written_fma:
                 options.append("-DWRITTEN_FMA")
             if self._builtins:
@@ -139,6 +153,8 @@ class OpenCLBackend:
             local = (GPU_GROUP // self.width if self.form == "gpu" else 1,)
         elif spec.per == "tile" and self.form == "gpu":
             size, local = (size[0] * 256 // self.width,), (256 // self.width,)
+        elif spec.per == "group" and self.form == "gpu":
+            size = local = (self._scan_group,)
         if self.session.info.loop_steps:
             check_steps(self.session.info, name, size, args)
         if size[0]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import JACOBIAN_MARGIN
+from flexgs_edge.small_matrices import product
 
 
 def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray:
@@ -35,6 +36,8 @@ def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray
     record[9:12] = moved.translation
     record[12:16] = moved.fx, moved.fy, moved.cx, moved.cy
     record[16:21] = near, x_low, x_high, y_low, y_high
-    record[21:24] = -moved.rotation.T @ moved.translation  # the transpose as inverse is exact enough near the origin
+    record[21:24] = product(
+        -moved.rotation.T, moved.translation
+    )  # the transpose as inverse is exact enough near the origin
     record[24:27] = moved.width, moved.height, moved.dilation
     return record.astype(np.float32)

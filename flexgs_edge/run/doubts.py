@@ -9,6 +9,7 @@ from flexgs_edge.io.frames import RDF
 from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.view_set import ViewSet
+from flexgs_edge.small_matrices import product
 
 FIT_GAP = 2.0
 """We warn of overfitting when training views show this much more fidelity than held-out views, dB."""
@@ -37,7 +38,7 @@ def frame_doubts(views: ViewSet, scene: CheckedScene) -> tuple[str, ...]:
     means = source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
     behind = np.ones(rows.size, bool)
     for camera in views.cameras[:: -(-len(views.cameras) // _SAMPLE_VIEWS)]:
-        behind &= camera.rotation[2] @ means + camera.translation[2] <= 0
+        behind &= product(camera.rotation[2:], means)[0] + camera.translation[2] <= 0
     share = float(behind.mean())
     if share <= BEHIND_SHARE:
         return ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flexgs_edge.errors import InputError
+from flexgs_edge.small_matrices import product
 
 
 def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -80,18 +81,7 @@ def times(first: np.ndarray, quats: np.ndarray) -> np.ndarray:
     """[4, n] f64, quaternions ([4, n]) turned by one more rotation, the unit quaternion `first` ([4])."""
     w, x, y, z = np.asarray(first, np.float64)
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return combined(left, np.asarray(quats, np.float64))
-
-
-def combined(matrix: np.ndarray, planes: np.ndarray) -> np.ndarray:
-    """[m, ...], sums of planes ([k, ...]) with the weights of `matrix` [m, k].
-
-    A product of matrices would round in an order that depends on the number of columns.
-    """
-    found: np.ndarray = sum(
-        matrix[:, k].reshape(-1, *[1] * (planes.ndim - 1)) * planes[k][None] for k in range(len(planes))
-    )
-    return found
+    return product(left, np.asarray(quats, np.float64))
 
 
 def tilted(quats: np.ndarray, errors: np.ndarray) -> np.ndarray:

@@ -6,10 +6,12 @@ import numpy as np
 
 from flexgs_edge.constants import MAX_SH_DEGREE, SH_C1, SH_C2, SH_C3, SH_C4
 from flexgs_edge.scene.fields import sh_rest_count
-from flexgs_edge.scene.rotations import combined
+from flexgs_edge.small_matrices import product
 
 _DIRECTIONS = 60
 """Directions in which functions are compared: many more than the 9 functions of the widest band."""
+_DIGITS = 13
+"""Decimals of the matrices. Digits beyond them differ between processors."""
 
 
 def sh_functions(degree: int, directions: np.ndarray) -> np.ndarray:
@@ -57,9 +59,9 @@ def band_matrices(turn: np.ndarray, degree: int = MAX_SH_DEGREE) -> list[np.ndar
         [2 l + 1, 2 l + 1] f64 for l = 1 to `degree`: new coefficients from old ones.
     """
     directions = _spread(_DIRECTIONS)
-    before, after = sh_functions(degree, turn.T @ directions), sh_functions(degree, directions)
+    before, after = sh_functions(degree, product(turn.T, directions)), sh_functions(degree, directions)
     bands = [slice(sh_rest_count(band - 1), sh_rest_count(band)) for band in range(1, degree + 1)]
-    return [np.linalg.lstsq(after[band].T, before[band].T, rcond=None)[0] for band in bands]
+    return [np.linalg.lstsq(after[band].T, before[band].T, rcond=None)[0].round(_DIGITS) for band in bands]
 
 
 def turn_sh(sh_rest: np.ndarray, matrices: list[np.ndarray]) -> np.ndarray:
@@ -70,7 +72,7 @@ def turn_sh(sh_rest: np.ndarray, matrices: list[np.ndarray]) -> np.ndarray:
         band = slice(start, start + len(matrix))
         if band.stop > channels.shape[1]:
             break
-        channels[:, band] = combined(matrix, channels[:, band].swapaxes(0, 1)).swapaxes(0, 1)
+        channels[:, band] = product(matrix, channels[:, band].swapaxes(0, 1)).swapaxes(0, 1)
         start = band.stop
     return channels.reshape(sh_rest.shape)
 

@@ -11,6 +11,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.small_matrices import product
 
 MIDDLE = 3
 """A camera looks at the middle one of so many parts of its frame, across and down."""
@@ -46,7 +47,7 @@ def visible_depths(renderer: Renderer, source: SceneSource, cameras: Sequence[Ca
             renderer.add_statistics(scene, camera, statistics)
             rows = np.flatnonzero(statistics.weights)
             moved = camera.moved(source.origin)
-            depth = moved.rotation[2] @ means[:, rows].astype(np.float64) + moved.translation[2]
+            depth = product(moved.rotation[2:], means[:, rows].astype(np.float64))[0] + moved.translation[2]
             order = np.argsort(depth, kind="stable")
             light = np.cumsum(statistics.weights[rows][order])
             depths.append(float(depth[order[np.searchsorted(light, light[-1] // 2)]]) if len(rows) else np.nan)

@@ -205,6 +205,8 @@ def simulate(call: str, folder: Path) -> str:
         "OCL_ICD_VENDORS": str(vendors),
         # Not OCLGRIND_UNINITIALIZED: with it version 21.10 reports the padding that vectors load, and computes other results.
         "OCLGRIND_DATA_RACES": "1",
+        # Oclgrind counts the local memory of all kernels of a program together. Each of ours takes less than 16 KiB.
+        "OCLGRIND_LOCAL_MEM_SIZE": str(1 << 16),
         "OCLGRIND_LOG": str(log),
         "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1] / "helpers"), *filter(None, sys.path)]),
     }

@@ -7,8 +7,9 @@ import pytest
 
 from flexgs_edge.kernels.twins.project import sh_basis
 from flexgs_edge.scene.fields import sh_rest_count
-from flexgs_edge.scene.rotations import combined, matrices, quats_of, times
+from flexgs_edge.scene.rotations import matrices, quats_of, times
 from flexgs_edge.scene.turn_sh import band_matrices, sh_functions, turn_sh
+from flexgs_edge.small_matrices import product
 
 
 def some_rotations(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +62,7 @@ def test_quaternions_and_matrices_are_each_others() -> None:
 def test_a_turn_never_depends_on_the_number_of_columns() -> None:
     rng = np.random.default_rng(1)
     matrix, values = rng.normal(size=(4, 4)), rng.normal(size=(4, 37))
-    whole = combined(matrix, values)
+    whole = product(matrix, values)
     np.testing.assert_allclose(whole, matrix @ values, atol=1e-14)
     for at in range(37):
-        np.testing.assert_array_equal(combined(matrix, values[:, at : at + 1])[:, 0], whole[:, at])
+        np.testing.assert_array_equal(product(matrix, values[:, at : at + 1])[:, 0], whole[:, at])

@@ -120,7 +120,7 @@ def _on_trial_grid(planes: dict[str, np.ndarray], kind: str, step: np.float32) -
 
 def _squared_error(image: np.ndarray, reference: np.ndarray) -> float:
     difference = image - reference.astype(np.float32)
-    return float(np.vdot(difference.astype(np.float64), difference))
+    return float(np.square(difference, dtype=np.float64).sum())
 
 
 def choose_steps(

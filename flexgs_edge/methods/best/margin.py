@@ -45,6 +45,6 @@ def with_margin(renderer: Renderer, source: SceneSource, cameras: Sequence[Camer
             made.append(at_distance(camera, depths[place], TIMES[place % EVERY]))
         elif place % EVERY == BETWEEN and len(cameras) > 1:
             others = [other for other in cameras if other is not camera]
-            away = [float(np.linalg.norm(other.center - camera.center)) for other in others]
+            away = [float(np.square(other.center - camera.center).sum()) for other in others]
             made.append(between(camera, others[int(np.argmin(away))]))
     return real + made
