@@ -27,9 +27,15 @@ if [ ! -e /etc/OpenCL/vendors/rusticl.icd ]; then
   apt_install mesa-opencl-icd 2>/dev/null || say "no mesa-opencl-icd here: the tests of a second OpenCL runtime are skipped"
 fi
 
-# The tests of report pages need a browser. Without one they are skipped.
+# The tests of pages need browsers. Without them they are skipped. Firefox draws with WebGL2 on a screen only, which Xvfb is.
 if ! command -v chromium >/dev/null && ! command -v google-chrome >/dev/null; then
   apt_install chromium 2>/dev/null || say "no browser here: the tests of report pages are skipped"
+fi
+if ! command -v firefox-esr >/dev/null && ! command -v firefox >/dev/null; then
+  apt_install firefox-esr 2>/dev/null || say "no Firefox here: the viewer's tests in a second browser are skipped"
+fi
+if ! command -v Xvfb >/dev/null; then
+  apt_install xvfb 2>/dev/null || say "no Xvfb here: the viewer's tests in a second browser are skipped"
 fi
 
 # Independent programs that read the files we write. Without npm their tests are skipped.

@@ -42,7 +42,11 @@ def test_poses_have_the_same_bits(processor: str, repository: Path) -> None:
     path = str(repository / "samples" / "still_life" / "cameras.json")
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", f"import test_processors as t; print(t.fingerprint({path!r}))"],
-        env={**os.environ, **PROCESSORS[processor], "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
+        env={
+            **os.environ,
+            **PROCESSORS[processor],
+            "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
+        },
         capture_output=True,
         text=True,
         check=True,

@@ -2,18 +2,63 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
+import threading
 import time
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+from PIL import Image
 
 from browser import Browser
+from flexgs_edge.commands.view import view
+from flexgs_edge.viewer.assets import PAGE
+from flexgs_edge.viewer.server import SceneServer
 
+POSES = (0, 27, 53)
+LOOK: dict[str, Any] = {"background": (0.2, 0.4, 0.9)}
+Drawn = Callable[[bool], tuple[str, ...]]
+"""Files of these poses, antialiased or not, as `render` draws them."""
 SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 
 
-def until(tab: Browser, condition: str) -> None:
+class Tab(Protocol):
+    """A page in any browser."""
+
+    events: list[dict[str, Any]]
+
+    def run(self, expression: str) -> Any:
+        """The value of a JavaScript expression in the page."""
+
+
+@contextmanager
+def served(scene: Path, cameras: str, **words: Any) -> Iterator[str]:
+    """The address of the viewer's page."""
+    ready: list[SceneServer] = []
+    event = threading.Event()
+
+    def started(server: SceneServer) -> None:
+        ready.append(server)
+        event.set()
+
+    thread = threading.Thread(
+        target=lambda: view(scene, browser=False, ready=started, cameras=cameras, **words), daemon=True
+    )
+    thread.start()
+    assert event.wait(60)
+    try:
+        yield ready[0].address(PAGE)
+    finally:
+        ready[0].stop()
+        thread.join(20)
+
+
+def until(tab: Tab, condition: str) -> None:
     for _ in range(600):
         if tab.run(f"Boolean({condition})"):
             return
@@ -21,7 +66,7 @@ def until(tab: Browser, condition: str) -> None:
     raise AssertionError(f"not within a minute: {condition}; {tab.run('document.body.innerText')!r}, {faults(tab)}")
 
 
-def faults(tab: Browser) -> list[str]:
+def faults(tab: Tab) -> list[str]:
     """What went wrong in the page: exceptions, refused requests, broken policies."""
     names = ("Runtime.exceptionThrown", "Log.entryAdded", "Network.loadingFailed")
     found = [event for event in tab.events if event.get("method") in names]
@@ -47,3 +92,13 @@ def drag(
     for step in range(1, 5):
         tab.send("Input.dispatchMouseEvent", type="mouseMoved", x=x + dx * step / 4, y=y + dy * step / 4, **mouse)
     tab.send("Input.dispatchMouseEvent", type="mouseReleased", x=x + dx, y=y + dy, **mouse)
+
+
+def picture(tab: Tab, pose: int, width: int, height: int) -> np.ndarray:
+    text = tab.run(
+        f"(async () => {{ viewer.setPose({pose}); const blob = await viewer.picture({width}, {height});"
+        "const reader = new FileReader(); reader.readAsDataURL(blob);"
+        "await new Promise((done) => (reader.onload = done)); return reader.result; })()"
+    )
+    data = base64.b64decode(text.partition(",")[2])
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), np.float64)

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import cache, partial
+from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -20,74 +16,14 @@ from PIL import Image
 from browser import Browser
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.codec.open_fgs import open_fgs
-from flexgs_edge.codec.v2.container import GridContainer, write_grid
+from flexgs_edge.codec.v2.container import GridContainer
 from flexgs_edge.commands.render import render_views
 from flexgs_edge.commands.trim import trim
 from flexgs_edge.commands.view import view
-from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.grid.to_grid import to_grid
-from flexgs_edge.io.ply import PlySource, write_ply
-from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.io.ply import write_ply
 from flexgs_edge.scene.growth import GrownSource
-from flexgs_edge.viewer.assets import PAGE
-from flexgs_edge.viewer.server import SceneServer
-from viewer_tab import decibels, drag, faults, requests, until
+from viewer_tab import LOOK, POSES, Drawn, decibels, drag, faults, picture, requests, served, until
 from web_vectors import FOLDER
-
-POSES = (0, 27, 53)
-LOOK: dict[str, Any] = {"background": (0.2, 0.4, 0.9)}
-Drawn = Callable[[bool], tuple[str, ...]]
-FINE = StepSizes(0.003, 0.1, 0.02, 0.2, 0.03, (0.03, 0.03, 0.03))
-
-
-@pytest.fixture(scope="module")
-def scene(sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sample, coded on a fine grid in two layers: no search, since only the drawing is looked at."""
-    source = PlySource(sample_dir / "point_cloud.ply")
-    planes = source.read(slice(0, source.count), list(FIELD))
-    layer = np.arange(source.count) % 2
-    degrees = np.full(source.count, source.sh_degree)
-    grid = to_grid(planes, degrees, FINE, tuple(source.origin), layer)[0]
-    place = tmp_path_factory.mktemp("scene") / "still_life.fgs"
-    write_grid(place, grid, {}, chunk_rows=4096)
-    return place
-
-
-@pytest.fixture(scope="module")
-def drawn(scene: Path, sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Drawn:
-    """The files that `render` writes, drawn once."""
-
-    @cache
-    def draw(antialiased: bool) -> tuple[str, ...]:
-        folder = tmp_path_factory.mktemp("drawn")
-        cameras = str(sample_dir / "cameras.json")
-        return render_views(
-            scene, folder, views=POSES, cameras=cameras, device="numpy", antialiased=antialiased, **LOOK
-        ).files
-
-    return draw
-
-
-@contextmanager
-def served(scene: Path, cameras: str, **words: Any) -> Iterator[str]:
-    """The address of the viewer's page."""
-    ready: list[SceneServer] = []
-    event = threading.Event()
-
-    def started(server: SceneServer) -> None:
-        ready.append(server)
-        event.set()
-
-    thread = threading.Thread(
-        target=lambda: view(scene, browser=False, ready=started, cameras=cameras, **words), daemon=True
-    )
-    thread.start()
-    assert event.wait(60)
-    try:
-        yield ready[0].address(PAGE)
-    finally:
-        ready[0].stop()
-        thread.join(20)
 
 
 def go(tab: Browser, address: str, width: int = 480, height: int = 360, dark: bool = False) -> None:
@@ -99,16 +35,6 @@ def go(tab: Browser, address: str, width: int = 480, height: int = 360, dark: bo
     tab.send("Page.navigate", url=address)
     tab.wait("Page.loadEventFired")
     until(tab, "globalThis.viewer && viewer.stats.wholeMs > 0 && viewer.stats.firstMs > 0")
-
-
-def picture(tab: Browser, pose: int, width: int, height: int) -> np.ndarray:
-    text = tab.run(
-        f"(async () => {{ viewer.setPose({pose}); const blob = await viewer.picture({width}, {height});"
-        "const reader = new FileReader(); reader.readAsDataURL(blob);"
-        "await new Promise((done) => (reader.onload = done)); return reader.result; })()"
-    )
-    data = base64.b64decode(text.partition(",")[2])
-    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), np.float64)
 
 
 @pytest.mark.parametrize(
