@@ -194,6 +194,14 @@ def means(target: Target) -> Target:
     return promised(mean_alone(target), _ssim_parts(target))
 
 
+def excesses(target: Target, size: int, measurement: Measurement) -> list[float]:
+    """The excess of a target by itself, then those of the parts of the promise that were measured."""
+    own = mean_alone(target).excess(size, measurement)
+    parts = target.parts if isinstance(target, Promised) else ()
+    found = (part.excess(measurement) for part in parts)
+    return [own, *(excess for excess in found if excess is not None)]
+
+
 def bounds_ssim(target: Target) -> bool:
     """Whether SSIM is among the parts of the promise."""
     return bool(_ssim_parts(target))

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.goals.line import AIM, next_point
-from flexgs_edge.goals.promise import bounds_ssim, means
+from flexgs_edge.goals.promise import bounds_ssim, excesses, means
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
@@ -398,7 +398,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         """The best of a result and what is left of it when the cheapest Gaussians go until `goal` hardly holds."""
         best = chosen, grid
 
-        def attempt(smaller: GridScene) -> float:
+        def attempt(smaller: GridScene) -> list[float]:
             nonlocal best
             started = time.perf_counter()
             mended = self._with_constants(smaller) if self.refit else smaller
@@ -409,13 +409,13 @@ class GridSearch(MultiplierSearch[GridScene]):
                 self.on_step(step)
             if better(step, best[0], target):
                 best = step, mended
-            return goal.excess(size, step.measurement)
+            return excesses(goal, size, step.measurement)
 
         known = next((removal for made, removal in self._removal if made is grid), None)
         try:
             if known is not None:
-                excess = goal.excess(chosen.size, chosen.measurement)
-                land_on_quality(grid, known, excess, attempt, self.rounds.storage, descended=self.steps > 0)
+                found = excesses(goal, chosen.size, chosen.measurement)
+                land_on_quality(grid, known, found, attempt, self.rounds.storage, descended=self.steps > 0)
         except KeyboardInterrupt:
             if not self.keeps_best:
                 raise

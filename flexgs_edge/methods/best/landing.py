@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -78,8 +78,8 @@ def land(
 def land_on_quality(
     grid: GridScene,
     removal: np.ndarray,
-    excess: float,
-    attempt: Callable[[GridScene], float],
+    excesses: Sequence[float],
+    attempt: Callable[[GridScene], Sequence[float]],
     storage: Storage,
     descended: bool = False,
 ) -> None:
@@ -91,32 +91,39 @@ def land_on_quality(
         The result, which holds.
     removal : np.ndarray
         [n] f64, cost of the removal of each of its rows, infinite for those that must stay.
-    excess : float
-        Log of its loss over what is allowed, below 0.
+    excesses : sequence of float
+        Log of its loss over what is allowed, for each bound of the promise; all below 0.
     attempt : callable
-        Makes and measures the result of a grid, and returns its excess.
+        Makes and measures the result of a grid, and returns its excesses.
     storage : Storage
         Holds the grids.
     descended : bool
         The result comes from a descent.
     """
     cheapest = np.argsort(removal, kind="stable")
-    within, beyond, aim = (0, excess), _beyond(removal), -NEAR_QUALITY / 2
-    each = 1 / ((DESCENDED_SHARE if descended else SHARE) * grid.count)
-    for number in range(QUALITY_TRIES + 1 if excess < -NEAR_QUALITY else 0):
-        if number == QUALITY_TRIES and within[0]:
+    least, beyond, aim = 0, _beyond(removal), -NEAR_QUALITY / 2
+    known = np.asarray(excesses)
+    usual = (DESCENDED_SHARE if descended else SHARE) * grid.count
+    stride = (aim - known.max()) * usual
+    for number in range(QUALITY_TRIES + 1 if known.max() < -NEAR_QUALITY else 0):
+        if number == QUALITY_TRIES and least:
             return
-        count = min(within[0] + round((aim - within[1]) / each), beyond - 1)
-        if count <= within[0]:
+        count = min(least + round(stride), beyond - 1)
+        if count <= least:
             return
-        found = attempt(grid.take(_along_curve(grid.position, np.sort(cheapest[count:])), storage))
-        each = (found - within[1]) / (count - within[0])
-        if found <= 0.0:
-            within = count, found
-            if found >= -NEAR_QUALITY or each <= 0.0:
+        found = np.asarray(attempt(grid.take(_along_curve(grid.position, np.sort(cheapest[count:])), storage)))
+        rises = (found - known) / (count - least)
+        if found.max() <= 0.0:
+            least, known = count, found
+            if found.max() >= -NEAR_QUALITY:
                 return
         else:
             beyond = count
+        rising = rises > 0.0
+        if not rising.any():
+            return
+        # Bounds rise at paces of their own, and the worst view may fall for once. No bound is taken to rise by less than half.
+        stride = min(((aim - known) / np.maximum(rises, 0.5 / usual))[rising])
 
 
 def _beyond(removal: np.ndarray) -> int:

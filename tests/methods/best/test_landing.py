@@ -94,44 +94,57 @@ def test_lands_just_below_a_quality(grid: GridScene, excess: float, power: float
     removal = np.random.default_rng(1).random(COUNT)
     seen: list[tuple[int, float]] = []
 
-    def attempt(smaller: GridScene) -> float:
+    def attempt(smaller: GridScene) -> list[float]:
         gone = COUNT - smaller.count
         seen.append((gone, excess + 3 * (gone / COUNT) ** power))
-        return seen[-1][1]
+        return [seen[-1][1]]
 
-    land_on_quality(grid, removal, excess, attempt, IN_MEMORY)
+    land_on_quality(grid, removal, [excess], attempt, IN_MEMORY)
     best = max((found for _, found in seen if found <= 0.0), default=excess)
     missed = all(found > 0.0 for _, found in seen[:QUALITY_TRIES])
     assert len(seen) <= QUALITY_TRIES + missed and len({gone for gone, _ in seen}) == len(seen)
     assert best >= min(0.9 * excess, -NEAR_QUALITY) and (power != 1.0 or best >= -NEAR_QUALITY)
 
 
+def test_each_bound_rises_at_its_own_pace(grid: GridScene) -> None:
+    """The first bound binds at the beginning and falls by chance; the second one decides in the end."""
+    seen: list[tuple[float, float]] = []
+
+    def attempt(smaller: GridScene) -> list[float]:
+        gone = (COUNT - smaller.count) / COUNT
+        seen.append((-0.1 - gone, -0.2 + 3 * gone))
+        return [*seen[-1]]
+
+    land_on_quality(grid, np.random.default_rng(1).random(COUNT), [-0.1, -0.2], attempt, IN_MEMORY)
+    assert len(seen) == 2 and -NEAR_QUALITY <= seen[-1][1] <= 0.0
+
+
 def test_fewer_go_behind_a_descent(grid: GridScene) -> None:
     asked: list[int] = []
 
-    def attempt(smaller: GridScene) -> float:
+    def attempt(smaller: GridScene) -> list[float]:
         asked.append(COUNT - smaller.count)
-        return -0.001
+        return [-0.001]
 
     for descended in (False, True):
-        land_on_quality(grid, np.zeros(COUNT), -0.11, attempt, IN_MEMORY, descended)
+        land_on_quality(grid, np.zeros(COUNT), [-0.11], attempt, IN_MEMORY, descended)
     assert asked == [round(0.1 * share * COUNT) for share in (SHARE, DESCENDED_SHARE)]
 
 
 def test_a_quality_that_is_met_is_left_alone(grid: GridScene) -> None:
-    land_on_quality(grid, np.zeros(COUNT), -0.5 * NEAR_QUALITY, lambda _: pytest.fail("no need"), IN_MEMORY)
+    land_on_quality(grid, np.zeros(COUNT), [-0.5 * NEAR_QUALITY], lambda _: pytest.fail("no need"), IN_MEMORY)
 
 
 def test_removals_that_gain_quality_end_it(grid: GridScene) -> None:
     asked: list[int] = []
 
-    def attempt(smaller: GridScene) -> float:
+    def attempt(smaller: GridScene) -> list[float]:
         asked.append(smaller.count)
-        return -0.2
+        return [-0.2]
 
-    land_on_quality(grid, np.zeros(COUNT), -0.1, attempt, IN_MEMORY)
+    land_on_quality(grid, np.zeros(COUNT), [-0.1], attempt, IN_MEMORY)
     assert len(asked) == 1
-    land_on_quality(grid.take(np.arange(1)), np.zeros(1), -0.1, attempt, IN_MEMORY)
+    land_on_quality(grid.take(np.arange(1)), np.zeros(1), [-0.1], attempt, IN_MEMORY)
     assert len(asked) == 1
 
 
@@ -140,11 +153,11 @@ def test_rows_that_must_stay(grid: GridScene) -> None:
     removal = np.where(np.arange(COUNT) < 30, np.random.default_rng(1).random(COUNT), np.inf)
     counts: list[int] = []
 
-    def attempt(smaller: GridScene) -> float:
+    def attempt(smaller: GridScene) -> list[float]:
         counts.append(smaller.count)
-        return -0.15 + 1e-6 * (COUNT - smaller.count)
+        return [-0.15 + 1e-6 * (COUNT - smaller.count)]
 
-    land_on_quality(grid, removal, -0.2, attempt, IN_MEMORY)
+    land_on_quality(grid, removal, [-0.2], attempt, IN_MEMORY)
     assert counts and min(counts) == COUNT - 30
     found, size, _ = landed(grid, 0.97, removal)
     assert found is grid and size == size_of(grid)
