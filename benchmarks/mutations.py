@@ -109,7 +109,7 @@ def constant(name: str, literal: str, words: str) -> Mutation:
 MUTATIONS = (
     Mutation("sign of the conic's B", "project.cl", "out[3] = -(b + b) * k", "out[3] = (b + b) * k"),
     Mutation("sign of the span's slope", "project.cl", "out[11] = b * ic", "out[11] = -b * ic"),
-    Mutation("sign of where the ellipse turns", "project.cl", "out[9] = (b / a)", "out[9] = -(b / a)"),
+    Mutation("sign of where the ellipse turns", "project.cl", "out[9] = quotient(b, a)", "out[9] = -quotient(b, a)"),
     Mutation("half width from the wrong axis", "project.cl", "half_width = sqrt(t2 * a)", "half_width = sqrt(t2 * c)"),
     constant("DILATION", "0.0f", "no +0.3"),
     constant("DILATION", "0.25f", "+0.25 for +0.3"),
@@ -148,7 +148,7 @@ MUTATIONS = (
     Mutation(
         "quaternions not normalised",
         "activate.cl",
-        "inv = (FW)1.0f / sqrt(fma(z, z, fma(y, y, fma(x, x, w * w))))",
+        "inv = quotient((FW)1.0f, sqrt(fma(z, z, fma(y, y, fma(x, x, w * w)))))",
         "inv = (FW)1.0f",
     ),
     Mutation("opacity not compensated", "project.cl", "level = fma((FW)0.5f, flog2(", "level = fma((FW)0.0f, flog2("),
@@ -224,7 +224,7 @@ MUTATIONS = (
     ),
     backward(
         "descent without Adam's correction",
-        "whole_first = (FW)1.0f / ((FW)1.0f - power_first)",
+        "whole_first = quotient((FW)1.0f, (FW)1.0f - power_first)",
         "whole_first = (FW)1.0f",
         reference=False,
     ),

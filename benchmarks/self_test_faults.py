@@ -23,6 +23,8 @@ _OPERATOR = re.compile(
 )
 _START = re.compile(r"^(?:__kernel|inline|#define FOR_EACH\w+\()", re.MULTILINE)
 _NAME = re.compile(r"(\w+)\s*\(")
+WRITTEN = {"written_fma": ("fma",), "quotient": ("div",), "written_root": ("div",)}
+"""Forms of what is written out for some devices."""
 SECONDS = 240
 """Time for one fault. A loop that does not end is refused too."""
 
@@ -118,7 +120,7 @@ def forms_of(fault: Fault) -> tuple[str, ...]:
     """Forms whose program has the file."""
     if fault.file.startswith("blend_"):
         return ("gpu4", "gpu") if fault.file == "blend_gpu.cl" else ("w16", "w1", "w4")
-    return ("fma",) if fault.function == "written_fma" else ("w16", "gpu", "w4")
+    return WRITTEN.get(fault.function, ("w16", "gpu", "w4"))
 
 
 def judge_all(chosen: list[Fault], place: Path, workers: int, verbose: bool) -> list[tuple[Fault, str, str]]:

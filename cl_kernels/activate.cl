@@ -20,11 +20,11 @@ __kernel void activate(
   FW y = LOADF(quats, 2 * (size_t)stride + i), z = LOADF(quats, 3 * (size_t)stride + i);
   // Divide by the largest component first, since squares of tiny or huge quaternions would leave float32's range.
   FW big = fmax(fmax(fabs(w), fabs(x)), fmax(fabs(y), fabs(z)));
-  w = w / big;
-  x = x / big;
-  y = y / big;
-  z = z / big;
-  FW inv = (FW)1.0f / sqrt(fma(z, z, fma(y, y, fma(x, x, w * w))));
+  w = quotient(w, big);
+  x = quotient(x, big);
+  y = quotient(y, big);
+  z = quotient(z, big);
+  FW inv = quotient((FW)1.0f, sqrt(fma(z, z, fma(y, y, fma(x, x, w * w)))));
   w = w * inv;
   x = x * inv;
   y = y * inv;
@@ -44,7 +44,7 @@ __kernel void activate(
   if (antialiased) {
     // Modified Gram-Schmidt on the rows: the factor is that of a matrix within a few ulp of M, whatever its rank. A row of length
     // zero has no direction to subtract. The limit is far above the numbers that some devices flush to zero.
-    FW inv0 = pick(MASK(xx > (FW)FACTOR_MIN), (FW)1.0f / sqrt(xx), (FW)0.0f);
+    FW inv0 = pick(MASK(xx > (FW)FACTOR_MIN), quotient((FW)1.0f, sqrt(xx)), (FW)0.0f);
     FW ux = m00 * inv0, uy = m01 * inv0, uz = m02 * inv0;
     xx = sqrt(xx);
     xy = dot3(m10, m11, m12, ux, uy, uz);
@@ -52,7 +52,7 @@ __kernel void activate(
     m10 = fma(-xy, ux, m10), m11 = fma(-xy, uy, m11), m12 = fma(-xy, uz, m12);
     m20 = fma(-xz, ux, m20), m21 = fma(-xz, uy, m21), m22 = fma(-xz, uz, m22);
     yy = dot3(m10, m11, m12, m10, m11, m12);
-    FW inv1 = pick(MASK(yy > (FW)FACTOR_MIN), (FW)1.0f / sqrt(yy), (FW)0.0f);
+    FW inv1 = pick(MASK(yy > (FW)FACTOR_MIN), quotient((FW)1.0f, sqrt(yy)), (FW)0.0f);
     ux = m10 * inv1, uy = m11 * inv1, uz = m12 * inv1;
     yy = sqrt(yy);
     yz = dot3(m20, m21, m22, ux, uy, uz);
@@ -72,7 +72,7 @@ __kernel void activate(
   STOREF(yz, cov, 4 * (size_t)stride + i);
   STOREF(zz, cov, 5 * (size_t)stride + i);
 
-  FW opacity = (FW)1.0f / ((FW)1.0f + fexp2(LOADF(logits, i) * (FW)-LOG2_E));
+  FW opacity = quotient((FW)1.0f, (FW)1.0f + fexp2(LOADF(logits, i) * (FW)-LOG2_E));
   FW level = flog2(fmax(opacity, (FW)ALPHA_MIN));
   STOREF(pick(MASK(opacity >= (FW)ALPHA_MIN), level, (FW)-INFINITY), log2_opacity, i);
 }

@@ -77,7 +77,7 @@ __kernel void project_backward(
   // Colours: the constant, SH, and the direction on which SH depend.
   const FW px = LOADF(means, i), py = LOADF(means, s + i), pz = LOADF(means, 2 * s + i);
   FW dx = px - CAM(21), dy = py - CAM(22), dz = pz - CAM(23);
-  const FW norm = (FW)1.0f / sqrt(dot3(dx, dy, dz, dx, dy, dz));
+  const FW norm = quotient((FW)1.0f, sqrt(dot3(dx, dy, dz, dx, dy, dz)));
   dx = dx * norm;
   dy = dy * norm;
   dz = dz * norm;
@@ -120,11 +120,11 @@ __kernel void project_backward(
   const FW s2 = fexp2(LOADF(log_scales, 2 * s + i) * (FW)LOG2_E);
   FW qw = LOADF(quats, i), qx = LOADF(quats, s + i), qy = LOADF(quats, 2 * s + i), qz = LOADF(quats, 3 * s + i);
   const FW big = fmax(fmax(fabs(qw), fabs(qx)), fmax(fabs(qy), fabs(qz)));
-  qw = qw / big;
-  qx = qx / big;
-  qy = qy / big;
-  qz = qz / big;
-  const FW inv = (FW)1.0f / sqrt(fma(qz, qz, fma(qy, qy, fma(qx, qx, qw * qw))));
+  qw = quotient(qw, big);
+  qx = quotient(qx, big);
+  qy = quotient(qy, big);
+  qz = quotient(qz, big);
+  const FW inv = quotient((FW)1.0f, sqrt(fma(qz, qz, fma(qy, qy, fma(qx, qx, qw * qw)))));
   qw = qw * inv;
   qx = qx * inv;
   qy = qy * inv;
@@ -138,10 +138,10 @@ __kernel void project_backward(
   const FW z = fma(CAM(8), pz, fma(CAM(6), px, CAM(7) * py)) + CAM(11);
   const FW x = fma(CAM(2), pz, fma(CAM(0), px, CAM(1) * py)) + CAM(9);
   const FW y = fma(CAM(5), pz, fma(CAM(3), px, CAM(4) * py)) + CAM(10);
-  const FW iz = (FW)1.0f / z, u = x * iz, v = y * iz;
+  const FW iz = quotient((FW)1.0f, z), u = x * iz, v = y * iz;
   // A turn or growth of a splat that fills the view changes all of it, so it goes in smaller steps.
   const FW size = larger(larger(s0, s1), s2) * iz;
-  STOREF(pick(seen, pick(MASK(size > (FW)wide), (FW)wide / size, (FW)1.0f), (FW)0.0f), pace, i);
+  STOREF(pick(seen, pick(MASK(size > (FW)wide), quotient((FW)wide, size), (FW)1.0f), (FW)0.0f), pace, i);
   const FW uc = fmin(fmax(u, CAM(17)), CAM(18)), vc = fmin(fmax(v, CAM(19)), CAM(20));
   const FW j00 = CAM(12) * iz, j02 = -(j00 * uc), j11 = CAM(13) * iz, j12 = -(j11 * vc);
   const FW t00 = fma(j02, CAM(6), j00 * CAM(0)), t01 = fma(j02, CAM(7), j00 * CAM(1)), t02 = fma(j02, CAM(8), j00 * CAM(2));
@@ -163,7 +163,7 @@ __kernel void project_backward(
     // log of the opacity's factor: half the difference of the logs of the areas before and after the dilation.
     const FW nx = fma(g01, g12, -(g02 * g11)), ny = fma(g02, g10, -(g00 * g12)), nz = fma(g00, g11, -(g01 * g10));
     const FW before = dot3(nx, ny, nz, nx, ny, nz);
-    const FW share = pick(MASK(before > (FW)FACTOR_MIN), slope / before, (FW)0.0f);
+    const FW share = pick(MASK(before > (FW)FACTOR_MIN), quotient(slope, before), (FW)0.0f);
     v00 = fma(share, fma(g11, nz, -(g12 * ny)), fma(-slope, fma(ca, g00, cb * g10), v00));
     v01 = fma(share, fma(g12, nx, -(g10 * nz)), fma(-slope, fma(ca, g01, cb * g11), v01));
     v02 = fma(share, fma(g10, ny, -(g11 * nx)), fma(-slope, fma(ca, g02, cb * g12), v02));
@@ -180,13 +180,13 @@ __kernel void project_backward(
   const FW turn_x = fma(h02, v01, h12 * v11) - fma(h01, v02, h11 * v12);
   const FW turn_y = fma(h00, v02, h10 * v12) - fma(h02, v00, h12 * v10);
   const FW turn_z = fma(h01, v00, h11 * v10) - fma(h00, v01, h10 * v11);
-  const FW twice = (FW)2.0f * (inv / big);
+  const FW twice = (FW)2.0f * quotient(inv, big);
   KEEP(AT_QUAT, -(twice * dot3(qx, qy, qz, turn_x, turn_y, turn_z)));
   KEEP(AT_QUAT + 1, twice * dot3(qw, qy, -qz, turn_x, turn_z, turn_y));
   KEEP(AT_QUAT + 2, twice * dot3(qw, qz, -qx, turn_y, turn_x, turn_z));
   KEEP(AT_QUAT + 3, twice * dot3(qw, qx, -qy, turn_z, turn_y, turn_x));
 
-  const FW opacity = (FW)1.0f / ((FW)1.0f + fexp2(LOADF(logits, i) * (FW)-LOG2_E));
+  const FW opacity = quotient((FW)1.0f, (FW)1.0f + fexp2(LOADF(logits, i) * (FW)-LOG2_E));
   KEEP(AT_LOGIT, slope * ((FW)1.0f - opacity));
 
   // From the projection's rows to camera space: through the centre, and through the Jacobian unless it is clamped.
@@ -206,7 +206,7 @@ __kernel void project_backward(
 }
 
 // What a bit-priced value adds to its gradient: the price times its sign, less within a width of zero.
-inline FW pull(FW away, float price, float width) { return (FW)price * away / (fabs(away) + (FW)width); }
+inline FW pull(FW away, float price, float width) { return quotient((FW)price * away, fabs(away) + (FW)width); }
 
 #define ADD(plane, value)                                                                            \
   {                                                                                                  \
@@ -281,7 +281,7 @@ __kernel void adam(
   const FW power_second = pick(seen, old_second * (FW)decay_second, old_second);
   STOREF(power_first, powers, i);
   STOREF(power_second, powers, s + i);
-  const FW whole_first = (FW)1.0f / ((FW)1.0f - power_first), whole_second = (FW)1.0f / ((FW)1.0f - power_second);
+  const FW whole_first = quotient((FW)1.0f, (FW)1.0f - power_first), whole_second = quotient((FW)1.0f, (FW)1.0f - power_second);
   for (size_t k = 0; k < planes; ++k) {
     const size_t at = k * s + i;
     const FW raw = LOADF(gradient, at), m = LOADF(first, at), v = LOADF(second, at);
@@ -290,7 +290,7 @@ __kernel void adam(
     mean = pick(MASK(fabs(mean) >= (FW)GRADIENT_MIN), mean, (FW)0.0f);
     FW square = fma((FW)decay_second, v, (FW)(1.0f - decay_second) * (g * g));
     square = pick(MASK(square >= (FW)(GRADIENT_MIN * GRADIENT_MIN)), square, (FW)0.0f);
-    const FW step = (mean * whole_first) / (sqrt(square * whole_second) + (FW)GRADIENT_MIN);
+    const FW step = quotient(mean * whole_first, sqrt(square * whole_second) + (FW)GRADIENT_MIN);
     STOREF(pick(seen, mean, m), first, at);
     STOREF(pick(seen, square, v), second, at);
     const FW value = LOADF(values, at);
@@ -314,7 +314,7 @@ __kernel void follow(
 }
 
 // Rounds a value to the nearest multiple of a step; a step of 0 leaves it as it is.
-inline FW on_grid(FW value, float step) { return step > 0.0f ? rint(value / (FW)step) * (FW)step : value; }
+inline FW on_grid(FW value, float step) { return step > 0.0f ? rint(quotient(value, (FW)step)) * (FW)step : value; }
 
 // Writes the values that a file of these steps would decode to (flexgs_edge.grid.values.from_grid) into the planes that views draw.
 __kernel void snap(
@@ -338,7 +338,7 @@ __kernel void snap(
   }
   FW w = VALUE(AT_QUAT), x = VALUE(AT_QUAT + 1), y = VALUE(AT_QUAT + 2), z = VALUE(AT_QUAT + 3);
   if (steps[2] > 0.0f) {
-    FW inv = (FW)1.0f / sqrt(fma(z, z, fma(y, y, fma(x, x, w * w))));
+    FW inv = quotient((FW)1.0f, sqrt(fma(z, z, fma(y, y, fma(x, x, w * w)))));
     inv = pick(MASK(w < (FW)0.0f), -inv, inv);
     x = on_grid(x * inv, steps[2]);
     y = on_grid(y * inv, steps[2]);

@@ -238,7 +238,7 @@ __kernel void BLEND(
 #if STATS == 2 || STATS == 4
         // The change of the pixel without this splat: its own light goes, and the light behind it gets brighter. Written as one
         // product, which takes fewer operations than the plain form, and is as exact where nearly all of the light has come.
-        const FW ratio = weight / trans[k];
+        const FW ratio = quotient(weight, trans[k]);
         const FW er = fma(cr, trans[k], red[k] - whole_r[k]), eg = fma(cg, trans[k], green[k] - whole_g[k]);
         const FW eb = fma(cbl, trans[k], blue[k] - whole_b[k]);
         errors[v] += ratio * ratio * fma(eb, eb, fma(eg, eg, er * er));
@@ -247,7 +247,7 @@ __kernel void BLEND(
         // That light times the residual is the gradient of the exponent, unless alpha is capped. Its moments about the splat's
         // centre are the gradients of the centre and of the conic.
         const FW own_light = fma(cbl, rest_b[k], fma(cg, rest_g[k], cr * rest_r[k]));
-        const FW light = (weight / trans[k]) * fma(own_light, before, -red[k]);
+        const FW light = quotient(weight, trans[k]) * fma(own_light, before, -red[k]);
         red[k] = fma(-weight, own_light, red[k]);
         const FW slope = pick(MASK(alpha < (FW)ALPHA_MAX), light, (FW)0.0f), slope_x = slope * dx, slope_y = slope * dy;
         errors[v] += slope;

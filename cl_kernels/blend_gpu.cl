@@ -155,13 +155,13 @@ __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void BLEND(
 #if STATS
       const uint turn = n % TOGETHER;
 #if STATS == 2 || STATS == 4
-      const FW ratio = weight / t;
+      const FW ratio = quotient(weight, t);
       const FW er = fma((FW)splats[n][6], t, red - whole_r), eg = fma((FW)splats[n][7], t, green - whole_g);
       const FW eb = fma((FW)splats[n][8], t, blue - whole_b);
       const FW error = ratio * ratio * fma(eb, eb, fma(eg, eg, er * er));
 #elif STATS == 5
       const FW own_light = fma((FW)splats[n][8], rest_b, fma((FW)splats[n][7], rest_g, (FW)splats[n][6] * rest_r));
-      const FW light = (weight / t) * fma(own_light, before, -red);
+      const FW light = quotient(weight, t) * fma(own_light, before, -red);
       red = fma(-weight, own_light, red);
       const FW error = pick(MASK(alpha < (FW)ALPHA_MAX), light, (FW)0.0f);   // gradient of the exponent
 #endif

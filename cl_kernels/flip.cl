@@ -22,8 +22,8 @@ __kernel void flip_colours(
   FW line[3];
   for (int c = 0; c < 3; ++c) {
     const FW s = LOADF(planes + (size_t)c * plane, i);
-    const FW curve = flip_power((s + (FW)0.055f) / (FW)1.055f, (FW)2.4f);
-    line[c] = pick(MASK(s > (FW)0.04045f), curve, s / (FW)12.92f);
+    const FW curve = flip_power(quotient(s + (FW)0.055f, (FW)1.055f), (FW)2.4f);
+    line[c] = pick(MASK(s > (FW)0.04045f), curve, quotient(s, (FW)12.92f));
   }
   const FW x = flip_mix(line[0], line[1], line[2], FLIP_XYZ_0, FLIP_XYZ_1, FLIP_XYZ_2);
   const FW y = flip_mix(line[0], line[1], line[2], FLIP_XYZ_3, FLIP_XYZ_4, FLIP_XYZ_5);
@@ -79,7 +79,7 @@ __kernel void flip_columns(
 inline FW flip_curve(FW t) {
   const FW edge = (FW)(6.0f / 29.0f);
   const FW root = flip_power(t, (FW)(1.0f / 3.0f));
-  return pick(MASK(t > edge * edge * edge), root, t / ((FW)3.0f * edge * edge) + (FW)(4.0f / 29.0f));
+  return pick(MASK(t > edge * edge * edge), root, quotient(t, (FW)3.0f * edge * edge) + (FW)(4.0f / 29.0f));
 }
 
 // Filters along the rows too. What is compared later: L, a and b of the filtered colour, strength of edges and of points.
@@ -136,8 +136,8 @@ __kernel void flip_pair(
   for (int c = 0; c < 5; ++c) away[c] = LOADF(one + (size_t)c * count, i) - LOADF(two + (size_t)c * count, i);
   const FW colour = fabs(away[0]) + sqrt(away[1] * away[1] + away[2] * away[2]);
   const FW power = flip_power(colour, (FW)FLIP_COLOUR_POWER), knee = (FW)FLIP_KNEE, share = (FW)FLIP_KNEE_SHARE;
-  const FW above = share + (power - knee) / ((FW)FLIP_COLOUR_MOST - knee) * ((FW)1.0f - share);
-  const FW of_colour = pick(MASK(power < knee), share / knee * power, above);
+  const FW above = share + quotient(power - knee, (FW)FLIP_COLOUR_MOST - knee) * ((FW)1.0f - share);
+  const FW of_colour = pick(MASK(power < knee), quotient(share, knee) * power, above);
   const FW of_feature = sqrt(larger(fabs(away[3]), fabs(away[4])) * (FW)0.70710678f);
   STOREF(flip_power(of_colour, (FW)1.0f - of_feature), flip, i);
 }

@@ -39,7 +39,7 @@ __kernel void project(
 
   FW x = fma(CAM(2), pz, fma(CAM(0), px, CAM(1) * py)) + CAM(9);
   FW y = fma(CAM(5), pz, fma(CAM(3), px, CAM(4) * py)) + CAM(10);
-  FW iz = (FW)1.0f / z;
+  FW iz = quotient((FW)1.0f, z);
   FW u = x * iz, v = y * iz;
   FW mx = fma(CAM(12), u, CAM(14)), my = fma(CAM(13), v, CAM(15));
   FW uc = smaller(larger(u, CAM(17)), CAM(18)), vc = smaller(larger(v, CAM(19)), CAM(20));
@@ -64,7 +64,7 @@ __kernel void project(
     det = before + fma(a + c, CAM(26), CAM(26) * CAM(26));
     a += CAM(26);
     c += CAM(26);
-    FW share = before / det;  // at most 1: the sum above rounds to at least `before`
+    FW share = quotient(before, det);  // at most 1: the sum above rounds to at least `before`
     shown &= MASK(share >= (FW)SHARE_MIN);
     level = fma((FW)0.5f, flog2(larger(share, (FW)SHARE_MIN)), level);
     shown &= MASK(level >= (FW)-(LOG2_255 + EXTENT_SLACK));
@@ -100,7 +100,7 @@ __kernel void project(
   shown &= MASK(mx + reach_x >= (FW)-1.0f) & MASK(mx - reach_x <= width);
   shown &= MASK(my + reach_y >= (FW)-1.0f) & MASK(my - reach_y <= height);
 
-  FW inv = (FW)1.0f / det;
+  FW inv = quotient((FW)1.0f, det);
   FW k = inv * (FW)(0.5f * LOG2_E);  // exponents are powers of two
   FW out[16];
   out[0] = mx;
@@ -110,8 +110,8 @@ __kernel void project(
   out[4] = a * k;
   out[5] = level;
   // Numbers for the tile lists: x of the ellipse's right end, its half height, axis slope b/c, 1/c, det/c and level.
-  FW ic = (FW)1.0f / c;
-  out[9] = (b / a) * half_width;
+  FW ic = quotient((FW)1.0f, c);
+  out[9] = quotient(b, a) * half_width;
   out[10] = half_height;
   out[11] = b * ic;
   out[12] = ic;

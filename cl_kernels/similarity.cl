@@ -45,8 +45,8 @@ __kernel void ssim_rows(
     for (int k = 0; k < SSIM_WINDOW; ++k) m[c] = m[c] + (FW)taps[k] * LOADF(from, k);
   }
   const FW ab = m[0] * m[1], aa = m[0] * m[0], bb = m[1] * m[1];
-  const FW light = ((FW)2.0f * ab + (FW)SSIM_C1) / (aa + bb + (FW)SSIM_C1);
-  const FW both = ((FW)2.0f * (m[4] - ab) + (FW)SSIM_C2) / ((m[2] - aa) + (m[3] - bb) + (FW)SSIM_C2);
+  const FW light = quotient((FW)2.0f * ab + (FW)SSIM_C1, aa + bb + (FW)SSIM_C1);
+  const FW both = quotient((FW)2.0f * (m[4] - ab) + (FW)SSIM_C2, (m[2] - aa) + (m[3] - bb) + (FW)SSIM_C2);
   STOREF(light * both, similar, i);
 }
 
@@ -118,14 +118,14 @@ __kernel void dssim_slopes(
   }
   const FW ab = m[0] * m[1], aa = m[0] * m[0], bb = m[1] * m[1];
   const FW means = aa + bb + (FW)SSIM_C1, variances = (m[2] - aa) + (m[3] - bb) + (FW)SSIM_C2;
-  const FW light = ((FW)2.0f * ab + (FW)SSIM_C1) / means;
-  const FW both = ((FW)2.0f * (m[4] - ab) + (FW)SSIM_C2) / variances;
-  const FW by_mean = both * (m[1] - light * m[0]) / means + light * (both * m[0] - m[1]) / variances;
+  const FW light = quotient((FW)2.0f * ab + (FW)SSIM_C1, means);
+  const FW both = quotient((FW)2.0f * (m[4] - ab) + (FW)SSIM_C2, variances);
+  const FW by_mean = quotient(both * (m[1] - light * m[0]), means) + quotient(light * (both * m[0] - m[1]), variances);
   const IW inside = MASK((IW)(int)(i % stride) + LANE_INDEX < (IW)(int)columns);
   __global float *to = slopes + i + (size_t)(size - 1) * (stride + 1);
   STOREF(pick(inside, (FW)2.0f * by_mean, (FW)0.0f), to, 0);
-  STOREF(pick(inside, -(light * both / variances), (FW)0.0f), to, wide);
-  STOREF(pick(inside, (FW)2.0f * light / variances, (FW)0.0f), to, 2 * (size_t)wide);
+  STOREF(pick(inside, -quotient(light * both, variances), (FW)0.0f), to, wide);
+  STOREF(pick(inside, quotient((FW)2.0f * light, variances), (FW)0.0f), to, 2 * (size_t)wide);
 }
 
 // The slopes summed along the columns, over all windows that hold a pixel.

@@ -1,5 +1,5 @@
 // Tile lists in depth order: the splats that may show in each tile, and in which of its sixteen 4x4 blocks.
-// It is a counting sort by tile; a work-item walks one contiguous block of the depth-ordered splats.
+// It is a counting sort by tile. The depth-ordered splats are cut into blocks. On CPUs a work-item walks a block, on GPUs a work-group does.
 // Twins: flexgs_edge.kernels.twins.tiles
 
 #define BANDS 16   // block rows (4 pixels high) worked on at a time: four rows of tiles
@@ -78,7 +78,7 @@ inline int tile_row(float y, float height) {
   }
 
 inline void splat_range(uint from, uint count, uint *start, uint *end) {
-  const uint blocks = get_global_size(0), block = get_global_id(0);
+  const uint blocks = get_num_groups(0), block = get_group_id(0);
   *start = from + (uint)((ulong)count * block / blocks);
   *end = from + (uint)((ulong)count * (block + 1) / blocks);
 }
@@ -94,17 +94,23 @@ __kernel void tile_room(
   uint start, end, sum = 0;
   splat_range(from, count, &start, &end);
   for (uint n = start; n < end; ++n) sum += bounds[ids[n]];
-  room[get_global_id(0)] = sum;
+  room[get_group_id(0)] = sum;
 }
 
 inline size_t draft_start(__global const uint *room) {
   size_t start = 0;
-  for (uint block = 0; block < get_global_id(0); ++block) start += room[block];
+  for (uint block = 0; block < get_group_id(0); ++block) start += room[block];
   return start;
 }
 
-// Computes the spans, once; `tile_scatter` then only moves the drafts.
-__kernel void tile_count(
+#ifdef GROUP
+#define LISTERS __attribute__((reqd_work_group_size(LIST_GROUP, 1, 1)))
+#else
+#define LISTERS
+#endif
+
+// Computes the spans, and drafts of the pairs; `tile_scatter` then only moves the drafts.
+__kernel LISTERS void tile_count(
     const uint from,
     const uint count,
     const float width,                // pixels
@@ -117,32 +123,89 @@ __kernel void tile_count(
     __global uint *counts)            // [blocks, tiles]
 {
   const int tiles_x = ((int)width + TILE - 1) / TILE, tiles_y = ((int)height + TILE - 1) / TILE;
-  __global uint *own = counts + get_global_id(0) * (size_t)(tiles_x * tiles_y);
+  __global uint *own = counts + get_group_id(0) * (size_t)(tiles_x * tiles_y);
   __global uint *const first_draft = drafts + 3 * draft_start(room);
   __global uint *draft = first_draft;
   uint start, end;
   splat_range(from, count, &start, &end);
+#ifdef GROUP
+  // Each work-item has one splat of LIST_GROUP: it counts its tiles, and drafts them behind those of the splats before.
+  __local uint found[LIST_GROUP];
+  const uint p = get_local_id(0);
+  for (int tile = (int)p; tile < tiles_x * tiles_y; tile += LIST_GROUP) own[tile] = 0;
+  barrier(CLK_GLOBAL_MEM_FENCE);
+  uint drafted = 0;
+#define COUNT_PAIR(tile, mask) (mine += 1, atomic_add(own + (tile), 1u))
+#define DRAFT_PAIR(tile, mask) (vstore3((uint3)(ids[n], (uint)(tile), mask), 0, draft), draft += 3)
+  for (uint first = start; first < end; first += LIST_GROUP) {
+    const uint n = first + p;
+    uint mine = 0, before = 0, all = 0;
+    if (n < end) {
+      FOR_EACH_TILE(COUNT_PAIR)
+    }
+    found[p] = mine;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint q = 0; q < LIST_GROUP; ++q) {
+      before += q < p ? found[q] : 0u;
+      all += found[q];
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    draft = first_draft + 3 * (size_t)(drafted + before);
+    if (n < end) {
+      FOR_EACH_TILE(DRAFT_PAIR)
+    }
+    drafted += all;
+  }
+  if (p == 0) room[get_num_groups(0) + get_group_id(0)] = drafted;
+#else
   for (int tile = 0; tile < tiles_x * tiles_y; ++tile) own[tile] = 0;
 #define DRAFT_PAIR(tile, mask) (vstore3((uint3)(ids[n], (uint)(tile), mask), 0, draft), draft += 3, own[tile] += 1)
   for (uint n = start; n < end; ++n) {
     FETCH(records + (size_t)ids[min(n + AHEAD, end - 1)] * 16);
     FOR_EACH_TILE(DRAFT_PAIR)
   }
-  room[get_global_size(0) + get_global_id(0)] = (uint)((draft - first_draft) / 3);
+  room[get_num_groups(0) + get_group_id(0)] = (uint)((draft - first_draft) / 3);
+#endif
 }
 
-__kernel void tile_scatter(
+__kernel LISTERS void tile_scatter(
     const uint tiles,
     __global const uint *room,        // [2, blocks]
     __global const uint *drafts,      // [capacity, 3]
     __global uint *offsets,           // [blocks, tiles] from the scan; advanced, so that the last row has the tiles' ends
     __global uint2 *pairs)            // [capacity] row and block mask, tile by tile, in depth order
 {
-  __global uint *own = offsets + get_global_id(0) * (size_t)tiles;
+  __global uint *own = offsets + get_group_id(0) * (size_t)tiles;
   __global const uint *draft = drafts + 3 * draft_start(room);
-  const uint count = room[get_global_size(0) + get_global_id(0)];
+  const uint count = room[get_num_groups(0) + get_group_id(0)];
+#ifdef GROUP
+  // Each work-item has one draft of LIST_GROUP. It goes behind those of its tile before it; the last of a tile counts them.
+  __local uint tile_of[LIST_GROUP];
+  const uint p = get_local_id(0);
+  for (uint first = 0; first < count; first += LIST_GROUP) {
+    const uint n = first + p, size = min((uint)LIST_GROUP, count - first);
+    const uint3 d = n < count ? vload3(n, draft) : (uint3)(0u);
+    tile_of[p] = d.s1;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    uint before = 0, all = 0;
+    for (uint q = 0; q < size; ++q) {
+      const uint same = tile_of[q] == d.s1 ? 1u : 0u;
+      before += q < p ? same : 0u;
+      all += same;
+    }
+    uint at = 0;
+    if (n < count) {
+      at = own[d.s1];
+      pairs[at + before] = (uint2)(d.s0, d.s2);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+    if (n < count && before + 1 == all) own[d.s1] = at + all;
+    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+  }
+#else
   for (uint n = 0; n < count; ++n) {
     const uint3 d = vload3(n, draft);
     pairs[own[d.s1]++] = (uint2)(d.s0, d.s2);
   }
+#endif
 }

@@ -26,7 +26,8 @@ class KernelSpec:
         One letter for each argument: u uint32, i int32, f float32, b array.
     per : str
         The work of one item: `rows` (a vector of W rows; the launch size counts rows), `item` (one of the launch size),
-        `tile` (one work-item a tile on CPUs, a group of 256 on GPUs), `group` (one work-item on CPUs, one group on GPUs).
+        `tile` (one work-item a tile on CPUs, a group of 256 on GPUs), `block` (one work-item a block of splats on CPUs, a
+        group on GPUs), `group` (one work-item on CPUs, one group on GPUs).
     stats : int, optional
         Kind of statistics, for blends.
     widest : int
@@ -52,8 +53,8 @@ KERNELS: dict[str, KernelSpec] = {
     "exclusive_scan": KernelSpec("sort.cl", "uub", "group"),
     # Most splats touch at most 8 block rows, so vectors of 16 would be slower.
     "tile_room": KernelSpec("tiles.cl", "uubbb", widest=8),
-    "tile_count": KernelSpec("tiles.cl", "uuffibbbbb", widest=8),
-    "tile_scatter": KernelSpec("tiles.cl", "ubbbb", widest=8),
+    "tile_count": KernelSpec("tiles.cl", "uuffibbbbb", "block", widest=8),
+    "tile_scatter": KernelSpec("tiles.cl", "ubbbb", "block", widest=8),
     "blend": KernelSpec("blend_{form}.cl", _BLEND, "tile", stats=0),
     "blend_stats": KernelSpec("blend_{form}.cl", _BLEND + "bb", "tile", stats=1),
     "blend_removal": KernelSpec("blend_{form}.cl", _BLEND + "bb", "tile", stats=2),

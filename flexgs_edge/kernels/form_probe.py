@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from flexgs_edge.errors import BudgetError, DeviceError
 from flexgs_edge.kernels.choose_device import DeviceInfo
-from flexgs_edge.kernels.form import Form, possible_forms, with_written_fma
+from flexgs_edge.kernels.form import GPU_WIDTHS, Form, possible_forms, with_written_fma
 from flexgs_edge.kernels.opencl import OpenCLBackend
+from flexgs_edge.kernels.rounding import rounds_division
 from flexgs_edge.memory.budget import MemoryBudget
 
 KERNEL = "blend_stats"
@@ -48,7 +49,11 @@ def measure_forms(
     found: list[Measured] = []
     failed = ""
     written = False
-    for number, form in enumerate(possible_forms(info)):
+    try:
+        forms = _right_forms(info)
+    except DeviceError as error:
+        return [], str(error)
+    for number, form in enumerate(forms):
         both = [form, with_written_fma(form)]
         # What is faster for the first form is so for all; building the slow ones takes long.
         chosen = both if number == 0 or not found else [both[written]]
@@ -58,15 +63,21 @@ def measure_forms(
                 continue
             say(str(one))
             try:
-                backend = OpenCLBackend(
-                    info, MemoryBudget(1 << 40), width=one.width, form=one.kind, written_fma=one.written_fma
-                )
+                backend = OpenCLBackend(replace(info, form=str(one)), MemoryBudget(1 << 40))
                 found.append(Measured(one, backend, _seconds(backend)))
             except (DeviceError, BudgetError) as error:
                 failed = failed or str(error)
         found.sort(key=lambda measured: measured.seconds)
         written = bool(found) and found[0].form.written_fma
     return found, failed
+
+
+def _right_forms(info: DeviceInfo) -> list[Form]:
+    """The forms that the device can take, with written quotients and roots if it does not round its own."""
+    forms = possible_forms(info)
+    if rounds_division(info):
+        return forms
+    return [replace(form, written_division=True) for form in forms if form.width in GPU_WIDTHS]
 
 
 def may_write_fma(info: DeviceInfo) -> bool:

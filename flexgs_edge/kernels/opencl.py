@@ -6,6 +6,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.cl_sources import load_source
 from flexgs_edge.kernels.form import GPU_WIDTHS, WIDTHS, Form, likely_form, native_width
 from flexgs_edge.kernels.loop_limit import LIMITED_BLOCKS, STEPS_A_PAIR, check_steps
+from flexgs_edge.kernels.rounding import rounding_options
 from flexgs_edge.kernels.session import DeviceArray, Session
 from flexgs_edge.memory.budget import MemoryBudget
 
@@ -24,6 +26,8 @@ GPU_GROUP = 64
 """Size of a work-group on GPUs for kernels with one row a work-item; it divides the padding of planes."""
 SCAN_GROUPS = (1024, 256, 64)
 """Sizes of the work-group that scans on GPUs: the largest that the device allows."""
+LIST_GROUP = 64
+"""Size of the work-groups that list pairs on GPUs."""
 GPU_BLOCKS = (64, 256)
 """Least and most work-items of the serial passes on GPUs; between them, two for each compute unit."""
 
@@ -41,10 +45,10 @@ class OpenCLBackend:
         Lanes of a vector: 16, 8, 4 or 1; in the GPU form 4 or 1.
     form : {"cpu", "gpu"}, optional
         Form of the blend kernel: one work-item a tile, or one work-group a tile.
-    written_fma : bool, optional
-        Whether `fma` is written out.
+    written_fma, written_division : bool, optional
+        Whether `fma` is written out, and whether quotients and roots are rounded by us.
 
-    By default, all three are what the self-test found to be fastest (`DeviceInfo.form`); if it has not run, they follow
+    By default, all four are what the self-test found to be fastest (`DeviceInfo.form`); if it has not run, they follow
     the device's type.
     """
 
@@ -57,24 +61,22 @@ class OpenCLBackend:
         width: int | None = None,
         form: str | None = None,
         written_fma: bool | None = None,
+        written_division: bool | None = None,
     ) -> None:
         start = time.perf_counter()
         self.session = Session(info, budget)
         chosen = Form.named(info.form) or likely_form(info)
         if form is not None and form != chosen.kind:
-            chosen = Form(form, 1 if form == "gpu" else native_width(info), chosen.written_fma)
+            chosen = replace(chosen, kind=form, width=1 if form == "gpu" else native_width(info))
         self.form, self.width = chosen.kind, width or chosen.width
         self.written_fma = chosen.written_fma if written_fma is None else written_fma
+        self.written_division = chosen.written_division if written_division is None else written_division
         widths = GPU_WIDTHS if self.form == "gpu" else WIDTHS
         if self.width not in widths:
             expected = ", ".join(map(str, widths))
             raise DeviceError(f"vector width {self.width} of the {self.form} form: expected one of {expected}")
         self.name = f"{info.name} ({info.platform})"
-        # By default, OpenCL allows a quotient 2.5 units in the last place of error, and a root 3.
-        rounds = (
-            info.handle is not None and info.handle.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
-        )
-        self._options = ("-cl-fp32-correctly-rounded-divide-sqrt",) if rounds else ()
+        self._options = rounding_options(info)
         # Hints and conversions that are not OpenCL C: only PoCL's compiler is known to take them, and only it gains by them.
         self._builtins = "portable computing" in info.platform.lower()
         # Blocks of the serial passes: enough to keep all compute units busy, few enough for short scans.
@@ -140,9 +142,11 @@ class OpenCLBackend:
         if name not in self._kernels:
             options = [f"-DW={min(self.width, spec.widest)}", *self._options]
             if self.form == "gpu":
-                options.append(f"-DGROUP={self._scan_group}")
+                options += [f"-DGROUP={self._scan_group}", f"-DLIST_GROUP={LIST_GROUP}"]
             if self.written_fma:
                 options.append("-DWRITTEN_FMA")
+            if self.written_division:
+                options.append("-DWRITTEN_DIVISION")
             if self._builtins:
                 options.append("-DCLANG_BUILTINS")
             source = load_source(spec.file.format(form=self.form), spec.stats, self.form)
@@ -153,6 +157,8 @@ class OpenCLBackend:
             local = (GPU_GROUP // self.width if self.form == "gpu" else 1,)
         elif spec.per == "tile" and self.form == "gpu":
             size, local = (size[0] * 256 // self.width,), (256 // self.width,)
+        elif spec.per == "block" and self.form == "gpu":
+            size, local = (size[0] * LIST_GROUP,), (LIST_GROUP,)
         elif spec.per == "group" and self.form == "gpu":
             size = local = (self._scan_group,)
         if self.session.info.loop_steps:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from weakref import WeakKeyDictionary
 
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS
 from flexgs_edge.codec.v2.device.encode_kernels import device_bytes
 from flexgs_edge.codec.v2.grid_source import GridSource
+from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.tested import processors_with_verdicts
@@ -111,11 +113,36 @@ def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
     return MemorySource(planes, source.sh_degree, source.origin, source.name)
 
 
-def coding_device(backend: Backend | None, budget: MemoryBudget, count: int, sh_degree: int) -> Backend | None:
-    """Return `backend` if it should entropy-code this scene, else `None`: then NumPy codes it, to the same bytes.
+def coding_device(
+    backend: Backend | None,
+    budget: MemoryBudget,
+    count: int,
+    sh_degree: int,
+    devices: Callable[[], list[DeviceInfo]] = processors_with_verdicts,
+) -> Backend | None:
+    """Return what should entropy-code this scene beside `backend`; `None`: NumPy codes it, to the same bytes.
 
-    The device must be a processor, the scene large enough to gain from it, and the free memory enough for its buffers.
+    That is `backend` itself if it is a processor, else a processor with a working driver, if there is one. The scene must be
+    large enough to gain from it, and the free memory enough for its buffers.
     """
-    if backend is None or not backend.threads or count < DEVICE_ROWS:
+    if backend is None or backend.is_numpy or count < DEVICE_ROWS:
         return None
-    return backend if backend.threads * device_bytes(CHUNK_ROWS, sh_degree) <= budget.free else None
+    coder = backend if backend.threads else _processor_beside(backend, budget, devices)
+    return coder if coder is not None and coder.threads * device_bytes(CHUNK_ROWS, sh_degree) <= budget.free else None
+
+
+_beside: WeakKeyDictionary[Backend, Backend | None] = WeakKeyDictionary()
+"""The processors that code for devices which cannot. They are opened once."""
+
+
+def _processor_beside(
+    backend: Backend, budget: MemoryBudget, devices: Callable[[], list[DeviceInfo]]
+) -> Backend | None:
+    """The processor that codes for a device such as a GPU."""
+    if backend not in _beside:
+        opened = None
+        if any(found.type == "cpu" and found.usable and not found.loop_steps for found in devices()):
+            with suppress(BudgetError):  # without room for its runtime, NumPy codes
+                opened = counted_backend("cpu", budget, Stopwatch())
+        _beside[backend] = opened if opened is not None and opened.threads else None
+    return _beside[backend]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -23,7 +24,12 @@ from flexgs_edge.scene.source import SceneSource
 FORMS = ("w16", "w8", "w4", "w1", "gpu", "gpu4")
 """Forms of the OpenCL kernels: vector widths of the CPU form; the GPU form, and that with four pixels a work-item."""
 ALL_FORMS = (*FORMS, "numpy")
-GPU_FORMS = {"gpu": Form("gpu", 1), "gpu4": Form("gpu", 4), "fma": Form("gpu", 4, written_fma=True)}
+GPU_FORMS = {
+    "gpu": Form("gpu", 1),
+    "gpu4": Form("gpu", 4),
+    "fma": Form("gpu", 4, written_fma=True),
+    "div": Form("gpu", 4, written_division=True),
+}
 
 
 def large_budget() -> MemoryBudget:
@@ -43,9 +49,7 @@ def open_form(form: str) -> Backend:
     if form == "numpy":
         return TwinBackend(large_budget())
     chosen = GPU_FORMS.get(form) or Form("cpu", int(form[1:]))
-    return OpenCLBackend(
-        default_device(), large_budget(), width=chosen.width, form=chosen.kind, written_fma=chosen.written_fma
-    )
+    return OpenCLBackend(replace(default_device(), form=str(chosen)), large_budget())
 
 
 def draw(

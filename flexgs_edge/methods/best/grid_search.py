@@ -26,14 +26,16 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best import descents
 from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOPE, Candidate, RateResult, bounds, misses
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
+from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.kept import Kept, Refitted
-from flexgs_edge.methods.best.landing import land, land_on_quality
+from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
 from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART, Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import LAST, Schedule, distil
 from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
-from flexgs_edge.scene.source import Planes
+from flexgs_edge.render.fit import sum_bytes
+from flexgs_edge.scene.source import MemorySource, Planes
 
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
@@ -104,18 +106,12 @@ class GridSearch(MultiplierSearch[GridScene]):
         self._drift = DRIFT if effort.refit_rounds and not steps else 0.0
         self._expected = 0.0
         self._interleaved, self._left = effort.interleaved if steps else 0, 0.0
-        self._removal: list[tuple[GridScene, np.ndarray]] = []
-        """Results that may be the answer, with the costs of the removal of each of their rows."""
 
     def run(self, target: Target, best_effort: bool = False) -> RateResult[GridScene]:
         """As `MultiplierSearch.run`, and then `land_on_quality` if a quality is asked for."""
         found = self._searched(target, best_effort)
         lands = found.reached and target.limit_bytes is None and not self.ended
         return self._landed_on_quality(found, target) if lands else found
-
-    def discard(self, product: GridScene) -> None:
-        """See `MultiplierSearch.discard`."""
-        self._removal = [(grid, removal) for grid, removal in self._removal if grid is not product]
 
     def _searched(self, target: Target, best_effort: bool) -> RateResult[GridScene]:
         """As `MultiplierSearch.run`. Where no descent reaches a quality, colours are refitted instead.
@@ -297,7 +293,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         """Expected change of the excess by a descent, learned from a pilot. Scenes differ too much for a constant."""
         kept, step_sizes = self._choice(multiplier)
         schedule = self._schedule(descents.PILOT, kept.planes, multiplier=multiplier)
-        grid, _ = self._distilled(kept, step_sizes, schedule)
+        grid = self._distilled(kept, step_sizes, schedule)
         found = target.excess(0, self.measure(values_of(grid, self.rounds.storage)))
         return found - self._probe(multiplier, target) - descents.PILOT_POWER * math.log(descents.PILOT)
 
@@ -327,18 +323,13 @@ class GridSearch(MultiplierSearch[GridScene]):
         kept, step_sizes = self._choice(multiplier)
         if self.steps:
             schedule = self._schedule(1.0, kept.planes, multiplier=multiplier)
-            grid, order = self._distilled(kept, step_sizes, schedule)
+            grid = self._distilled(kept, step_sizes, schedule)
         else:
-            grid, order = self._finish(kept, step_sizes)
-        storage = self.rounds.storage
-        grid = lowered(grid, storage)
+            grid = self._finish(kept, step_sizes)
+        grid = lowered(grid, self.rounds.storage)
         size = self.size_of(grid)
-        # Those that no scored pose sees cost nothing. Whether they stay is not for a landing to say.
-        removal = np.where(kept.weight2 > 0, kept.removal, np.inf)[order]
         if target.limit_bytes is not None:
-            grid, size = self._landed(grid, removal, size, target.limit_bytes)
-        else:
-            self._removal.append((grid, removal))
+            grid, size = self._landed(grid, size, target.limit_bytes)
         return self._measured(grid, size, multiplier, target, started, kept.left_out), grid
 
     def _measured(
@@ -348,15 +339,12 @@ class GridSearch(MultiplierSearch[GridScene]):
         excess, seconds = target.excess(size, measurement), time.perf_counter() - started
         return Candidate(multiplier, grid.count, grid.sh_count, size, measurement, excess, seconds, left_out)
 
-    def _distilled(self, kept: Kept, step_sizes: StepSizes, schedule: Schedule) -> tuple[GridScene, np.ndarray]:
-        """Move all values towards the references, put them on the grid, and refit the constant colour.
-
-        Also returns the row of `kept` of each row of the grid.
-        """
+    def _distilled(self, kept: Kept, step_sizes: StepSizes, schedule: Schedule) -> GridScene:
+        """Move all values towards the references, put them on the grid, and refit the constant colour."""
         moved = self._distil(kept, schedule, step_sizes)
         storage = self.rounds.storage
-        grid, order = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved), storage)
-        return self._with_constants(grid) if self.refit else grid, order
+        grid = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved), storage)[0]
+        return self._with_constants(grid) if self.refit else grid
 
     def _with_constants(self, grid: GridScene) -> GridScene:
         """The grid with its constant colours refitted once."""
@@ -364,10 +352,23 @@ class GridSearch(MultiplierSearch[GridScene]):
         moved = self._refit_colours(values_of(grid, storage), grid.sh_degrees, 1, bands=False)
         return recolour(grid, moved["sh_dc"], moved["sh_rest"], storage)
 
-    def _landed(self, grid: GridScene, removal: np.ndarray, size: int, limit: int) -> tuple[GridScene, int]:
+    def _removal_costs(self, grid: GridScene) -> np.ndarray:
+        """[n] f64, what the removal of each row of a result costs. Behind a descent, those from before it say little.
+
+        Infinite for rows that no scored pose sees: whether they stay is not for a landing to say.
+        """
+        original = self.rounds.original
+        source = MemorySource(values_of(grid, self.rounds.storage), origin=original.origin)
+        with original.bench.renderer.load(source, sum_bytes(2) + cost_bytes(0), view_sums=2) as scene:
+            costs = measure_costs(original.bench, scene, original.cameras, sh_costs=False)
+        return np.where(costs.weight2 > 0, costs.removal, np.inf)
+
+    def _landed(self, grid: GridScene, size: int, limit: int) -> tuple[GridScene, int]:
         """`land`, and then the constant colours, which had been fitted to what is gone, once more."""
         storage = self.rounds.storage
-        landed, less = land(grid, removal, size, limit, self.size_of, storage)
+        if not 0.0 < math.log(size / limit) <= REACH:
+            return grid, size
+        landed, less = land(grid, self._removal_costs(grid), size, limit, self.size_of, storage)
         if landed is grid or not self.refit:
             return landed, less
         mended = self._with_constants(landed)
@@ -411,22 +412,20 @@ class GridSearch(MultiplierSearch[GridScene]):
                 best = step, mended
             return excesses(goal, size, step.measurement)
 
-        known = next((removal for made, removal in self._removal if made is grid), None)
+        found = excesses(goal, chosen.size, chosen.measurement)
+        if max(found) >= -NEAR_QUALITY:
+            return best
         try:
-            if known is not None:
-                found = excesses(goal, chosen.size, chosen.measurement)
-                land_on_quality(grid, known, found, attempt, self.rounds.storage, descended=self.steps > 0)
+            removal = self._removal_costs(grid)
+            land_on_quality(grid, removal, found, attempt, self.rounds.storage, descended=self.steps > 0)
         except KeyboardInterrupt:
             if not self.keeps_best:
                 raise
             self.interrupted()
         return best
 
-    def _finish(self, kept: Kept, step_sizes: StepSizes) -> tuple[GridScene, np.ndarray]:
-        """Put geometry on its grid, refit all colours, put SH on their grid, refit the constant colour, put it on its grid.
-
-        Also returns the row of `kept` of each row of the grid.
-        """
+    def _finish(self, kept: Kept, step_sizes: StepSizes) -> GridScene:
+        """Put geometry on its grid, refit all colours, put SH on their grid, refit the constant colour, put it on its grid."""
         storage, planes = self.rounds.storage, kept.planes
         fine = replace(step_sizes, dc=step_sizes.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in step_sizes.sh))
         fine = holdable(fine, planes)
@@ -441,4 +440,4 @@ class GridSearch(MultiplierSearch[GridScene]):
             coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], storage), storage)
             moved = self._refit_colours(coarse, degrees, 1, bands=False)
         final = replace(grid.step_sizes, dc=step_sizes.dc, sh=step_sizes.sh[: grid.sh_degree])
-        return recolour(replace(grid, step_sizes=final), moved["sh_dc"], moved["sh_rest"], storage), order
+        return recolour(replace(grid, step_sizes=final), moved["sh_dc"], moved["sh_rest"], storage)

@@ -86,8 +86,6 @@ class Kept:
         [n] u8, SH degrees.
     weight2 : np.ndarray
         [n] f64, sums of squared weights.
-    removal : np.ndarray
-        [n] f64, costs of removal.
     left_out : int
         How many rows were left out because the grid would be coarser with them (`reachable`).
     """
@@ -97,7 +95,6 @@ class Kept:
     planes: dict[str, np.ndarray]
     degrees: np.ndarray
     weight2: np.ndarray
-    removal: np.ndarray
     left_out: int = 0
 
     def take(self, keep: np.ndarray, storage: Storage = IN_MEMORY) -> Kept:
@@ -106,5 +103,5 @@ class Kept:
             return self
         rows = np.flatnonzero(keep)
         planes = {name: storage.take(values, rows) for name, values in self.planes.items()}
-        some, weight2, removal = (storage.take(values, rows) for values in (self.rows, self.weight2, self.removal))
-        return Kept(self.snapshot, some, planes, self.degrees[rows], weight2, removal)
+        some, weight2 = storage.take(self.rows, rows), storage.take(self.weight2, rows)
+        return Kept(self.snapshot, some, planes, self.degrees[rows], weight2)

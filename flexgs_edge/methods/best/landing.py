@@ -22,7 +22,7 @@ SHARE, DESCENDED_SHARE = 0.5, 0.33
 matters more: docs/results/tuning.md#landing"""
 NEAR_QUALITY = 0.02
 """How far below what it allows, as a share of it, we are content."""
-QUALITY_TRIES = 2
+QUALITY_TRIES = 3
 """Most results that are made and measured on the way to a quality; one more if none of them holds."""
 
 
@@ -119,11 +119,10 @@ def land_on_quality(
                 return
         else:
             beyond = count
-        rising = rises > 0.0
-        if not rising.any():
+        if not (rises > 0.0).any():
             return
-        # Bounds rise at paces of their own, and the worst view may fall for once. No bound is taken to rise by less than half.
-        stride = min(((aim - known) / np.maximum(rises, 0.5 / usual))[rising])
+        # Bounds rise at paces of their own, and one may fall by chance. None is taken to rise by less than half of what is usual.
+        stride = float(((aim - known) / np.maximum(rises, 0.5 / usual)).min())
 
 
 def _beyond(removal: np.ndarray) -> int:

@@ -258,6 +258,5 @@ class MultiplierSearch(ABC, Generic[Product]):
         snapshot = self.rounds.snapshots[index]
         rows, storage = np.flatnonzero(keep), self.rounds.storage
         planes = drop_bands(snapshot.planes, rows, degrees[rows], snapshot.costs.sh_mean, SH_C0, storage)
-        costs = snapshot.costs
-        weight2, removal = storage.take(costs.weight2, rows), storage.take(costs.removal, rows)
-        return Kept(index, storage.take(snapshot.rows, rows), planes, degrees[rows], weight2, removal)
+        weight2 = storage.take(snapshot.costs.weight2, rows)
+        return Kept(index, storage.take(snapshot.rows, rows), planes, degrees[rows], weight2)

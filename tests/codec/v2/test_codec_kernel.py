@@ -183,8 +183,19 @@ def test_when_a_device_codes() -> None:
     assert coding_device(backend, large_budget(), DEVICE_ROWS, 3) is backend
     assert coding_device(backend, MemoryBudget(1 << 20), DEVICE_ROWS, 3) is None
     assert coding_device(backend, large_budget(), DEVICE_ROWS - 1, 3) is None
-    for other in (None, open_form("gpu"), open_form("numpy")):
+    for other in (None, open_form("numpy")):
         assert coding_device(other, large_budget(), DEVICE_ROWS, 3) is None
+
+
+def test_a_processor_codes_for_a_gpu() -> None:
+    """If one has a working driver; it is opened once."""
+    gpu = OpenCLBackend(replace(default_device(), form="gpu1"), large_budget())
+    coder = coding_device(gpu, large_budget(), DEVICE_ROWS, 3)
+    assert coder is not None and coder.threads and coder is coding_device(gpu, large_budget(), DEVICE_ROWS, 3)
+    alone = OpenCLBackend(replace(default_device(), form="gpu1"), large_budget())
+    assert coding_device(alone, large_budget(), DEVICE_ROWS, 3, devices=list) is None
+    crowded = OpenCLBackend(replace(default_device(), form="gpu1"), large_budget())
+    assert coding_device(crowded, MemoryBudget(1 << 20), DEVICE_ROWS, 3) is None
 
 
 @pytest.mark.parametrize("name", ["both", "degree 4"])

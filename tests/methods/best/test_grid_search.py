@@ -137,6 +137,9 @@ class KnownSearch(GridSearch):
     def _probe_slopes(self, snapshot: Snapshot) -> Slopes:
         return SLOPES
 
+    def _removal_costs(self, grid: GridScene) -> np.ndarray:
+        return np.arange(grid.count, dtype=np.float64)
+
 
 def search(
     world: World,
@@ -475,6 +478,7 @@ def test_a_mended_result_does_not_take_the_place_of_a_smaller_one(monkeypatch: p
     monkeypatch.setattr(finder, "_start", lambda _: 1.0)
     monkeypatch.setattr(finder, "_aim", lambda multiplier, *_: multiplier)
     monkeypatch.setattr(finder, "_whole", lambda *_: (next(given), object()))
+    monkeypatch.setattr(finder, "_thinned", lambda chosen, grid, *_: (chosen, grid))
     larger = Candidate(2.0, 8, 0, 110, quality, -0.01, 0.0)
     monkeypatch.setattr(finder, "_mended", lambda *_: (larger, object()))
     assert finder.run(MaxDrop(0.5)).chosen.size == 100
@@ -589,6 +593,7 @@ def test_an_interrupted_landing_keeps_the_best(monkeypatch: pytest.MonkeyPatch) 
         raise KeyboardInterrupt
 
     monkeypatch.setattr(grid_search, "land_on_quality", interrupted)
+    monkeypatch.setattr(grid_search, "NEAR_QUALITY", 0.0)
     Mending.calls = []
     found = search(Mended(0.5, 1.0), MaxDrop(1.0), kind=Mending, steps=100)
     assert found.reached and found.chosen in found.steps
