@@ -10,7 +10,7 @@ from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule
 DISTILLED, DISTILLED_POWER = 0.46, -0.2
 """Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
 the power by which it changes with the steps: docs/results/tuning.md#distilled"""
-BEHIND_SHORT, BEHIND_LONG = -0.05, 0.02
+BEHIND_SHORT, BEHIND_LONG = 0.03, 0.02
 """Log of the loss after a first candidate's descent, `SHORT` or `LONG`, over the middle of what the last descent between rounds
 left and of the probe: docs/results/tuning.md#distilled"""
 FULL_PASSES = 10

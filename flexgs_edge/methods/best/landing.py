@@ -22,8 +22,8 @@ SHARE, DESCENDED_SHARE = 0.5, 0.33
 matters more: docs/results/tuning.md#landing"""
 NEAR_QUALITY = 0.02
 """How far below what it allows, as a share of it, we are content."""
-QUALITY_TRIES = 3
-"""Most results that are made and measured on the way to a quality; one more if none of them holds."""
+QUALITY_TRIES, DESCENDED_TRIES = 2, 3
+"""Most results that are made and measured on the way to a quality, and behind a descent; one more if none of them holds."""
 
 
 def land(
@@ -103,10 +103,11 @@ def land_on_quality(
     cheapest = np.argsort(removal, kind="stable")
     least, beyond, aim = 0, _beyond(removal), -NEAR_QUALITY / 2
     known = np.asarray(excesses)
+    tries = DESCENDED_TRIES if descended else QUALITY_TRIES
     usual = (DESCENDED_SHARE if descended else SHARE) * grid.count
     stride = (aim - known.max()) * usual
-    for number in range(QUALITY_TRIES + 1 if known.max() < -NEAR_QUALITY else 0):
-        if number == QUALITY_TRIES and least:
+    for number in range(tries + 1 if known.max() < -NEAR_QUALITY else 0):
+        if number == tries and least:
             return
         count = min(least + round(stride), beyond - 1)
         if count <= least:
