@@ -280,7 +280,7 @@ def test_layers_are_the_same_scene_and_worth_most_first(project: Path, tmp_path:
 
 @pytest.mark.parametrize(
     ("least", "most", "cost", "limit", "layers"),
-    [(10**9, 10**9, 2.0, 0, 1), (0, 10**9, 2.0, 0, 2), (0, 10**9, 1.0, 0, 1), (0, 10**9, 2.0, 1, 1), (0, 9, 2.0, 0, 1)],
+    [(10**9, 10**9, 2.0, 0, 1), (0, 10**9, 2.0, 0, 2), (0, 10**9, 0.9, 0, 1), (0, 10**9, 2.0, 1, 1), (0, 9, 2.0, 0, 1)],
 )
 def test_large_files_have_two_layers_where_they_cost_little(
     tiny: tuple[Path, CompressResult],
