@@ -142,6 +142,9 @@ class _Pretended(GridSearch):
         step = Candidate(multiplier, COUNT, 0, size, found, target.excess(size, found), 0.0)
         return step, cast(GridScene, None)
 
+    def _thinned(self, chosen: Candidate, grid: GridScene, *_: Any) -> tuple[Candidate, GridScene]:
+        return chosen, grid  # there are no Gaussians that could go
+
 
 @dataclass(frozen=True)
 class Answer:
