@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -20,6 +20,8 @@ SCALARS = {"u": np.uint32, "i": np.int32, "f": np.float32, "b": None}
 
 FILLED_TOGETHER = (16, 8, 4, 2)
 """Elements of a pattern that fills an array, where its size allows. Patterns have at most 128 bytes."""
+SMALL_WRITE, WRITES_BEHIND = 1 << 16, 64
+"""Most bytes of a write that does not wait for the queue, and most such writes on their way: docs/results/tuning.md#small_write"""
 
 
 class DeviceArray:
@@ -77,6 +79,8 @@ class Session:
         self.compile_seconds = 0.0
         self.profile: defaultdict[str, float] | None = None
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
+        # Events hold the copied values. One that falls out is waited for.
+        self._writes: deque[cl.Event] = deque(maxlen=WRITES_BEHIND)
 
     def kernel(self, source: str, name: str, options: tuple[str, ...], signature: str) -> cl.Kernel:
         """The kernel `name` of `source`, built with `options`; `signature` has one letter (u i f b) for each argument.
@@ -132,15 +136,19 @@ class Session:
         return DeviceArray(self, shape, dtype)
 
     def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0) -> None:
-        """Copy C-contiguous `values` to the flat element `offset` of `array`."""
+        """Copy C-contiguous `values` to the flat element `offset` of `array`; they may change as soon as this returns."""
         values = np.ascontiguousarray(values, array.dtype)
         if values.size:
+            # What is small is copied here, so that the host need not wait for all kernels before.
+            small, at = values.nbytes <= SMALL_WRITE, offset * array.dtype.itemsize
             try:
-                cl.enqueue_copy(
-                    self.queue, array.buffer, values, dst_offset=offset * array.dtype.itemsize, is_blocking=True
+                written = cl.enqueue_copy(
+                    self.queue, array.buffer, values.copy() if small else values, dst_offset=at, is_blocking=not small
                 )
             except cl.Error as error:
                 raise self._failure("writing an array", error) from error
+            if small:
+                self._writes.append(written)
 
     @contextmanager
     def mapped(self, array: DeviceArray) -> Iterator[np.ndarray]:

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.choose_device import SELF_TEST, DeviceInfo, choose_device, list_devices, run_self_test
 from flexgs_edge.kernels.open_backend import open_backend
 from flexgs_edge.kernels.opencl import OpenCLBackend
-from flexgs_edge.kernels.session import Session
+from flexgs_edge.kernels.session import WRITES_BEHIND, Session
 from flexgs_edge.memory.budget import MemoryBudget
 from kernel_fixtures import default_device, large_budget
 
@@ -207,6 +208,38 @@ def test_arrays_are_counted(session: Session) -> None:
     with pytest.raises(BudgetError, match="use --memory-limit"):
         session.array((1 << 20,), np.float32)
     assert session.budget.used == 0
+
+
+SLOW = """__kernel void slow(__global const float *given, __global float *seen) {
+  volatile float busy = 0;
+  for (uint k = 0; k < 20000000; ++k) busy += 1.0f;
+  seen[0] = given[0];
+}"""
+
+
+def test_small_writes_do_not_wait(session: Session) -> None:
+    """Kernels before a write see the old values, those after it the new ones, whatever becomes of the host's array."""
+    given, seen = session.array((4,), np.float32), session.array((4,), np.float32)
+    kernel = session.kernel(SLOW, "slow", (), "bb")
+    values = np.full(4, 1, np.float32)
+    session.write(given, values)
+    session.launch("slow", kernel, (1,), (1,), (given, seen))
+    done = session.mark()
+    start = time.perf_counter()
+    for number in range(2, WRITES_BEHIND):
+        values[:] = number
+        session.write(given, values)
+    values[:] = -1
+    behind = time.perf_counter() - start
+    done()
+    assert behind < (time.perf_counter() - start) / 2
+    assert session.read(seen, np.empty(1, np.float32)) == [1]
+    assert (session.read(given) == WRITES_BEHIND - 1).all()
+    for number in range(2 * WRITES_BEHIND):
+        session.write(given, np.full(4, number, np.float32))
+    assert (session.read(given) == number).all()
+    given.release()
+    seen.release()
 
 
 def test_buffers_beyond_the_device() -> None:
