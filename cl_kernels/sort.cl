@@ -137,13 +137,34 @@ __kernel void exclusive_scan(
     const uint blocks,
     __global uint *values)            // [blocks, cells] and the total
 {
-  uint sum = 0;
-  for (uint cell = 0; cell < cells; ++cell)
+  uint sum = 0, cell = 0;
+#if W > 1
+  // W cells at a time: first their sums over all blocks, then the offsets.
+  for (; cell + W <= cells; cell += W) {
+    UW before = (UW)0u;
+    for (uint block = 0; block < blocks; ++block) before += LOADF(values, (size_t)block * cells + cell);
+    uint lanes[W];
+    STOREI(before, lanes, 0);
+    for (uint lane = 0; lane < W; ++lane) {
+      const uint own = lanes[lane];
+      lanes[lane] = sum;
+      sum += own;
+    }
+    before = LOADF(lanes, 0);
     for (uint block = 0; block < blocks; ++block) {
       const size_t i = (size_t)block * cells + cell;
-      const uint value = values[i];
+      const UW own = LOADF(values, i);
+      STOREI(before, values, i);
+      before += own;
+    }
+  }
+#endif
+  for (; cell < cells; ++cell)
+    for (uint block = 0; block < blocks; ++block) {
+      const size_t i = (size_t)block * cells + cell;
+      const uint own = values[i];
       values[i] = sum;
-      sum += value;
+      sum += own;
     }
   values[(size_t)blocks * cells] = sum;
 }

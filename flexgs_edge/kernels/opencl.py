@@ -82,7 +82,7 @@ class OpenCLBackend:
         # Blocks of the serial passes: enough to keep all compute units busy, few enough for short scans.
         least, most = GPU_BLOCKS
         gpu_blocks = min(max(2 * info.compute_units, least), most)
-        self.sort_blocks = self.tile_blocks = max(8 * info.compute_units, 16) if self.form == "cpu" else gpu_blocks
+        self.sort_blocks = self.tile_blocks = max(4 * info.compute_units, 16) if self.form == "cpu" else gpu_blocks
         self._scan_group = next((size for size in SCAN_GROUPS if size <= info.max_work_group), 1)
         self.most_pairs = 0
         if info.loop_steps:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -20,8 +20,8 @@ SCALARS = {"u": np.uint32, "i": np.int32, "f": np.float32, "b": None}
 
 FILLED_TOGETHER = (16, 8, 4, 2)
 """Elements of a pattern that fills an array, where its size allows. Patterns have at most 128 bytes."""
-SMALL_WRITE, WRITES_BEHIND = 1 << 16, 64
-"""Most bytes of a write that does not wait for the queue, and most such writes on their way: docs/results/tuning.md#small_write"""
+SMALL_WRITE = 1 << 16
+"""Most bytes of a write that does not wait for the queue: docs/results/tuning.md#small_write"""
 
 
 class DeviceArray:
@@ -31,6 +31,9 @@ class DeviceArray:
         self.shape = shape
         self.dtype = np.dtype(dtype)
         self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
+        self.changed: cl.Event | None = None
+        """The last fill or small write, which may not have begun. A write holds a copy of its values, and is waited for when
+        another event takes its place."""
         self._session = session
         session.budget.take("a device buffer", self.nbytes)
         try:
@@ -79,8 +82,6 @@ class Session:
         self.compile_seconds = 0.0
         self.profile: defaultdict[str, float] | None = None
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
-        # Events hold the copied values. One that falls out is waited for.
-        self._writes: deque[cl.Event] = deque(maxlen=WRITES_BEHIND)
 
     def kernel(self, source: str, name: str, options: tuple[str, ...], signature: str) -> cl.Kernel:
         """The kernel `name` of `source`, built with `options`; `signature` has one letter (u i f b) for each argument.
@@ -147,12 +148,13 @@ class Session:
                 )
             except cl.Error as error:
                 raise self._failure("writing an array", error) from error
-            if small:
-                self._writes.append(written)
+            array.changed = written if small else None
 
     @contextmanager
     def mapped(self, array: DeviceArray) -> Iterator[np.ndarray]:
         """Map `array` to the host for writing. Its old values may be lost, and no kernel may use it meanwhile."""
+        if array.changed is not None:
+            array.changed.wait()
         flags = cl.map_flags.WRITE_INVALIDATE_REGION
         values, _ = cl.enqueue_map_buffer(self._maps, array.buffer, flags, 0, array.shape, array.dtype)
         try:
@@ -183,7 +185,8 @@ class Session:
         # A runtime copies the pattern again and again, so a long one is faster.
         repeats = next((n for n in FILLED_TOGETHER if size % (n * array.dtype.itemsize) == 0), 1)
         if size:
-            cl.enqueue_fill_buffer(self.queue, array.buffer, np.full(repeats, value, array.dtype), 0, size)
+            pattern = np.full(repeats, value, array.dtype)
+            array.changed = cl.enqueue_fill_buffer(self.queue, array.buffer, pattern, 0, size)
 
     def finish(self) -> None:
         """Wait for everything that is enqueued."""
