@@ -33,7 +33,7 @@ from flexgs_edge.render.fit import (
     fits_whole,
     saves_bytes,
 )
-from flexgs_edge.render.residual import add_structure, target_residual
+from flexgs_edge.render.residual import add_structure, scale_residual, target_residual
 from flexgs_edge.render.statistics import Statistics, SumReader
 from flexgs_edge.render.tile_lists import list_tiles, sort_splats
 from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
@@ -286,13 +286,15 @@ class Renderer:
         self._blend(view, "blend_both", (hits, sums, residual), again=True)
         return sums
 
-    def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray, structure: float = 0.0) -> Any:
+    def gradient_sums(
+        self, scene: DeviceScene, camera: Camera, target: np.ndarray, structure: float = 0.0, weight: float = 1.0
+    ) -> Any:
         """Gradients of the loss of one view against `target`, for each splat, summed over pixels.
 
-        The loss is the squared error, plus `structure` times 1 - SSIM (`add_structure`). Let r be minus half of its
-        gradient by the view: target minus view, without structure. Let e be the light that a splat adds when its alpha
-        grows by its own size. The sums are sum(alpha T r) for red, green, blue, then sum(r e), then its moments about
-        the splat's centre: x, y, xx, xy, yy.
+        The loss is the squared error, plus `structure` times 1 - SSIM (`add_structure`), all times `weight`. Let r be
+        minus half of its gradient by the view: target minus view, without structure. Let e be the light that a splat
+        adds when its alpha grows by its own size. The sums are sum(alpha T r) for red, green, blue, then sum(r e), then
+        its moments about the splat's centre: x, y, xx, xy, yy.
 
         Returns
         -------
@@ -307,6 +309,8 @@ class Renderer:
         residual = target_residual(self.backend, view.buffers, target)
         if structure:
             add_structure(self.backend, view.buffers, camera, structure)
+        if weight != 1.0:
+            scale_residual(self.backend, view.buffers, weight)
         self._blend(view, "blend_backward", (hits, sums, residual), again=True)
         return sums
 

@@ -23,6 +23,12 @@ def target_residual(backend: Backend, buffers: ViewBuffers, target: np.ndarray) 
     return residual
 
 
+def scale_residual(backend: Backend, buffers: ViewBuffers, factor: float) -> None:
+    """Multiply the residual by `factor`."""
+    _, residual = buffers.reference_arrays()
+    backend.write(residual, backend.read(residual) * np.float32(factor))
+
+
 def add_structure(backend: Backend, buffers: ViewBuffers, camera: Camera, weight: float) -> None:
     """Add minus half the gradient of `weight` times the sum of 1 - SSIM, over windows and channels, to the residual.
 

@@ -30,6 +30,7 @@ from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
+from flexgs_edge.methods.best.layers import first_layer
 from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART, Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import LAST, Schedule, distil
@@ -84,6 +85,8 @@ class GridSearch(MultiplierSearch[GridScene]):
         Called with each candidate.
     steps : int
         Views that the descent to a candidate looks at. 0 (default): colours are refitted instead.
+    first : float
+        Share of the bits that a first layer gets. Descents to candidates draw it alone, too. 0 (default): there is none.
     """
 
     def __init__(
@@ -95,9 +98,10 @@ class GridSearch(MultiplierSearch[GridScene]):
         refit: bool = True,
         on_step: Callable[[Candidate], None] | None = None,
         steps: int = 0,
+        first: float = 0.0,
     ) -> None:
         super().__init__(rounds, measure, effort, on_step)
-        self.size_of, self.refit, self.steps = size_of, refit, steps
+        self.size_of, self.refit, self.steps, self.first = size_of, refit, steps, first
         if steps:
             self.pruned_part, self.keeps_best = descents.PRUNED_DISTILLED, True
         self._slopes: Slopes | None = None
@@ -213,7 +217,9 @@ class GridSearch(MultiplierSearch[GridScene]):
         return probe_slopes(original.bench.renderer, planes, original.origin, original.cameras, self.effort.probed)
 
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes) -> Planes:
-        return distil(kept.planes, kept.degrees, self.rounds.original, schedule, step_sizes)
+        original = self.rounds.original
+        first = first_layer(kept.planes, kept.degrees, self.first, self.bits, original) if self.first else None
+        return distil(kept.planes, kept.degrees, original, schedule, step_sizes, first=first)
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
         subsets = self.effort.subsets_of(len(self.rounds.original.cameras))

@@ -23,6 +23,7 @@ from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.growth import growth
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.original import Original
 
 HALF = 0.485
 """Share of the bits that stays when the last layer is cut off. It is below .5, so that half of a file's bytes hold the other
@@ -101,25 +102,67 @@ def assign_layers(
     GridScene
         The same Gaussians in the order of their layers.
     """
-    spent = np.array([bits.of_degree(degree) for degree in range(grid.sh_degree + 1)])[grid.sh_degrees]
-    layer = np.zeros(grid.count, np.uint8)
-    left = np.arange(grid.count)
-    renderer = bench.renderer
-    planes, storage = values_of(grid, renderer.storage), renderer.storage
+    storage = bench.renderer.storage
+    planes, left, layer = values_of(grid, storage), np.arange(grid.count), np.zeros(grid.count, np.uint8)
     for level, part in zip(range(len(parts), 0, -1), parts, strict=True):
-        end = part * spent[left].sum()
-        while len(left) > 1 and spent[left].sum() > end:  # the first layer is never empty
-            kept = take_rows(planes, left, storage)
-            for rows, (scales,) in read_ahead(len(left), kept["log_scales"]):
-                put_rows(kept["log_scales"], rows, scales + growth(len(left), grid.count))
-            with renderer.load(MemorySource(kept, origin=grid.origin), sum_bytes(2) + cost_bytes(0)) as scene:
-                costs = measure_costs(bench, scene, cameras, sh_costs=False, progress=progress)
-            worth = np.where(costs.weight2 > 0, costs.removal / spent[left], -1.0)
-            order = np.argsort(worth, kind="stable")
-            gone = np.cumsum(spent[left][order])
-            goal = gone[-1] - max(end, ROUND * gone[-1])
-            cut = order[: min(int(np.searchsorted(gone, goal)) + 1, len(left) - 1)]
-            layer[left[cut]] = level
-            left = np.delete(left, cut)
+        layer[left] = level
+        left = _worthiest(planes, grid.sh_degrees, left, part, bits, bench, cameras, grid.origin, progress)
+        layer[left] = 0
     order = np.argsort(layer, kind="stable")
     return replace(grid.take(order, storage), layer=layer[order])
+
+
+def first_layer(
+    planes: dict[str, np.ndarray], degrees: np.ndarray, share: float, bits: BitModel, original: Original
+) -> np.ndarray:
+    """[n] bool, the rows that a first layer of `share` of the bits should have, before a descent.
+
+    A part of the poses decides.
+
+    Parameters
+    ----------
+    planes : dict
+        Stored planes ([width, n] f32 by field).
+    degrees : np.ndarray
+        [n] u8, SH degrees.
+    share : float
+        Above 0, at most 1.
+    bits : BitModel
+        Bits of a row of each SH degree.
+    original : Original
+        Its renderer has nothing loaded.
+    """
+    some = original.cameras[:: -(-len(original.cameras) // LAYER_POSES)]
+    rows = np.arange(len(degrees))
+    inside = np.zeros(len(degrees), bool)
+    inside[_worthiest(planes, degrees, rows, share, bits, original.bench, some, original.origin)] = True
+    return inside
+
+
+def _worthiest(
+    planes: dict[str, np.ndarray],
+    degrees: np.ndarray,
+    left: np.ndarray,
+    part: float,
+    bits: BitModel,
+    bench: Bench,
+    cameras: Sequence[Camera],
+    origin: np.ndarray,
+    progress: Progress = SILENT,
+) -> np.ndarray:
+    """What stays of the rows `left` when all but `part` of their bits are gone, a fifth at a time. It is never empty."""
+    renderer, storage = bench.renderer, bench.renderer.storage
+    spent = np.array([bits.of_degree(degree) for degree in range(int(degrees.max(initial=0)) + 1)])[degrees]
+    end = part * spent[left].sum()
+    while len(left) > 1 and spent[left].sum() > end:
+        kept = take_rows(planes, left, storage)
+        for rows, (scales,) in read_ahead(len(left), kept["log_scales"]):
+            put_rows(kept["log_scales"], rows, scales + growth(len(left), len(degrees)))
+        with renderer.load(MemorySource(kept, origin=origin), sum_bytes(2) + cost_bytes(0)) as scene:
+            costs = measure_costs(bench, scene, cameras, sh_costs=False, progress=progress)
+        worth = np.where(costs.weight2 > 0, costs.removal / spent[left], -1.0)
+        order = np.argsort(worth, kind="stable")
+        gone = np.cumsum(spent[left][order])
+        goal = gone[-1] - max(end, ROUND * gone[-1])
+        left = np.delete(left, order[: min(int(np.searchsorted(gone, goal)) + 1, len(left) - 1)])
+    return left

@@ -170,7 +170,8 @@ def grid_search(
     plan = effort_of(options)
 
     def make(rounds: PruneRounds, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
-        return search(rounds, size_of, measure, plan, options.refit, report, rounds.original.steps)
+        first = HALF ** (options.layers - 1) if options.layers and options.layers > 1 else 0.0
+        return search(rounds, size_of, measure, plan, options.refit, report, rounds.original.steps, first)
 
     return make
 

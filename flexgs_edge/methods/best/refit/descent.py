@@ -11,6 +11,7 @@ from flexgs_edge.constants import LANES
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.methods.best.refit.chunk_state import PLANE_SETS, ChunkState, fields_of, widths
+from flexgs_edge.methods.best.refit.first_layer import WEIGHT, FirstLayer
 from flexgs_edge.methods.best.refit.prices import PRICES
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.fit import GRADIENT_SUMS, sum_bytes
@@ -51,6 +52,8 @@ class Descent:
         The largest view, from which memory is planned.
     structure : float
         Weight of the structural term of the loss (`Renderer.gradient_sums`).
+    first : FirstLayer, optional
+        Drawn alone by steps that ask for it.
 
     Raises
     ------
@@ -66,8 +69,9 @@ class Descent:
         origin: np.ndarray,
         camera: Camera,
         structure: float = 0.0,
+        first: FirstLayer | None = None,
     ) -> None:
-        self.renderer, self.backend, self.structure = renderer, renderer.backend, structure
+        self.renderer, self.backend, self.structure, self.first = renderer, renderer.backend, structure, first
         source = MemorySource(planes, origin=origin, sh_count=int(np.flatnonzero(degrees).max(initial=-1)) + 1)
         self.count, self.widths = source.count, widths(source.sh_degree)
         self._parts: list[ChunkState] = []
@@ -125,18 +129,30 @@ class Descent:
         self.backend.write(self._prices, prices)
         self._priced = True
 
-    def differentiate(self, camera: Camera, target: np.ndarray) -> None:
-        """Compute gradients of the loss of a view against `target` ([3, H, W] f16, as for `Renderer.residual_sums`)."""
-        sums = self.renderer.gradient_sums(self._scene, camera, target, self.structure)
+    def differentiate(self, camera: Camera, target: np.ndarray, alone: bool = False) -> None:
+        """Compute gradients of the loss of a view against `target` ([3, H, W] f16, as for `Renderer.residual_sums`).
+
+        With `alone`, the view shows the first layer alone, and its loss counts less.
+        """
+        if alone:
+            assert self.first is not None
+            for part in self._parts:
+                self.first.draw(self.backend, part.chunk.base, part.chunk.count, part.stored[0], part.stored[2])
+                part.activate()
+        weight = WEIGHT if alone else 1.0
+        sums = self.renderer.gradient_sums(self._scene, camera, target, self.structure, weight)
         for part in self._parts:
             part.differentiate(self.renderer.camera_array, self.renderer.records_array, sums, part.chunk.base)
 
-    def step(self, camera: Camera, target: np.ndarray, rates: dict[str, float]) -> None:
-        """Take one step of Adam down the squared error of a view; `rates` are the largest changes of each field's values."""
-        self.differentiate(camera, target)
+    def step(self, camera: Camera, target: np.ndarray, rates: dict[str, float], alone: bool = False) -> None:
+        """Take one step of Adam down the loss of a view; `rates` are the largest changes of each field's values.
+
+        With `alone`, that is the first layer's, in which bits cost nothing.
+        """
+        self.differentiate(camera, target, alone)
         self.backend.write(self._rates, rate_record(rates, self.widths))
         for part in self._parts:
-            if self._priced:
+            if self._priced and not alone:
                 part.price(self._prices)
             part.step(self._rates)
         self._snap()

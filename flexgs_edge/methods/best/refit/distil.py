@@ -14,6 +14,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.memory.storage import Storage
+from flexgs_edge.methods.best.refit.first_layer import EVERY, FirstLayer
 from flexgs_edge.methods.best.refit.prices import bit_prices
 from flexgs_edge.methods.best.refit.streamed_descent import open_descent
 from flexgs_edge.scene.rotations import canonical_axes
@@ -134,6 +135,7 @@ def distil(
     step_sizes: StepSizes | None = None,
     rates: dict[str, float] | None = None,
     structure: float = STRUCTURE,
+    first: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """Move all values of a scene towards the original's renders.
 
@@ -153,6 +155,8 @@ def distil(
         Rates by field, in place of those of `rates_for`.
     structure : float
         Weight of 1 - SSIM in the loss, beside the squared error.
+    first : np.ndarray, optional
+        [n] bool, rows of a first layer. Further steps move them so that the layer alone looks well, too (`FirstLayer`).
 
     Returns
     -------
@@ -171,7 +175,8 @@ def distil(
     # Rows with SH come first, so that the other chunks are drawn without SH.
     rows = np.argsort(degrees == 0, kind="stable")
     ordered, degrees = _canonical(planes, rows, storage), degrees[rows]
-    with open_descent(renderer, ordered, degrees, original.origin, largest, structure) as descent:
+    layer = None if first is None or not first.any() else FirstLayer(first[rows])
+    with open_descent(renderer, ordered, degrees, original.origin, largest, structure, layer) as descent:
         if step_sizes is not None and schedule.multiplier > 0 and len(degrees):
             worth = course.bit_weight * schedule.multiplier / len(original.cameras)
             descent.price(bit_prices(ordered, degrees, step_sizes, worth))
@@ -189,6 +194,8 @@ def distil(
                 now = schedule.rate * last ** ((k - falling.start) / len(falling))
                 moving = {name: 0.0 if name in held else now * rate for name, rate in rates.items()}
                 descent.step(cameras[order[k]], original.references[order[k]], moving)
+                if layer is not None and k % EVERY == EVERY - 1:
+                    descent.step(cameras[order[k]], original.references[order[k]], moving, alone=True)
                 if place:
                     # A plain mean first, then one that forgets: single views then decide little.
                     descent.follow(max(1.0 / (k - part.start + 1), 1.0 / max(course.mean_views * len(cameras), 1.0)))
