@@ -80,7 +80,7 @@ def evaluate(
         stack.callback(judge.close)
         with clock.stage("references"), renderer.load(run.source) as original:
             judge.prepare(original, progress)
-        with clock.stage("measure"), renderer.load(scene.source) as compressed:
+        with clock.stage("measure"), renderer.load(scene.drawn) as compressed:
             quality = judge.compare(compressed, with_ssim=True, progress=progress, lpips=distance, flip=True)
             if reporter is not None:
                 reporter.look(judge, compressed, quality, clock, progress)

@@ -69,7 +69,7 @@ def render_views(
     with open_bench(run) as bench:
         renderer = bench.renderer
         with clock.stage("load"):
-            device_scene = renderer.load(run.source)
+            device_scene = renderer.load(run.scene.drawn)
         with device_scene:
             started = time.perf_counter()
             with clock.stage("warm up"):

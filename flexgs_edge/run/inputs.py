@@ -18,6 +18,7 @@ from flexgs_edge.report.run_info import SceneInfo
 from flexgs_edge.run.open_scene import open_file
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.scene.check import check_scene
+from flexgs_edge.scene.growth import GrownSource
 from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.source import SceneSource
 
@@ -46,6 +47,8 @@ class CheckedScene:
         Bytes of the input file, or of all files that were read; `None` for a scene from memory.
     frame : Frame
         Directions of the axes in the file.
+    whole : int or None
+        Gaussians of the scene that a cut file is a part of.
     """
 
     path: Path | None
@@ -56,6 +59,12 @@ class CheckedScene:
     held_bytes: int = 0
     file_bytes: int | None = None
     frame: Frame = RDF
+    whole: int | None = None
+
+    @property
+    def drawn(self) -> SceneSource:
+        """The scene as pictures show it: what is left of a file that was cut is drawn larger."""
+        return self.source if self.whole is None else GrownSource(self.source, self.whole)
 
     @property
     def ply_bytes(self) -> int:
@@ -101,6 +110,7 @@ def checked_scene(opened: SceneSource, path: Path | None = None, drop_invalid: b
         opened.sh_degree,
         dict(opened.settings),
         opened.held_bytes,
+        whole=opened.whole,
     )
 
 

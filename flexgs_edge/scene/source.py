@@ -58,6 +58,8 @@ class SceneSource(ABC):
         Bytes of all files that the scene was read from, if there are several. `None`: the size of its only file.
     version : int or None
         Version of the format that the file states.
+    whole : int or None
+        Gaussians of the scene that a cut file is a part of.
     """
 
     name: str
@@ -72,6 +74,7 @@ class SceneSource(ABC):
     held_bytes: int = 0
     file_bytes: int | None = None
     version: int | None = None
+    whole: int | None = None
 
     @abstractmethod
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:

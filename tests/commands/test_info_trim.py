@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from camera_files import write_inria
 from flexgs_edge.cli import app
 from flexgs_edge.codec.open_fgs import read_header
 from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v2.channels import Channels
 from flexgs_edge.codec.v2.container import channel_bytes, write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
+from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
+from flexgs_edge.commands.render import render_views
 from flexgs_edge.commands.trim import trim
 from flexgs_edge.commands.verify import verify
 from flexgs_edge.errors import FormatError, InputError, TargetError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import from_grid
+from flexgs_edge.io.ply import write_ply
+from flexgs_edge.run.inputs import load_scene
 from flexgs_edge.run.open_scene import open_scene
+from flexgs_edge.scene.growth import GrownSource
 from grid_scenes import make_grid
 from quantized_scenes import make_scene, quantize_all
+from synthetic import look_from, make_camera
 
 SETTINGS = {"source_count": 4000, "source_sh_degree": 2, "target": "drop <= 1 dB"}
 
@@ -169,6 +177,28 @@ def test_trim_keeps_whole_layers(tmp_path: Path) -> None:
     with pytest.raises(TargetError, match=f"first layer needs {sizes[2]} bytes, {most} are allowed"):
         trim(path, tmp_path / "none.fgs", most)
     assert not (tmp_path / "none.fgs").exists() and not list(tmp_path.glob("*.tmp*"))
+
+
+def test_cut_files_are_drawn_larger(tmp_path: Path) -> None:
+    """As docs/drawing.md says, by `render` and by `evaluate`."""
+    path, _ = written(tmp_path)
+    cut, grown = tmp_path / "cut.fgs", tmp_path / "grown.ply"
+    trim(path, cut, path.stat().st_size - 1)
+    source = open_scene(cut)
+    assert load_scene(path).drawn.count == 900 and load_scene(cut).drawn.count == source.count < 900
+    write_ply(grown, GrownSource(source, 900))
+    poses = [dict(zip(("rotation", "translation"), look_from(seed), strict=True)) for seed in (1, 2)]
+    cameras = [make_camera(64, 48, name=f"v{k}", **pose).moved(-source.origin) for k, pose in enumerate(poses)]
+    words: dict[str, Any] = {"device": "numpy", "cameras": str(write_inria(tmp_path / "cameras.json", cameras))}
+    pictures = [
+        [Path(file).read_bytes() for file in render_views(scene, tmp_path / scene.stem, None, **words).files]
+        for scene in (cut, grown, path)
+    ]
+    assert pictures[0] == pictures[1] != pictures[2]
+    write_ply(tmp_path / "plain.ply", source)
+    scenes = cut, grown, tmp_path / "plain.ply"
+    lost = [evaluate(scene, path, holdout=0, **words).quality.fidelity for scene in scenes]
+    assert lost[0] == pytest.approx(lost[1], rel=1e-6) and lost[0] != pytest.approx(lost[2], rel=1e-3)
 
 
 def test_trim_refuses(tmp_path: Path) -> None:

@@ -79,8 +79,10 @@ def test_what_is_there_of_a_cut_file_is_drawn_larger(
     cut, grown = tmp_path / "cut.fgs", tmp_path / "grown.ply"
     trim(scene, cut, scene.stat().st_size - 1)
     write_ply(grown, GrownSource(whole.select(np.arange(count)), whole.count))
-    (file,) = render_views(grown, tmp_path, views=[3], cameras=cameras, device="numpy").files
+    (file,) = render_views(grown, tmp_path / "grown", views=[3], cameras=cameras, device="numpy").files
     wanted = np.asarray(Image.open(file), np.float64)
+    (file,) = render_views(cut, tmp_path / "cut", views=[3], cameras=cameras, device="numpy").files
+    np.testing.assert_array_equal(np.asarray(Image.open(file)), wanted)
     with served(cut, cameras) as address:
         go(tab, address)
         assert decibels(picture(tab, 3, wanted.shape[1], wanted.shape[0]), wanted) >= 50

@@ -53,6 +53,7 @@ class GridSource(SceneSource):
         self.count, self.sh_degree = header.count, header.sh_degree
         self.sh_count = self.count if self.sh_degree else 0
         self.origin = np.array(header.origin, np.float64)
+        self.whole = None if header.cut_from is None else header.cut_from["count"]
         # A code times a step is finite. Only squares of absurd rotations and colours could leave float32, so the steps
         # tell enough. A check of the values would decode the file twice more.
         steps = header.grid_steps
