@@ -348,9 +348,9 @@ def test_descents_between_the_rounds_are_not_done_again(
     moved: list[int] = []
     whole, descend = GridSearch._whole, grid_search.distil
 
-    def distil(planes: Any, degrees: Any, original: Original, schedule: Schedule, *more: Any) -> Any:
+    def distil(planes: Any, degrees: Any, original: Original, schedule: Schedule, *more: Any, **words: Any) -> Any:
         moved.append(schedule.iterations)
-        return descend(planes, degrees, original, schedule, *more)
+        return descend(planes, degrees, original, schedule, *more, **words)
 
     def stop(*_: Any) -> Any:
         raise Stop
