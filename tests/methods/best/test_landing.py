@@ -12,6 +12,7 @@ from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.methods.best.landing import (
     DESCENDED_SHARE,
+    DESCENDED_TRIES,
     NEAR_QUALITY,
     QUALITY_TRIES,
     REACH,
@@ -115,8 +116,8 @@ def test_each_bound_rises_at_its_own_pace(grid: GridScene) -> None:
         seen.append((-0.1 - gone, -0.2 + 3 * gone))
         return [*seen[-1]]
 
-    land_on_quality(grid, np.random.default_rng(1).random(COUNT), [-0.1, -0.2], attempt, IN_MEMORY)
-    assert len(seen) == 2 and -NEAR_QUALITY <= seen[-1][1] <= 0.0
+    land_on_quality(grid, np.random.default_rng(1).random(COUNT), [-0.1, -0.2], attempt, IN_MEMORY, descended=True)
+    assert 2 <= len(seen) <= DESCENDED_TRIES and -NEAR_QUALITY <= seen[-1][1] <= 0.0
 
 
 def test_fewer_go_behind_a_descent(grid: GridScene) -> None:
