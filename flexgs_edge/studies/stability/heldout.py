@@ -12,6 +12,7 @@ from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.plots import BarChart
+from flexgs_edge.run.few_poses import evenly
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
@@ -19,7 +20,7 @@ from flexgs_edge.studies.stability.amounts import Amounts
 from flexgs_edge.studies.stability.breaks import BREAK, LOST, mean_loss, number, view_loss
 from flexgs_edge.studies.stability.contenders import BEST, MARGIN, WORDS, Contenders
 from flexgs_edge.studies.stability.ours import Whole, search
-from flexgs_edge.studies.stability.unseen_poses import TILE_SIDE, evenly, worst_tile
+from flexgs_edge.studies.stability.unseen_poses import TILE_SIDE, worst_tile
 from flexgs_edge.studies.study_scene import StudyScene
 
 EVEN, HELD = "best, decided on even views", "best, --max-worst-drop"

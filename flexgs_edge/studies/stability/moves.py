@@ -21,6 +21,7 @@ from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.plots import BarChart
+from flexgs_edge.run.few_poses import evenly
 from flexgs_edge.run.inputs import load_scene
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.view_set import ViewSet
@@ -33,7 +34,6 @@ from flexgs_edge.studies.stability.baselines import half_positions
 from flexgs_edge.studies.stability.breaks import BREAK, LOST, number
 from flexgs_edge.studies.stability.moved_scene import NO_TURN, Similarity
 from flexgs_edge.studies.stability.ours import Whole, scored_pixels, walked, whole_at
-from flexgs_edge.studies.stability.unseen_poses import evenly
 from flexgs_edge.studies.study_scene import StudyScene
 from flexgs_edge.views.bench import Bench
 

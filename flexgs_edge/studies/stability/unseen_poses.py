@@ -12,6 +12,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.generated import at_distance, between
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.report.plots import BarChart, LineChart
+from flexgs_edge.run.few_poses import evenly
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
 from flexgs_edge.studies.stability.amounts import Amounts
@@ -46,12 +47,6 @@ class Poses:
     kind: str
     amount: float | None
     cameras: list[Camera]
-
-
-def evenly(cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """`count` cameras, evenly spread over the list; all if there are no more."""
-    count = min(count, len(cameras))
-    return [cameras[i * len(cameras) // count] for i in range(count)]
 
 
 def above(camera: Camera, depth: float, degrees: float) -> Camera:

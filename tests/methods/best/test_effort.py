@@ -1,0 +1,74 @@
+"""Efforts: who descends, and at which pixels of which poses scenes are scored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexgs_edge.methods.best.effort import (
+    EFFORTS,
+    LARGEST_STEP,
+    LEAST_STEPS,
+    distil_steps,
+    sampled_poses,
+    sampling_steps,
+)
+from flexgs_edge.run.options import CompressOptions
+from known_search import EFFORT
+from synthetic import make_camera
+
+
+def test_efforts_grow() -> None:
+    fast, balanced, most = EFFORTS.values()
+    for name in ("keep", "refit_rounds", "steps", "views", "passes"):
+        assert getattr(fast, name) <= getattr(balanced, name) <= getattr(most, name)
+        assert getattr(fast, name) < getattr(most, name)
+    assert fast.close > balanced.close > most.close
+    assert fast.passes == 0 < balanced.passes < most.passes
+
+
+def test_who_descends() -> None:
+    passes, least = EFFORTS["balanced"].passes, EFFORTS["balanced"].descends
+    assert distil_steps(CompressOptions(), 100, 1000 * least) == round(100 * passes)
+    assert distil_steps(CompressOptions(), 2, least) == LEAST_STEPS
+    assert distil_steps(CompressOptions(), 100, least - 1) == 0 < distil_steps(CompressOptions(), 100, least)
+    assert distil_steps(CompressOptions(effort="max"), 100, least - 1) > 0
+    assert distil_steps(CompressOptions(distil=7), 100, least - 1) == 7
+    for words, foreign in (({"distil": 0}, False), ({"refit": False}, False), ({"effort": "fast"}, False), ({}, True)):
+        assert distil_steps(CompressOptions(**words), 100, least, foreign) == 0, (words, foreign)
+
+
+@pytest.mark.parametrize(("count", "step"), [(10, LARGEST_STEP), (100, 3), (240, 2), (260, 1), (10**6, 1)])
+def test_poses_have_no_more_pixels_than_the_rows_need(count: int, step: int) -> None:
+    cameras = [make_camera(64, 48) for _ in range(8)]
+    assert sampling_steps(cameras, 24 * count) == [step] * 8
+    assert sampling_steps(cameras, 24 * count, 0.5) == sampling_steps(cameras, 48 * count)
+    assert sampling_steps(cameras, 24 * count, 0.0) == [1] * 8
+    sampled = sampled_poses(cameras, [step] * 8)
+    assert {camera.width for camera in sampled} == {-(-64 // step)} | ({64 // step} if 64 % step else set())
+    if 1 < step < LARGEST_STEP:
+        pixels = sum(camera.width * camera.height for camera in sampled)
+        assert pixels >= 24 * count
+    # Not the same lattice in every view.
+    assert len({(camera.cx, camera.cy) for camera in sampled}) == min(step**2, 8)
+
+
+def test_poses_get_pixels_by_their_weights() -> None:
+    """About in proportion, between all of them and one of the largest step; never fewer in all than the rows need."""
+    cameras = [make_camera(64, 48) for _ in range(4)]
+    weights = np.array([1.0, 0.25, 1 / 9, 1e-6])
+    assert sampling_steps(cameras, 1, weights=weights) == [4, 4, 4, 4]
+    assert sampling_steps(cameras, 4300, weights=weights) == [1, 2, 3, 4]
+    assert sampling_steps(cameras, 4 * 64 * 48, weights=weights) == [1, 1, 1, 1]
+    for pixels in range(800, 12_000, 700):
+        steps = sampling_steps(cameras, pixels, weights=weights)
+        assert steps == sorted(steps) and sum((64 // step) * (48 // step) for step in steps) >= pixels
+
+
+def test_large_scenes_are_scored_from_more_poses() -> None:
+    effort = replace(EFFORT, few=3, views=6, pixels=10)
+    pixels = [100] * 9
+    assert [effort.poses_of(pixels, count) for count in (1, 30, 31, 40, 41, 60, 1000)] == [3, 3, 4, 4, 5, 6, 6]
+    assert effort.poses_of(pixels[:2], 1) == effort.poses_of(pixels[:2], 1000) == 2
