@@ -15,7 +15,7 @@ ORDER = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 """Fields in the order of a gradient's planes (cl_kernels/backward.cl)."""
 DECAYS = (0.9, 0.99)
 """Decay of Adam's running means of gradients and of their squares. The usual 0.999 of the second would remember longer than
-a descent of a few hundred views lasts."""
+a descent of a few hundred views lasts: docs/results/tuning.md#decays"""
 WIDE = 0.055
 """A Gaussian whose largest deviation is above this share of its depth takes steps that are shorter by the same factor. Full
 steps would make haze that no scored pose sees: docs/results/tuning.md#wide"""
