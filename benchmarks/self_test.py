@@ -208,11 +208,6 @@ REASONS = {
     ("blend_cpu.cl", "any_alive", ">"): "a transmittance is never 0: pixels end before",
     ("backward.cl", "project_backward", ">"): "at equality the quotient is 1, as without it",
     ("flip.cl", "flip_pair", "<"): "both pieces of the curve meet there",
-    (
-        "similarity.cl",
-        "dssim_slopes",
-        "<",
-    ): "one number behind the window is read, which is 0 here; Oclgrind reports it",
     ("sort.cl", "exclusive_scan", "<"): "one turn more, in which no block is left",
     ("common.clh", "smaller", "<"): "of two equal numbers it does not matter which is taken",
     ("common.clh", "larger", ">"): "of two equal numbers it does not matter which is taken",

@@ -152,6 +152,7 @@ class StreamedDescent:
 
     def step(self, camera: Camera, target: np.ndarray, rates: dict[str, float], alone: bool = False) -> None:
         """As `Descent.step`."""
+        assert self.first is not None or not alone
         if alone != (self._planes.alone is not None):
             self._planes.alone = self.first if alone else None
             self._planes.bounds.clear()
