@@ -144,10 +144,10 @@ MUTATIONS = (
     ),
     Mutation("no near plane", "project.cl", "MASK(z > CAM(16))", "MASK(z > (FW)0.0f)"),
     Mutation("near plane itself is drawn", "project.cl", "MASK(z > CAM(16))", "MASK(z >= CAM(16))"),
-    Mutation("no opacity cull", "activate.cl", "pick(MASK(opacity >= (FW)ALPHA_MIN), level, (FW)-INFINITY)", "level"),
+    Mutation("no opacity cull", "activate.clh", "pick(MASK(opacity >= (FW)ALPHA_MIN), level, (FW)-INFINITY)", "level"),
     Mutation(
         "quaternions not normalised",
-        "activate.cl",
+        "activate.clh",
         "inv = quotient((FW)1.0f, sqrt(fma(z, z, fma(y, y, fma(x, x, w * w)))))",
         "inv = (FW)1.0f",
     ),
@@ -156,7 +156,7 @@ MUTATIONS = (
         "compensation by the area's ratio, not its root", "project.cl", "fma((FW)0.5f, flog2(", "fma((FW)1.0f, flog2("
     ),
     Mutation("sign in the area before dilation", "project.cl", "nz = fma(g00, g11, -(", "nz = fma(g00, g11, ("),
-    Mutation("factor's rows not made orthogonal", "activate.cl", "m20 = fma(-yz, ux, m20)", "m20 = m20"),
+    Mutation("factor's rows not made orthogonal", "activate.clh", "m20 = fma(-yz, ux, m20)", "m20 = m20"),
     Mutation("determinant not checked", "project.cl", "MASK(det < (FW)INFINITY)", "MASK(det == det)"),
     Mutation(
         "hit counted on the splat that ends",
@@ -226,10 +226,15 @@ MUTATIONS = (
         "descent without Adam's correction",
         "whole_first = quotient((FW)1.0f, (FW)1.0f - power_first)",
         "whole_first = (FW)1.0f",
+        "descend.cl",
         reference=False,
     ),
     backward(
-        "descent: opposite quaternions on the grid", "inv = pick(MASK(w < (FW)0.0f), -inv, inv);", "", reference=False
+        "descent: opposite quaternions on the grid",
+        "inv = pick(MASK(w < (FW)0.0f), -inv, inv);",
+        "",
+        "descend.cl",
+        reference=False,
     ),
     Mutation("SSIM: variance not about the mean", "similarity.cl", "(m[2] - aa)", "m[2]", tests=SIMILARITY),
     Mutation(

@@ -75,7 +75,7 @@ class Recorder:
         array.release = release
         return array
 
-    def write(self, array: Any, values: np.ndarray, offset: int = 0) -> None:
+    def write(self, array: Any, values: np.ndarray, offset: int = 0, stays: bool = False) -> None:
         """Write, and note it."""
         self.backend.write(array, values, offset)
         values = np.ascontiguousarray(values, array.dtype)

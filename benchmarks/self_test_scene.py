@@ -11,7 +11,16 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
-from flexgs_edge.constants import LOG2_ALPHA_MAX, LOG2_ALPHA_MIN, ROW_BLOCK, SUM_LANES, TILE, TRANSMITTANCE_MIN
+from flexgs_edge.constants import (
+    LOG2_ALPHA_MAX,
+    LOG2_ALPHA_MIN,
+    ROW_BLOCK,
+    ROW_SPAN,
+    SSIM_WINDOW,
+    SUM_LANES,
+    TILE,
+    TRANSMITTANCE_MIN,
+)
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.kernels.twins.arithmetic import fexp2
@@ -148,9 +157,11 @@ def edges(backend: Any) -> None:
     ones = np.ones((1, rows), f32)
     powers = np.stack([some % 2 + 0.5, some % 2 + 0.25]).astype(f32) * f32(0.4)
     pace = ((some % 5 > 0) / (some % 4 + 1)).astype(f32)
+    values, drawn = np.tile(ones, (14, 1)), [np.zeros((width, rows), f32) for width in (3, 3, 4, 1, 3, 1, 6, 1)]
     call(
-        backend, "adam", rows, rows, 1, 0.9, 0.999, np.array([0.01], f32), pace, gradient[None], powers,
-        gradient[::-1][None] * f32(1e-3), ones * f32(1e-29), ones,
+        backend, "descend", rows, rows, 0, 14, 0, 0, 1, 0.9, 0.999, 0.25, np.full(14, 0.01, f32), np.zeros(33, f32),
+        np.full(14, 0.125, f32), np.zeros(rows, np.uint32), pace, np.tile(gradient, (14, 1)), powers,
+        np.tile(gradient[::-1] * f32(1e-3), (14, 1)), values * f32(1e-29), values, values * f32(0.5), *drawn,
     )  # fmt: skip
     # Costs: both words, sums at the ends of their range.
     sums = np.empty((rows, 2), np.int64)
@@ -208,28 +219,27 @@ def edges(backend: Any) -> None:
             *extra,
         )  # fmt: skip
 
-    # Pixels at the ends of what a screen shows, where the structural term has a gradient.
-    pixels = np.array([0, 1, -0.5, 0.5, 1.5], f32)[some % 5]
-    taps, sums_of = (
-        np.array([0.25, 0.5, 0.25], f32),
-        np.stack([some % 3 + 1, some % 4 - 2, some % 5 + 0.5, some]).astype(f32)[:3],
-    )
-    wide = np.pad(sums_of, ((0, 0), (0, 4)))
+    # Who reads behind the window's taps finds no zeros.
+    moments = np.stack([some % 5, some % 3, some % 7, some % 4, some % 6]).astype(f32) / 8
     call(
         backend,
-        "dssim_residual",
+        "ssim_rows",
         rows,
         rows,
-        0,
-        rows + 4,
-        0.5,
-        3,
-        taps,
-        wide,
-        pixels,
-        pixels.astype(np.float16),
-        pixels / 4,
+        2 * rows,
+        np.full(2 * SSIM_WINDOW, 0.125, f32),
+        np.tile(moments, 2),
+        some.astype(f32),
     )
+    # Pixels at the ends of what a screen shows, where the structural term has a gradient.
+    pixels = np.array([0, 1, -0.5, 0.5, 1.5], f32)[some % 5]
+    taps = np.array([0.25, 0.5, 0.25], f32)
+    slopes_of = (np.stack([some % 3 + 1, some % 4 - 2, some % 5 + 0.5])).astype(f32)
+    slopes = np.tile(np.pad(slopes_of, ((0, 0), (0, 3 * rows))), (3, 1, 1))
+    call(
+        backend, "dssim_residual", 3 * ROW_SPAN, ROW_SPAN, 1, rows, rows, 4 * rows, 0.5, 3, taps, slopes,
+        np.tile(pixels, (3, 1)), np.tile(pixels, (3, 1)).astype(np.float16), np.tile(pixels / 4, (3, 1)),
+    )  # fmt: skip
 
 
 def for_degree(backend: Any, budget: MemoryBudget, degree: int) -> None:
@@ -254,9 +264,9 @@ def for_degree(backend: Any, budget: MemoryBudget, degree: int) -> None:
             if put:
                 descent.put_on(STEPS)
                 descent.price(bit_prices(planes, degrees, STEPS, WORTH))
-            for _ in range(2):
-                descent.step(view, target, {"means": 1e-2, **FIELD_RATES})
-            descent.follow(0.5)
+            for share in (0.0, 0.5):
+                descent.step(view, target, {"means": 1e-2, **FIELD_RATES}, share=share)
+        descent.settle()
         descent.planes()
     drawer.release()
 

@@ -12,6 +12,12 @@ inline FW flip_power(FW x, FW p) {
 
 inline FW flip_mix(FW r, FW g, FW b, float wr, float wg, float wb) { return ((FW)wr * r + (FW)wg * g) + (FW)wb * b; }
 
+// Light of an sRGB value in [0, 1].
+inline FW flip_line(FW s) {
+  const FW curve = flip_power(quotient(s + (FW)0.055f, (FW)1.055f), (FW)2.4f);
+  return pick(MASK(s > (FW)0.04045f), curve, quotient(s, (FW)12.92f));
+}
+
 // sRGB in [0, 1] becomes light, red against green and yellow against blue: Y, X - Y and Y - Z.
 __kernel void flip_colours(
     const uint count,                   // elements of a plane that are wanted
@@ -19,15 +25,10 @@ __kernel void flip_colours(
     __global float *planes)             // [3, plane]
 {
   const size_t i = get_global_id(0) * W;
-  FW line[3];
-  for (int c = 0; c < 3; ++c) {
-    const FW s = LOADF(planes + (size_t)c * plane, i);
-    const FW curve = flip_power(quotient(s + (FW)0.055f, (FW)1.055f), (FW)2.4f);
-    line[c] = pick(MASK(s > (FW)0.04045f), curve, quotient(s, (FW)12.92f));
-  }
-  const FW x = flip_mix(line[0], line[1], line[2], FLIP_XYZ_0, FLIP_XYZ_1, FLIP_XYZ_2);
-  const FW y = flip_mix(line[0], line[1], line[2], FLIP_XYZ_3, FLIP_XYZ_4, FLIP_XYZ_5);
-  const FW z = flip_mix(line[0], line[1], line[2], FLIP_XYZ_6, FLIP_XYZ_7, FLIP_XYZ_8);
+  const FW r = flip_line(LOADF(planes, i)), g = flip_line(LOADF(planes + plane, i)), b = flip_line(LOADF(planes + 2 * (size_t)plane, i));
+  const FW x = flip_mix(r, g, b, FLIP_XYZ_0, FLIP_XYZ_1, FLIP_XYZ_2);
+  const FW y = flip_mix(r, g, b, FLIP_XYZ_3, FLIP_XYZ_4, FLIP_XYZ_5);
+  const FW z = flip_mix(r, g, b, FLIP_XYZ_6, FLIP_XYZ_7, FLIP_XYZ_8);
   STOREF(y, planes, i);
   STOREF(x - y, planes + plane, i);
   STOREF(y - z, planes + 2 * (size_t)plane, i);

@@ -2,7 +2,12 @@
 // It is a counting sort by tile. The depth-ordered splats are cut into blocks. On CPUs a work-item walks a block, on GPUs a work-group does.
 // Twins: flexgs_edge.kernels.twins.tiles
 
-#define BANDS 16   // block rows (4 pixels high) worked on at a time: four rows of tiles
+// Block rows (4 pixels high) worked on at a time: four rows of tiles, or one on GPUs, where each has a work-item.
+#ifdef GROUP
+#define BANDS 4
+#else
+#define BANDS 16
+#endif
 #define EMPTY_FIRST (1 << 28)
 #define EMPTY_LAST (-1)
 
@@ -42,37 +47,40 @@ inline int tile_row(float y, float height) {
   return (int)(y > 0.0f ? y < last ? y : last : 0.0f) / TILE;
 }
 
-// Calls EACH(tile, mask) for every tile in which the splat may show.
-#define FOR_EACH_TILE(EACH)                                                                                     \
-  __global const float *r = records + (size_t)ids[n] * 16;                                                      \
+// First and last row of tiles that a splat may reach; none if the first is beyond the last.
+inline int2 rows_of_tiles(__global const float *r, float height, int inria_extent, int tiles_y) {
+  if (inria_extent) {
+    const int y0 = (int)fmax(floor((r[1] - r[15]) * (1.0f / TILE)), 0.0f);
+    return (int2)(y0, (int)fmin(floor((r[1] + r[15] + (TILE - 1)) * (1.0f / TILE)) - 1.0f, (float)(tiles_y - 1)));
+  }
+  const float slack = fma(r[10], SPAN_SLACK_RELATIVE, SPAN_SLACK);
+  return (int2)(tile_row(r[1] - r[10] - slack, height), tile_row(r[1] + r[10] + slack, height));
+}
+
+// Calls EACH(tile, mask) for every tile in which the splat of record `r` may show, in BANDS / 4 rows of tiles from `top` on, of those up
+// to `ty1`.
+#define FOR_EACH_TILE(r, top, ty1, EACH)                                                                        \
   if (inria_extent) {                                                                                           \
-    const float radius = r[15];                                                                                 \
-    const int x0 = (int)fmax(floor((r[0] - radius) * (1.0f / TILE)), 0.0f);                                     \
-    const int y0 = (int)fmax(floor((r[1] - radius) * (1.0f / TILE)), 0.0f);                                     \
-    const int x1 = (int)fmin(floor((r[0] + radius + (TILE - 1)) * (1.0f / TILE)) - 1.0f, (float)(tiles_x - 1)); \
-    const int y1 = (int)fmin(floor((r[1] + radius + (TILE - 1)) * (1.0f / TILE)) - 1.0f, (float)(tiles_y - 1)); \
-    for (int ty = y0; ty <= y1; ++ty)                                                                           \
+    const int x0 = (int)fmax(floor((r[0] - r[15]) * (1.0f / TILE)), 0.0f);                                      \
+    const int x1 = (int)fmin(floor((r[0] + r[15] + (TILE - 1)) * (1.0f / TILE)) - 1.0f, (float)(tiles_x - 1));  \
+    for (int ty = top; ty <= ty1 && ty < top + BANDS / 4; ++ty)                                                 \
       for (int tx = x0; tx <= x1; ++tx) EACH(ty * tiles_x + tx, 0xFFFFu);                                       \
   } else {                                                                                                      \
-    const float slack = fma(r[10], SPAN_SLACK_RELATIVE, SPAN_SLACK);                                            \
-    const int ty0 = tile_row(r[1] - r[10] - slack, height), ty1 = tile_row(r[1] + r[10] + slack, height);       \
-    for (int top = ty0; top <= ty1; top += BANDS / 4) {                                                         \
-      int first[BANDS], last[BANDS];                                                                            \
-      const int bands = min(BANDS, 4 * (ty1 - top + 1));                                                        \
-      for (int v = 0; v < bands; v += W) {                                                                      \
-        IW f, l;                                                                                                \
-        block_spans(r, top * 4 + v, width, &f, &l);                                                             \
-        STOREI(f, first, v);                                                                                    \
-        STOREI(l, last, v);                                                                                     \
-      }                                                                                                         \
-      for (int t = 0; t < BANDS / 4 && top + t <= ty1; ++t) {                                                   \
-        const int4 f4 = vload4(t, first), l4 = vload4(t, last);                                                 \
-        const int from = min(min(f4.s0, f4.s1), min(f4.s2, f4.s3));                                             \
-        const int to = max(max(l4.s0, l4.s1), max(l4.s2, l4.s3));                                               \
-        for (int tx = from >> 2; tx <= to >> 2; ++tx) {                                                         \
-          const uint mask = tile_mask(f4, l4, tx);                                                              \
-          if (mask) EACH((top + t) * tiles_x + tx, mask);                                                       \
-        }                                                                                                       \
+    int first[BANDS], last[BANDS];                                                                              \
+    const int bands = min(BANDS, 4 * (ty1 - top + 1));                                                          \
+    for (int v = 0; v < bands; v += W) {                                                                        \
+      IW f, l;                                                                                                  \
+      block_spans(r, top * 4 + v, width, &f, &l);                                                               \
+      STOREI(f, first, v);                                                                                      \
+      STOREI(l, last, v);                                                                                       \
+    }                                                                                                           \
+    for (int t = 0; t < BANDS / 4 && top + t <= ty1; ++t) {                                                     \
+      const int4 f4 = vload4(t, first), l4 = vload4(t, last);                                                   \
+      const int from = min(min(f4.s0, f4.s1), min(f4.s2, f4.s3));                                               \
+      const int to = max(max(l4.s0, l4.s1), max(l4.s2, l4.s3));                                                 \
+      for (int tx = from >> 2; tx <= to >> 2; ++tx) {                                                           \
+        const uint mask = tile_mask(f4, l4, tx);                                                                \
+        if (mask) EACH((top + t) * tiles_x + tx, mask);                                                         \
       }                                                                                                         \
     }                                                                                                           \
   }
@@ -129,32 +137,53 @@ __kernel LISTERS void tile_count(
   uint start, end;
   splat_range(from, count, &start, &end);
 #ifdef GROUP
-  // Each work-item has one splat of LIST_GROUP: it counts its tiles, and drafts them behind those of the splats before.
-  __local uint found[LIST_GROUP];
+  // Of LIST_GROUP splats, each work-item has one row of tiles at a time, so that a large splat does not keep the others waiting. It
+  // counts its tiles, and drafts them behind those of the rows before.
+  __local uint found[LIST_GROUP], rows[LIST_GROUP];
   const uint p = get_local_id(0);
   for (int tile = (int)p; tile < tiles_x * tiles_y; tile += LIST_GROUP) own[tile] = 0;
   barrier(CLK_GLOBAL_MEM_FENCE);
   uint drafted = 0;
 #define COUNT_PAIR(tile, mask) (mine += 1, atomic_add(own + (tile), 1u))
-#define DRAFT_PAIR(tile, mask) (vstore3((uint3)(ids[n], (uint)(tile), mask), 0, draft), draft += 3)
-  for (uint first = start; first < end; first += LIST_GROUP) {
-    const uint n = first + p;
-    uint mine = 0, before = 0, all = 0;
-    if (n < end) {
-      FOR_EACH_TILE(COUNT_PAIR)
-    }
-    found[p] = mine;
+#define DRAFT_PAIR(tile, mask) (vstore3((uint3)(id, (uint)(tile), mask), 0, draft), draft += 3)
+  for (uint from_splat = start; from_splat < end; from_splat += LIST_GROUP) {
+    // Rows of tiles of each splat, and of those up to it.
+    int2 span = (int2)(0, -1);
+    if (from_splat + p < end) span = rows_of_tiles(records + (size_t)ids[from_splat + p] * 16, height, inria_extent, tiles_y);
+    found[p] = (uint)max(span.s1 - span.s0 + 1, 0);
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (uint q = 0; q < LIST_GROUP; ++q) {
-      before += q < p ? found[q] : 0u;
-      all += found[q];
+    uint upto = 0;
+    for (uint q = 0; q <= p; ++q) upto += found[q];
+    rows[p] = upto;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    const uint all_rows = rows[LIST_GROUP - 1];
+    for (uint first_row = 0; first_row < all_rows; first_row += LIST_GROUP) {
+      const uint row = first_row + p;
+      uint mine = 0, before = 0, all = 0, splat = 0, id = 0;
+      int top = 0;
+      __global const float *r = records;
+      if (row < all_rows) {
+        for (uint stride = LIST_GROUP / 2; stride; stride /= 2)
+          if (rows[splat + stride - 1] <= row) splat += stride;
+        id = ids[from_splat + splat];
+        r = records + (size_t)id * 16;
+        top = rows_of_tiles(r, height, inria_extent, tiles_y).s0 + (int)(row - (splat ? rows[splat - 1] : 0u));
+        FOR_EACH_TILE(r, top, top, COUNT_PAIR)
+      }
+      found[p] = mine;
+      barrier(CLK_LOCAL_MEM_FENCE);
+      for (uint q = 0; q < LIST_GROUP; ++q) {
+        before += q < p ? found[q] : 0u;
+        all += found[q];
+      }
+      barrier(CLK_LOCAL_MEM_FENCE);
+      draft = first_draft + 3 * (size_t)(drafted + before);
+      if (row < all_rows) {
+        FOR_EACH_TILE(r, top, top, DRAFT_PAIR)
+      }
+      drafted += all;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    draft = first_draft + 3 * (size_t)(drafted + before);
-    if (n < end) {
-      FOR_EACH_TILE(DRAFT_PAIR)
-    }
-    drafted += all;
   }
   if (p == 0) room[get_num_groups(0) + get_group_id(0)] = drafted;
 #else
@@ -162,7 +191,11 @@ __kernel LISTERS void tile_count(
 #define DRAFT_PAIR(tile, mask) (vstore3((uint3)(ids[n], (uint)(tile), mask), 0, draft), draft += 3, own[tile] += 1)
   for (uint n = start; n < end; ++n) {
     FETCH(records + (size_t)ids[min(n + AHEAD, end - 1)] * 16);
-    FOR_EACH_TILE(DRAFT_PAIR)
+    __global const float *r = records + (size_t)ids[n] * 16;
+    const int2 span = rows_of_tiles(r, height, inria_extent, tiles_y);
+    for (int top = span.s0; top <= span.s1; top += BANDS / 4) {
+      FOR_EACH_TILE(r, top, span.s1, DRAFT_PAIR)
+    }
   }
   room[get_num_groups(0) + get_group_id(0)] = (uint)((draft - first_draft) / 3);
 #endif

@@ -25,7 +25,8 @@ class KernelSpec:
     signature : str
         One letter for each argument: u uint32, i int32, f float32, b array.
     per : str
-        The work of one item: `rows` (a vector of W rows; the launch size counts rows), `item` (one of the launch size),
+        The work of one item: `rows` (a vector of W rows; the launch size counts rows), `span` (`ROW_SPAN` elements of a
+        picture's row on CPUs, a vector on GPUs; the launch size counts elements), `item` (one of the launch size),
         `tile` (one work-item a tile on CPUs, a group of 256 on GPUs), `block` (one work-item a block of splats on CPUs, a
         group on GPUs), `group` (one work-item on CPUs, one group on GPUs).
     stats : int, optional
@@ -70,15 +71,12 @@ KERNELS: dict[str, KernelSpec] = {
     "flip_columns": KernelSpec("flip.cl", "uuuubbb", "rows"),
     "flip_rows": KernelSpec("flip.cl", "uubbb", "rows"),
     "flip_pair": KernelSpec("flip.cl", "ubbb", "rows"),
-    "dssim_columns": KernelSpec("similarity.cl", "uuuuubbbb", "rows"),
-    "dssim_slopes": KernelSpec("similarity.cl", "uuuuuubbb", "rows"),
-    "dssim_columns_back": KernelSpec("similarity.cl", "uuuuubbb", "rows"),
-    "dssim_residual": KernelSpec("similarity.cl", "uuufubbbbb", "rows"),
+    "dssim_slopes": KernelSpec("similarity.cl", "uuuuuuubbbb", "span"),
+    "dssim_residual": KernelSpec("similarity.cl", "uuuuufubbbbb", "span"),
     "project_backward": KernelSpec("backward.cl", "uuuuifbbbbbbbbbbb", "rows"),
-    "price_bits": KernelSpec("backward.cl", "uubbbbb", "rows"),
-    "adam": KernelSpec("backward.cl", "uuffbbbbbbb", "rows"),
-    "follow": KernelSpec("backward.cl", "uufbb", "rows"),
-    "snap": KernelSpec("backward.cl", "uubbbbbbbb", "rows"),
+    "descend": KernelSpec("descend.cl", "uuuiiifff" + 19 * "b", "rows"),
+    "follow": KernelSpec("descend.cl", "uufbb", "rows"),
+    "snap": KernelSpec("descend.cl", "uubbbbbbbb", "rows"),
     "dequantize": KernelSpec("dequantize.cl", "uuuuuuubbbb"),
 }
 """Every kernel, by the name that `Backend.launch` and the twins use."""
@@ -127,8 +125,11 @@ class Backend(Protocol):
     def array(self, shape: tuple[int, ...], dtype: Any) -> Any:
         """A new array, not initialised; its bytes are taken from the budget."""
 
-    def write(self, array: Any, values: np.ndarray, offset: int = 0) -> None:
-        """Copy values into an array, from the flat element `offset` on."""
+    def write(self, array: Any, values: np.ndarray, offset: int = 0, stays: bool = False) -> None:
+        """Copy values into an array, from the flat element `offset` on.
+
+        With `stays`, the caller does not change them any more, so that the device may read them later.
+        """
 
     def mapped(self, array: Any) -> AbstractContextManager[np.ndarray]:
         """Write to an array on the host, without a copy if the device shares the host's memory.
@@ -140,8 +141,11 @@ class Backend(Protocol):
     def mark(self) -> Callable[[], None]:
         """A function that waits for all kernels launched so far, but for none launched later."""
 
-    def read(self, array: Any, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
-        """Copy an array to the host, from the flat element `offset` on."""
+    def read(self, array: Any, out: np.ndarray | None = None, offset: int = 0, waits: bool = True) -> np.ndarray:
+        """Copy an array to the host, from the flat element `offset` on.
+
+        Without `waits`, the values are there only when a later read that waits returns.
+        """
 
     def fill(self, array: Any, value: int, count: int | None = None) -> None:
         """Set every element of an array, or the first `count` of its rows."""
@@ -200,7 +204,7 @@ class TwinBackend:
         """A new array; its bytes are taken from the budget."""
         return HostArray(self.budget, shape, dtype)
 
-    def write(self, array: HostArray, values: np.ndarray, offset: int = 0) -> None:
+    def write(self, array: HostArray, values: np.ndarray, offset: int = 0, stays: bool = False) -> None:
         """Copy `values` to the flat element `offset` of `array`."""
         values = np.ascontiguousarray(values, array.data.dtype)
         array.data.reshape(-1)[offset : offset + values.size] = values.reshape(-1)
@@ -213,7 +217,7 @@ class TwinBackend:
         """A function that does nothing, since `launch` returns when the twin has run."""
         return lambda: None
 
-    def read(self, array: HostArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
+    def read(self, array: HostArray, out: np.ndarray | None = None, offset: int = 0, waits: bool = True) -> np.ndarray:
         """Copy `array`, from the flat element `offset` on."""
         if out is None:
             return array.data.copy()

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from flexgs_edge.constants import LANES, ROW_SPAN
 from flexgs_edge.errors import DeviceError
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS
 from flexgs_edge.kernels.choose_device import DeviceInfo
@@ -22,8 +23,6 @@ from flexgs_edge.kernels.rounding import rounding_options
 from flexgs_edge.kernels.session import DeviceArray, Session
 from flexgs_edge.memory.budget import MemoryBudget
 
-GPU_GROUP = 64
-"""Size of a work-group on GPUs for kernels with one row a work-item; it divides the padding of planes."""
 SCAN_GROUPS = (1024, 256, 64)
 """Sizes of the work-group that scans on GPUs: the largest that the device allows."""
 LIST_GROUP = 64
@@ -116,9 +115,9 @@ class OpenCLBackend:
         """A new array on the device, not initialised."""
         return self.session.array(shape, dtype)
 
-    def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0) -> None:
-        """Copy `values` to the flat element `offset` of `array`."""
-        self.session.write(array, values, offset)
+    def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0, stays: bool = False) -> None:
+        """Copy `values` to the flat element `offset` of `array`; see `Backend.write`."""
+        self.session.write(array, values, offset, stays)
 
     def mapped(self, array: DeviceArray) -> AbstractContextManager[np.ndarray]:
         """Write to `array` on the host; see `Backend.mapped`."""
@@ -128,9 +127,11 @@ class OpenCLBackend:
         """A function that waits for all kernels launched so far."""
         return self.session.mark()
 
-    def read(self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
-        """Copy `array` to the host, from the flat element `offset` on."""
-        return self.session.read(array, out, offset)
+    def read(
+        self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0, waits: bool = True
+    ) -> np.ndarray:
+        """Copy `array` to the host, from the flat element `offset` on; see `Backend.read`."""
+        return self.session.read(array, out, offset, waits)
 
     def fill(self, array: DeviceArray, value: int, count: int | None = None) -> None:
         """Set every element of `array`, or the first `count` of its rows."""
@@ -152,9 +153,11 @@ class OpenCLBackend:
             source = load_source(spec.file.format(form=self.form), spec.stats, self.form)
             self._kernels[name] = self.session.kernel(source, name, tuple(options), spec.signature)
         local: tuple[int, ...] = (1,) * len(size)
-        if spec.per == "rows":
-            size = (size[0] // self.width,)
-            local = (GPU_GROUP // self.width if self.form == "gpu" else 1,)
+        if spec.per == "span" and self.form == "cpu":
+            size = (size[0] // ROW_SPAN,)
+        elif spec.per in ("rows", "span"):
+            # LANES // width vectors are a whole group in any array, on all devices.
+            size, local = (size[0] // self.width,), (LANES // self.width,)
         elif spec.per == "tile" and self.form == "gpu":
             size, local = (size[0] * 256 // self.width,), (256 // self.width,)
         elif spec.per == "block" and self.form == "gpu":

@@ -23,6 +23,9 @@ FILLED_TOGETHER = (16, 8, 4, 2)
 SMALL_WRITE = 1 << 16
 """Most bytes of a write that does not wait for the queue: docs/results/tuning.md#small_write"""
 
+HELD_WRITE = 1 << 22
+"""Most bytes of values that stay, which a write holds on to without waiting. The budget does not count them."""
+
 
 class DeviceArray:
     """A buffer on the device, with the shape and dtype of its array."""
@@ -32,8 +35,8 @@ class DeviceArray:
         self.dtype = np.dtype(dtype)
         self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
         self.changed: cl.Event | None = None
-        """The last fill or small write, which may not have begun. A write holds a copy of its values, and is waited for when
-        another event takes its place."""
+        """The last fill, or write or read that nobody waited for, which may not have begun. It holds on to its values, and is
+        waited for when another event takes its place."""
         self._session = session
         session.budget.take("a device buffer", self.nbytes)
         try:
@@ -136,19 +139,22 @@ class Session:
         """A new array on the device, not initialised."""
         return DeviceArray(self, shape, dtype)
 
-    def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0) -> None:
-        """Copy C-contiguous `values` to the flat element `offset` of `array`; they may change as soon as this returns."""
+    def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0, stays: bool = False) -> None:
+        """Copy C-contiguous `values` to the flat element `offset` of `array`.
+
+        They may change as soon as this returns, unless the caller says that they stay as they are.
+        """
         values = np.ascontiguousarray(values, array.dtype)
         if values.size:
             # What is small is copied here, so that the host need not wait for all kernels before.
             small, at = values.nbytes <= SMALL_WRITE, offset * array.dtype.itemsize
+            waits = not small and not (stays and values.nbytes <= HELD_WRITE)
+            copied = values.copy() if small and not stays else values
             try:
-                written = cl.enqueue_copy(
-                    self.queue, array.buffer, values.copy() if small else values, dst_offset=at, is_blocking=not small
-                )
+                written = cl.enqueue_copy(self.queue, array.buffer, copied, dst_offset=at, is_blocking=waits)
             except cl.Error as error:
                 raise self._failure("writing an array", error) from error
-            array.changed = written if small else None
+            array.changed = None if waits else written
 
     @contextmanager
     def mapped(self, array: DeviceArray) -> Iterator[np.ndarray]:
@@ -168,15 +174,22 @@ class Session:
         self.queue.flush()
         return marker.wait
 
-    def read(self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
-        """Copy `array` to the host, from the flat element `offset` on, as much as `out` holds; waits for the queue."""
+    def read(
+        self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0, waits: bool = True
+    ) -> np.ndarray:
+        """Copy `array` to the host, from the flat element `offset` on, as much as `out` holds; waits for the queue.
+
+        If it does not wait, the values are there when a later read that waits returns.
+        """
         out = np.empty(array.shape, array.dtype) if out is None else out
         if out.size:
             at = offset * array.dtype.itemsize
             try:
-                cl.enqueue_copy(self.queue, out, array.buffer, src_offset=at, is_blocking=True)
+                copied = cl.enqueue_copy(self.queue, out, array.buffer, src_offset=at, is_blocking=waits)
             except cl.Error as error:
                 raise self._failure("reading an array", error) from error
+            if not waits:
+                array.changed = copied
         return out
 
     def fill(self, array: DeviceArray, value: int, count: int | None = None) -> None:

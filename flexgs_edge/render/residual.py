@@ -8,17 +8,19 @@ from typing import Any
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.constants import DILATION
+from flexgs_edge.constants import DILATION, ROW_SPAN
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.window import window
-from flexgs_edge.render.fit import padded
 from flexgs_edge.render.view_buffers import ViewBuffers
 
 
 def target_residual(backend: Backend, buffers: ViewBuffers, target: np.ndarray) -> Any:
-    """`target` ([3, H, W] f16, in the layout of `Renderer.render_planes`) minus the drawn view: [3 H W] f32 on the backend."""
+    """`target` ([3, H, W] f16, in the layout of `Renderer.render_planes`) minus the drawn view: [3 H W] f32 on the backend.
+
+    The target must not change afterwards, since the device may read it later.
+    """
     half, residual = buffers.reference_arrays()
-    backend.write(half, target.reshape(-1))
+    backend.write(half, target.reshape(-1), stays=True)
     backend.launch("residual", (residual.shape[0],), residual.shape[0], half, buffers.image, residual)
     return residual
 
@@ -40,20 +42,16 @@ def add_structure(backend: Backend, buffers: ViewBuffers, camera: Camera, weight
     size = len(weights)
     if min(camera.width, camera.height) < size:
         return
-    taps, moments, slopes = buffers.structure_arrays()
+    taps, slopes = buffers.structure_arrays(weights)
     target, residual = buffers.reference_arrays()
-    backend.write(taps, weights)
-    backend.fill(slopes, 0)  # the kernels rely on zeros around the slopes that they write
     _, rows, stride = buffers.image.shape
-    plane, wide, columns = moments.shape[1], slopes.shape[1], camera.width - size + 1
-    windows, below, pixels = (n * stride for n in (camera.height - size + 1, camera.height + 1, camera.height))
-    for first in (channel * rows * stride for channel in range(3)):
-        pair = (buffers.image, target)
-        backend.launch("dssim_columns", (padded(windows),), windows, first, stride, plane, size, taps, *pair, moments)
-        backend.launch(
-            "dssim_slopes", (padded(windows),), windows, stride, columns, plane, wide, size, taps, moments, slopes
-        )
-        backend.launch("dssim_columns_back", (padded(below),), below, stride, plane, wide, size, taps, slopes, moments)
-        backend.launch(
-            "dssim_residual", (padded(pixels),), pixels, first, plane, weight / 2, size, taps, moments, *pair, residual
-        )  # fmt: skip
+    across, plane, wide = -(-stride // ROW_SPAN) * ROW_SPAN, rows * stride, slopes.shape[2]
+    windows, columns = (side - size + 1 for side in (camera.height, camera.width))
+    backend.launch(
+        "dssim_slopes", (3 * windows * across,), across, windows, columns, stride, plane, wide, size, taps, buffers.image,
+        target, slopes,
+    )  # fmt: skip
+    backend.launch(
+        "dssim_residual", (3 * camera.height * across,), across, camera.height, stride, plane, wide, weight / 2, size, taps,
+        slopes, buffers.image, target, residual,
+    )  # fmt: skip

@@ -20,8 +20,9 @@ def sort_splats(backend: Backend, buffers: ViewBuffers, count: int) -> tuple[int
     )
     backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
     backend.launch("sort_scatter_first", (blocks,), count, buffers.keys, buffers.digits, keys_a, ids_a)
-    shown = int(backend.read(buffers.digits, np.empty(1, np.uint32), cells)[0])
+    total = backend.read(buffers.digits, np.empty(1, np.uint32), cells, waits=False)
     pairs = int(backend.read(buffers.block_pairs).sum())
+    shown = int(total[0])
     for shift in (SORT_DIGIT_BITS, 2 * SORT_DIGIT_BITS):
         backend.launch("sort_count", (blocks,), shown, shift, keys_a, buffers.digits)
         backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)

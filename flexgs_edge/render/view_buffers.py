@@ -54,7 +54,8 @@ class ViewBuffers:
         self.arrays: list[Any] = []
         self._backend = backend
         self._references: tuple[Any, Any] | None = None
-        self._structure: tuple[Any, ...] | None = None
+        self._structure: tuple[Any, Any] | None = None
+        self._window = 0
         shapes = view_shapes(self.size, count)
         size = shapes_bytes(shapes)
         # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the
@@ -73,7 +74,7 @@ class ViewBuffers:
             if scene.references:
                 self.reference_arrays()
             if scene.structure:
-                self.structure_arrays()
+                self.structure_room()
             later -= target_bytes(scene, self.size)
             pairs = min(scene.fit.pairs, backend.most_pairs or scene.fit.pairs)
             share, most = PAIR_SHARE, max(pairs, self.tiles)
@@ -140,16 +141,27 @@ class ViewBuffers:
             self._references = (self._array((pixels,), np.float16), self._array((pixels,), np.float32))
         return self._references
 
-    def structure_arrays(self) -> tuple[Any, ...]:
-        """Taps of the window, moments and slopes, for the gradient of SSIM; allocated at the first call."""
-        if self._structure is None:
-            shapes = structure_shapes(self.size).values()
-            self._structure = tuple(self._array(shape, dtype) for shape, dtype in shapes)
-        return self._structure
+    def structure_arrays(self, weights: np.ndarray) -> tuple[Any, Any]:
+        """Taps of a window, with these weights, and slopes, for the gradient of SSIM; allocated at the first call.
+
+        The kernels rely on zeros around the slopes that they write, which are others for each size of the window.
+        """
+        taps, slopes = self._structure or self.structure_room()
+        if len(weights) != self._window:
+            self._backend.write(taps, weights)
+            self._backend.fill(slopes, 0)
+            self._window = len(weights)
+        return taps, slopes
+
+    def structure_room(self) -> tuple[Any, Any]:
+        """Allocate the arrays for the gradient of SSIM."""
+        taps, slopes = (self._array(shape, dtype) for shape, dtype in structure_shapes(self.size).values())
+        self._structure = taps, slopes
+        return taps, slopes
 
     def release(self) -> None:
         """Free all buffers."""
         for array in self.arrays:
             array.release()
         self.arrays = []
-        self._references = self._structure = None
+        self._references, self._structure, self._window = None, None, 0

@@ -188,9 +188,9 @@ class PairedBackend:
         self.write(array, np.full(size, self.pattern, np.uint8).view(array.dtype))
         return array
 
-    def write(self, array: _PairedArray, values: np.ndarray, offset: int = 0) -> None:
+    def write(self, array: _PairedArray, values: np.ndarray, offset: int = 0, stays: bool = False) -> None:
         """Write to both."""
-        self.device.write(array.device, values, offset)
+        self.device.write(array.device, values, offset, stays)
         self.twin.write(array.host, values, offset)
 
     @contextmanager
@@ -205,9 +205,11 @@ class PairedBackend:
         """The device's."""
         return self.device.mark()
 
-    def read(self, array: _PairedArray, out: np.ndarray | None = None, offset: int = 0) -> np.ndarray:
+    def read(
+        self, array: _PairedArray, out: np.ndarray | None = None, offset: int = 0, waits: bool = True
+    ) -> np.ndarray:
         """Read the device's."""
-        return self.device.read(array.device, out, offset)
+        return self.device.read(array.device, out, offset, waits)
 
     def fill(self, array: _PairedArray, value: int, count: int | None = None) -> None:
         """Fill both."""

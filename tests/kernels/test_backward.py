@@ -13,7 +13,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
-from flexgs_edge.kernels import twins
+from flexgs_edge.kernels.twins.descend import price_bits
 from flexgs_edge.methods.best.refit.chunk_state import ORDER, WIDE
 from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
@@ -122,17 +122,14 @@ def test_descents_of_kernel_and_twin(form: str, antialiased: bool, monkeypatch: 
             descent.put_on(steps)
             if steps:
                 descent.price(bit_prices(planes, degrees, steps, 0.01))
-            descent.step(cameras[k], padded_target(cameras[k], k), RATES)
-            descent.follow(1.0)
-            descent.step(cameras[k], padded_target(cameras[k], k), RATES)
+            descent.step(cameras[k], padded_target(cameras[k], k), RATES, share=1.0)
+            descent.step(cameras[k], padded_target(cameras[k], k), RATES, share=0.25)
             unaveraged = descent.planes()
-            descent.follow(0.25)
             descent.settle()
         moved = descent.planes()
     assert not same_bits(moved["means"], unaveraged["means"])
     renderer.release()
-    assert paired.launched["blend_backward"] > 3 and paired.launched["adam"] == 4 * 3
-    assert paired.launched["price_bits"] == 2 * 3
+    assert paired.launched["blend_backward"] > 3 and paired.launched["descend"] == 4 * 3
     for name, before in planes.items():
         assert not same_bits(moved[name], before) and same_bits(moved[name][:, 50], before[:, 50]), name
     for degree in range(1, 5):
@@ -186,7 +183,7 @@ def test_prices_are_slopes_of_bits() -> None:
     prices = bit_prices(planes, degrees, STEPS, 0.01)
     stacked = np.concatenate([planes[name] for name in ORDER])
     gradient = np.ones_like(stacked)
-    twins.price_bits((count,), count, 4, prices, degrees, np.array([1, 1, 0, 1], np.float32), stacked, gradient)
+    price_bits(4, prices, degrees, np.array([1, 1, 0, 1], np.float32), stacked, gradient)
     assert (gradient[:, 2] == 1).all() and (gradient[:3] == 1).all()
     at = 0
     for name in ORDER:

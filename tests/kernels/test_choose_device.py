@@ -17,7 +17,7 @@ from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.choose_device import SELF_TEST, DeviceInfo, choose_device, list_devices, run_self_test
 from flexgs_edge.kernels.open_backend import open_backend
 from flexgs_edge.kernels.opencl import OpenCLBackend
-from flexgs_edge.kernels.session import Session
+from flexgs_edge.kernels.session import SMALL_WRITE, Session
 from flexgs_edge.memory.budget import MemoryBudget
 from kernel_fixtures import default_device, large_budget
 
@@ -244,6 +244,25 @@ def test_small_writes_do_not_wait(session: Session) -> None:
         with session.mapped(given) as mapped:
             mapped[:] = 5
         assert (session.read(given) == 5).all()
+    given.release()
+    seen.release()
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_values_that_stay_are_not_waited_for(session: Session, waits: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Writes of values that stay, and reads that need not wait, come in the queue's order; very large writes wait."""
+    if waits:
+        monkeypatch.setattr("flexgs_edge.kernels.session.HELD_WRITE", SMALL_WRITE)
+    given, seen = session.array((SMALL_WRITE // 4 + 1,), np.float32), session.array((1,), np.float32)
+    kernel = session.kernel(SLOW, "slow", (), "bb")
+    session.write(given, np.full(given.shape, 1, np.float32))
+    start = time.perf_counter()
+    session.launch("slow", kernel, (1,), (1,), (given, seen))
+    session.write(given, np.full(given.shape, 2, np.float32), stays=True)
+    early = session.read(seen, waits=False)
+    behind = time.perf_counter() - start
+    assert (session.read(given) == 2).all() and early == [1]
+    assert (behind > (time.perf_counter() - start) / 2) == waits
     given.release()
     seen.release()
 

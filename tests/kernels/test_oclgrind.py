@@ -124,8 +124,8 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
         steps = StepSizes(0.01, 0.1, 0.03, 0.2, 0.05, (0.04,) * 4)
         descent.put_on(steps)
         descent.price(bit_prices(planes, np.full(source.count, 4), steps, 0.01))
-        descent.step(camera, references[0], {"means": 1e-2, **FIELD_RATES})
-        descent.follow(0.5)
+        descent.step(camera, references[0], {"means": 1e-2, **FIELD_RATES}, share=0.5)
+        descent.settle()
         yield from descent.planes().values()
 
 

@@ -61,7 +61,7 @@ def faulty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, old: str,
             "row[NORMAL_COLUMN + axis] = -0.0f",
             ["kernel grid_rows", "-0 where 0"],
         ),
-        ("activate.cl", "FW inv", "FW in v", ["kernel activate does not build", "error"]),
+        ("activate.clh", "FW inv", "FW in v", ["kernel activate does not build", "error"]),
     ],
 )
 def test_a_fault_is_named(

@@ -94,7 +94,7 @@ def test_all_forms_give_the_same_bits(width: int, height: int, step: int) -> Non
 def test_every_launch_is_its_twins(form: str) -> None:
     paired = PairedBackend(open_form(form), 2)
     term(paired, sampled(45, 37, 1))
-    assert [paired.launched[f"dssim_{name}"] for name in ("columns", "slopes", "columns_back", "residual")] == [3] * 4
+    assert [paired.launched[f"dssim_{name}"] for name in ("slopes", "residual")] == [1, 1]
 
 
 @pytest.mark.parametrize(("width", "height", "step"), [(10, 40, 1), (40, 4, 2), (2, 2, 4)])

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from flexgs_edge.kernels.twins.activate import activate
-from flexgs_edge.kernels.twins.backward import adam, follow, price_bits, project_backward, snap
+from flexgs_edge.kernels.twins.backward import project_backward
 from flexgs_edge.kernels.twins.blend import (
     blend,
     blend_backward,
@@ -18,12 +18,11 @@ from flexgs_edge.kernels.twins.blend import (
     blend_stats,
 )
 from flexgs_edge.kernels.twins.dequantize import dequantize
+from flexgs_edge.kernels.twins.descend import descend, follow, snap
 from flexgs_edge.kernels.twins.flip import flip_colours, flip_columns, flip_pair, flip_rows
 from flexgs_edge.kernels.twins.project import project
 from flexgs_edge.kernels.twins.score import add_costs, residual, sh_residual
 from flexgs_edge.kernels.twins.similarity import (
-    dssim_columns,
-    dssim_columns_back,
     dssim_residual,
     dssim_slopes,
     ssim_columns,
@@ -62,15 +61,12 @@ TWINS: dict[str, Callable[..., None]] = {
     "flip_columns": flip_columns,
     "flip_rows": flip_rows,
     "flip_pair": flip_pair,
-    "dssim_columns": dssim_columns,
     "dssim_slopes": dssim_slopes,
-    "dssim_columns_back": dssim_columns_back,
     "dssim_residual": dssim_residual,
     "add_costs": add_costs,
     "sh_residual": sh_residual,
     "project_backward": project_backward,
-    "price_bits": price_bits,
-    "adam": adam,
+    "descend": descend,
     "follow": follow,
     "snap": snap,
     "dequantize": dequantize,

@@ -1,4 +1,4 @@
-"""Twins of `cl_kernels/backward.cl`: gradients of stored values from a view's sums, steps along them, rounding to the grid."""
+"""Twins of `cl_kernels/backward.cl`: gradients of stored values from a view's sums."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from flexgs_edge.constants import (
     FACTOR_MIN,
     FIXED_MOMENT,
     FIXED_WEIGHT,
-    GRADIENT_MIN,
     LOG2_E,
     SH_C0,
     SH_C1,
@@ -228,134 +227,3 @@ def _geometry(
     moved = du * iz, dv * iz, -(fma(iz, deep, fma(u, du, v * dv)) * iz)
     centre = [dot3(cam[k], cam[3 + k], cam[6 + k], *moved) + toward[k] for k in range(3)]
     return np.stack([*centre, *scales, *rotation])
-
-
-def _pull(away: np.ndarray, price: np.float32, width: np.float32) -> np.ndarray:
-    pulled: np.ndarray = price * away / (np.abs(away) + width)
-    return pulled
-
-
-def price_bits(
-    size: tuple[int, ...],
-    stride: int,
-    degree: int,
-    prices: np.ndarray,
-    degrees: np.ndarray,
-    pace: np.ndarray,
-    values: np.ndarray,
-    gradient: np.ndarray,
-) -> None:
-    """Add what the bits of values cost to their gradients ([14 + 3 K, stride]), in rows that have gradients.
-
-    `prices` is the record of `flexgs_edge.methods.best.refit.prices.bit_prices`.
-    """
-    rows = np.flatnonzero(pace > 0)
-    own = values[:, rows]
-    for k in range(3):
-        gradient[AT_SCALE + k, rows] += _pull(own[AT_SCALE + k] - prices[26 + k], *prices[:2])
-        gradient[AT_QUAT + 1 + k, rows] += _pull(own[AT_QUAT + 1 + k], *prices[2:4])
-    gradient[AT_LOGIT, rows] += _pull(own[AT_LOGIT] - prices[29], *prices[4:6])
-    bands = (degree + 1) ** 2 - 1
-    for k in range(bands + 1):
-        level = int(np.searchsorted((0, 3, 8, 15), k))
-        some, at = degrees[rows] >= level, 6 + 4 * level
-        centres = np.zeros(3, np.float32) if k else prices[30:33]
-        places = [AT_SH + k - 1 + channel * bands if k else AT_DC + channel for channel in range(3)]
-        red, green, blue = own[:, some][places]
-        both = red + blue
-        luma = (both + f32(2) * green) * f32(0.25) - centres[0]
-        orange = red - blue - centres[1]
-        moss = (f32(2) * green - both) * f32(0.5) - centres[2]
-        by_luma = _pull(luma, *prices[at : at + 2]) * f32(0.25)
-        by_orange, by_moss = _pull(orange, *prices[at + 2 : at + 4]), _pull(moss, *prices[at + 2 : at + 4]) * f32(0.5)
-        rest = by_luma - by_moss
-        gradient[places[0], rows[some]] += rest + by_orange
-        gradient[places[1], rows[some]] += f32(2) * (by_luma + by_moss)
-        gradient[places[2], rows[some]] += rest - by_orange
-
-
-def adam(
-    size: tuple[int, ...],
-    stride: int,
-    planes: int,
-    decay_first: float,
-    decay_second: float,
-    rates: np.ndarray,
-    pace: np.ndarray,
-    gradient: np.ndarray,
-    powers: np.ndarray,
-    first: np.ndarray,
-    second: np.ndarray,
-    values: np.ndarray,
-) -> None:
-    """One step of Adam for the rows with a share above 0; running means, powers of the decays and values change in place."""
-    rows = np.flatnonzero(pace > 0)
-    one, least = f32(1), f32(GRADIENT_MIN)
-    decays = f32(decay_first), f32(decay_second)
-    for k, decay in enumerate(decays):
-        powers[k, rows] *= decay
-    whole = [one / (one - powers[k, rows]) for k in range(2)]
-    for k in range(planes):
-        g = gradient[k, rows]
-        g = np.where(np.abs(g) >= least, g, f32(0))
-        mean = fma(decays[0], first[k, rows], (one - decays[0]) * g)
-        mean = np.where(np.abs(mean) >= least, mean, f32(0))
-        square = fma(decays[1], second[k, rows], (one - decays[1]) * (g * g))
-        square = np.where(square >= least * least, square, f32(0))
-        step = (mean * whole[0]) / (np.sqrt(square * whole[1]) + least)
-        first[k, rows], second[k, rows] = mean, square
-        values[k, rows] = fma(-rates[k] * pace[rows], step, values[k, rows])
-
-
-def follow(size: tuple[int, ...], stride: int, planes: int, share: float, values: np.ndarray, mean: np.ndarray) -> None:
-    """Move a running mean of values towards them by a share, in place; a share of 1 begins it anew."""
-    mean[:planes] = fma(f32(share), values[:planes] - mean[:planes], mean[:planes]) if share < 1 else values[:planes]
-
-
-def _on_grid(values: np.ndarray, step: np.float32) -> np.ndarray:
-    return np.rint(values / step) * step if step > 0 else values
-
-
-def snap(
-    size: tuple[int, ...],
-    stride: int,
-    degree: int,
-    steps: np.ndarray,
-    values: np.ndarray,
-    means: np.ndarray,
-    log_scales: np.ndarray,
-    quats: np.ndarray,
-    logits: np.ndarray,
-    sh_dc: np.ndarray,
-    sh_rest: np.ndarray,
-) -> None:
-    """Round values ([14 + 3 K, stride]) to those that a file of these steps decodes to.
-
-    A step of 0 leaves them as they are.
-    """
-    means[:] = _on_grid(values[:AT_SCALE], steps[0])
-    log_scales[:] = _on_grid(values[AT_SCALE:AT_QUAT], steps[1])
-    w, x, y, z = values[AT_QUAT:AT_LOGIT]
-    if steps[2] > 0:
-        inv = f32(1) / np.sqrt(fma(z, z, fma(y, y, fma(x, x, w * w))))
-        inv = np.where(w < 0, -inv, inv)
-        x, y, z = (_on_grid(part * inv, steps[2]) for part in (x, y, z))
-        w = np.sqrt(np.fmax(f32(1) - ((x * x + y * y) + z * z), f32(0)))
-    quats[:] = w, x, y, z
-    logits.reshape(-1)[:] = _on_grid(values[AT_LOGIT], steps[3])
-    bands = (degree + 1) ** 2 - 1
-    for k in range(bands + 1):
-        level = int(np.searchsorted((0, 3, 8, 15), k))
-        luma_step, chroma_step = steps[4 + 2 * level : 6 + 2 * level]
-        source, to, at = (
-            (values[AT_SH:], sh_rest, slice(k - 1, None, bands)) if k else (values[AT_DC:AT_SH], sh_dc, slice(None))
-        )
-        red, green, blue = source[at]
-        if luma_step > 0:
-            both = red + blue
-            luma = _on_grid((both + f32(2) * green) * f32(0.25), luma_step)
-            half_orange = _on_grid(red - blue, chroma_step) * f32(0.5)
-            half_green = _on_grid((f32(2) * green - both) * f32(0.5), chroma_step) * f32(0.5)
-            rest = luma - half_green
-            red, green, blue = rest + half_orange, luma + half_green, rest - half_orange
-        to[at] = red, green, blue

@@ -52,89 +52,66 @@ def _shown(values: np.ndarray) -> np.ndarray:
     return shown
 
 
-def dssim_columns(
+def dssim_slopes(
     launched: tuple[int, ...],
-    count: int,
-    first: int,
+    across: int,
+    rows: int,
+    columns: int,
     stride: int,
     plane: int,
+    wide: int,
     size: int,
     taps: np.ndarray,
     image: np.ndarray,
     target: np.ndarray,
-    moments: np.ndarray,
-) -> None:
-    """Moments of a channel of `image` (a), of `target` (b), and of a a, b b and a b, windowed along the columns ([5, plane])."""
-    a = _shown(image.reshape(-1)[first:])
-    b = _shown(target.reshape(-1)[first:].astype(f32))
-    _columns(count, stride, taps[:size], a, b, moments)
-
-
-def dssim_slopes(
-    launched: tuple[int, ...],
-    count: int,
-    stride: int,
-    columns: int,
-    plane: int,
-    wide: int,
-    size: int,
-    taps: np.ndarray,
-    moments: np.ndarray,
     slopes: np.ndarray,
 ) -> None:
-    """What each window's SSIM gains by a change of its moments, named by the window's last pixel ([3, wide])."""
-    m = np.zeros((5, count), f32)
-    for k in range(size):
-        m += taps[k] * moments[:, k : k + count]
-    two, ab, aa, bb = f32(2), m[0] * m[1], m[0] * m[0], m[1] * m[1]
-    means, variances = aa + bb + f32(SSIM_C1), (m[2] - aa) + (m[3] - bb) + f32(SSIM_C2)
-    light = (two * ab + f32(SSIM_C1)) / means
-    both = (two * (m[4] - ab) + f32(SSIM_C2)) / variances
-    by_mean = both * (m[1] - light * m[0]) / means + light * (both * m[0] - m[1]) / variances
-    inside = np.arange(count) % stride < columns
-    at = (size - 1) * (stride + 1)
-    for plane_of, value in zip(
-        slopes, (two * by_mean, -(light * both / variances), two * light / variances), strict=True
-    ):
-        plane_of[at : at + count] = np.where(inside, value, f32(0))
-
-
-def dssim_columns_back(
-    launched: tuple[int, ...],
-    count: int,
-    stride: int,
-    plane: int,
-    wide: int,
-    size: int,
-    taps: np.ndarray,
-    slopes: np.ndarray,
-    sums: np.ndarray,
-) -> None:
-    """The slopes summed along the columns, over all windows that hold a pixel (the first three planes of `sums`)."""
-    back = sums[:3, :count]
-    back[:] = 0
-    for k in range(size):
-        back += taps[k] * slopes[:, k * stride : k * stride + count]
+    """What each window's SSIM gains by a change of its moments, named by the window's last pixel ([3, 3, wide])."""
+    count, two = rows * stride, f32(2)
+    sums, m = np.zeros((5, count + size), f32), np.empty((5, count), f32)
+    inside, at = np.arange(count) % stride < columns, (size - 1) * (stride + 1)
+    for channel in range(3):
+        own = slice(channel * plane, (channel + 1) * plane)
+        a, b = _shown(image.reshape(-1)[own]), _shown(target.reshape(-1)[own].astype(f32))
+        _columns(count, stride, taps[:size], a, b, sums)
+        m[:] = 0
+        for k in range(size):
+            m += taps[k] * sums[:, k : k + count]
+        ab, aa, bb = m[0] * m[1], m[0] * m[0], m[1] * m[1]
+        means, variances = aa + bb + f32(SSIM_C1), (m[2] - aa) + (m[3] - bb) + f32(SSIM_C2)
+        light = (two * ab + f32(SSIM_C1)) / means
+        both = (two * (m[4] - ab) + f32(SSIM_C2)) / variances
+        by_mean = both * (m[1] - light * m[0]) / means + light * (both * m[0] - m[1]) / variances
+        found = two * by_mean, -(light * both / variances), two * light / variances
+        for plane_of, value in zip(slopes.reshape(3, 3, wide)[channel], found, strict=True):
+            plane_of[at : at + count] = np.where(inside, value, f32(0))
 
 
 def dssim_residual(
     launched: tuple[int, ...],
-    count: int,
-    first: int,
+    across: int,
+    rows: int,
+    stride: int,
     plane: int,
+    wide: int,
     factor: float,
     size: int,
     taps: np.ndarray,
-    sums: np.ndarray,
+    slopes: np.ndarray,
     image: np.ndarray,
     target: np.ndarray,
     residual: np.ndarray,
 ) -> None:
-    """Add the gradient of all windows' SSIM by `image`, times `factor`, to a channel of `residual`."""
-    by = np.zeros((3, count), f32)
-    for k in range(size):
-        by += taps[k] * sums[:3, k : k + count]
-    own = slice(first, first + count)
-    a, b = image.reshape(-1)[own], _shown(target.reshape(-1)[own].astype(f32))
-    slope = by[0] + f32(2) * a * by[1] + b * by[2]
-    residual.reshape(-1)[own] += np.where((a >= 0) & (a <= 1), f32(factor) * slope, f32(0))
+    """Add the gradient of all windows' SSIM by `image`, times `factor`, to `residual`."""
+    count = rows * stride
+    for channel in range(3):
+        own_slopes = slopes.reshape(3, 3, wide)[channel]
+        sums, by = np.zeros((3, count + size), f32), np.zeros((3, count), f32)
+        for k in range(size):
+            sums[:, :count] += taps[k] * own_slopes[:, k * stride : k * stride + count]
+        for k in range(size):
+            by += taps[k] * sums[:, k : k + count]
+        own = slice(channel * plane, channel * plane + count)
+        a, b = image.reshape(-1)[own], _shown(target.reshape(-1)[own].astype(f32))
+        slope = by[0] + f32(2) * a * by[1] + b * by[2]
+        residual.reshape(-1)[own] += np.where((a >= 0) & (a <= 1), f32(factor) * slope, f32(0))

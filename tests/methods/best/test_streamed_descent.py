@@ -61,10 +61,10 @@ def course(descent: Any) -> dict[str, np.ndarray]:
                 descent.settle()
             descent.put_on(STEPS)
             for k in range(7):
-                descent.step(cameras[k * k % 4], targets[k * k % 4], rates)
-                for _ in range(k % 3):
-                    descent.step(cameras[k % 4], targets[k % 4], rates, alone=True)
-                descent.follow(max(1 / (k + 1), 0.4))
+                shares = [0.0] * (k % 3) + [max(1 / (k + 1), 0.4)]
+                descent.step(cameras[k * k % 4], targets[k * k % 4], rates, share=shares[0])
+                for share in shares[1:]:
+                    descent.step(cameras[k % 4], targets[k % 4], rates, alone=True, share=share)
         descent.settle()
         moved: dict[str, np.ndarray] = descent.planes()
     return moved

@@ -12,7 +12,7 @@ from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.scene.fields import FIELD
 
 ORDER = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
-"""Fields in the order of a gradient's planes (cl_kernels/backward.cl)."""
+"""Fields in the order of a gradient's planes (cl_kernels/values.clh)."""
 DECAYS = (0.9, 0.99)
 """Decay of Adam's running means of gradients and of their squares. The usual 0.999 of the second would remember longer than
 a descent of a few hundred views lasts: docs/results/tuning.md#decays"""
@@ -102,19 +102,17 @@ class ChunkState:
             camera, chunk.means, *self.stored, chunk.sh_rest, self.degrees, records, sums, self.pace, self.gradient,
         )  # fmt: skip
 
-    def price(self, prices: Any) -> None:
-        """Add to the gradients what bits cost (record of `bit_prices`)."""
-        stride, degree = self.chunk.stride, self.chunk.degree
-        self.backend.launch(
-            "price_bits", (stride,), stride, degree, prices, self.degrees, self.pace, self.values, self.gradient
-        )
+    def step(self, rates: Any, steps: Any, prices: Any | None = None, share: float = 0.0) -> None:
+        """Take one step of Adam, and put the values on a grid for drawing (records of `rate_record` and `step_record`).
 
-    def step(self, rates: Any) -> None:
-        """Take one step of Adam."""
-        stride = self.chunk.stride
+        With `prices` (record of `bit_prices`), gradients count what bits cost. With a `share`, the mean follows.
+        """
+        chunk, stride = self.chunk, self.chunk.stride
         self.backend.launch(
-            "adam", (stride,), stride, self.planes, *DECAYS, rates, self.pace, self.gradient, self.powers, self.first,
-            self.second, self.values,
+            "descend", (stride,), stride, chunk.degree, self.planes, self.antialiased, int(prices is not None), int(share > 0),
+            *DECAYS, share, rates, rates if prices is None else prices, steps, self.degrees, self.pace, self.gradient,
+            self.powers, self.first, self.second, self.values, self.mean, chunk.means, *self.stored, chunk.sh_dc, chunk.sh_rest,
+            chunk.cov, chunk.log2_opacity,
         )  # fmt: skip
 
     def follow(self, share: float) -> None:

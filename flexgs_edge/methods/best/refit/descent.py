@@ -117,9 +117,6 @@ class Descent:
     def put_on(self, steps: StepSizes | None) -> None:
         """From now on, draw from values on this grid (None: from the values themselves)."""
         self.backend.write(self._steps, step_record(steps))
-        self._snap()
-
-    def _snap(self) -> None:
         for part in self._parts:
             part.snap(self._steps)
             part.activate()
@@ -144,23 +141,23 @@ class Descent:
         for part in self._parts:
             part.differentiate(self.renderer.camera_array, self.renderer.records_array, sums, part.chunk.base)
 
-    def step(self, camera: Camera, target: np.ndarray, rates: dict[str, float], alone: bool = False) -> None:
+    def step(
+        self,
+        camera: Camera,
+        target: np.ndarray,
+        rates: dict[str, float],
+        alone: bool = False,
+        share: float = 0.0,
+    ) -> None:
         """Take one step of Adam down the loss of a view; `rates` are the largest changes of each field's values.
 
-        With `alone`, that is the first layer's, in which bits cost nothing.
+        With `alone`, that is the first layer's, in which bits cost nothing. Then the running mean of the values moves towards
+        them by `share`; 1 begins it anew.
         """
         self.differentiate(camera, target, alone)
         self.backend.write(self._rates, rate_record(rates, self.widths))
         for part in self._parts:
-            if self._priced and not alone:
-                part.price(self._prices)
-            part.step(self._rates)
-        self._snap()
-
-    def follow(self, share: float) -> None:
-        """Move the running mean of the values towards them by `share`; 1 begins it anew."""
-        for part in self._parts:
-            part.follow(share)
+            part.step(self._rates, self._steps, self._prices if self._priced and not alone else None, share)
 
     def settle(self) -> None:
         """Take the running mean as the values."""

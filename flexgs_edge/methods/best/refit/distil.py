@@ -193,12 +193,14 @@ def distil(
             for k in original.progress.track(part, f"distilling{' on the grid' if place else ''}", len(part)):
                 now = schedule.rate * last ** ((k - falling.start) / len(falling))
                 moving = {name: 0.0 if name in held else now * rate for name, rate in rates.items()}
-                descent.step(cameras[order[k]], original.references[order[k]], moving)
-                if layer is not None and k % EVERY == EVERY - 1:
-                    descent.step(cameras[order[k]], original.references[order[k]], moving, alone=True)
-                if place:
-                    # A plain mean first, then one that forgets: single views then decide little.
-                    descent.follow(max(1.0 / (k - part.start + 1), 1.0 / max(course.mean_views * len(cameras), 1.0)))
+                # On the grid, a plain mean first, then one that forgets: single views then decide little.
+                share = (
+                    max(1.0 / (k - part.start + 1), 1.0 / max(course.mean_views * len(cameras), 1.0)) if place else 0.0
+                )
+                both = layer is not None and k % EVERY == EVERY - 1
+                descent.step(cameras[order[k]], original.references[order[k]], moving, share=0.0 if both else share)
+                if both:
+                    descent.step(cameras[order[k]], original.references[order[k]], moving, alone=True, share=share)
         if len(parts[1]) or len(parts[2]):
             descent.settle()
         moved = descent.planes()

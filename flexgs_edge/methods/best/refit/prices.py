@@ -15,13 +15,13 @@ from flexgs_edge.grid.step_sizes import Planes, StepSizes
 from flexgs_edge.memory.rows import read_ahead
 
 PRICES = 33
-"""Values of the record that the kernel `price_bits` takes."""
+"""Values of the record that the kernel `descend` takes."""
 WIDTH = 0.5
 """Prices rise over about this many grid steps around a centre. Within a step, it makes no difference to the bits."""
 
 
 def bit_prices(planes: Planes, degrees: np.ndarray, steps: StepSizes, worth: float) -> np.ndarray:
-    """The record of the kernel `price_bits`.
+    """The record of the kernel `descend`.
 
     Parameters
     ----------

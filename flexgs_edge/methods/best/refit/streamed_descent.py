@@ -150,7 +150,14 @@ class StreamedDescent:
         self.backend.write(self._prices, prices)
         self._priced = True
 
-    def step(self, camera: Camera, target: np.ndarray, rates: dict[str, float], alone: bool = False) -> None:
+    def step(
+        self,
+        camera: Camera,
+        target: np.ndarray,
+        rates: dict[str, float],
+        alone: bool = False,
+        share: float = 0.0,
+    ) -> None:
         """As `Descent.step`."""
         assert self.first is not None or not alone
         if alone != (self._planes.alone is not None):
@@ -172,6 +179,8 @@ class StreamedDescent:
                 continue
             own = self.backend.read(records, np.empty((last - first, RECORD), np.float32), first * RECORD)
             self._move(part, shown[first:last] - np.uint32(part.base), own, some)
+        if share > 0:
+            self._follow(share)
 
     def _move(self, part: Part, rows: np.ndarray, records: np.ndarray, sums: np.ndarray) -> None:
         """Take one step of Adam for the rows of a chunk that a view shows."""
@@ -186,11 +195,9 @@ class StreamedDescent:
         if self._planes.alone is not None:
             self._planes.alone.draw(self.backend, part.base, part.count, state.stored[0], state.stored[2])
         state.differentiate(self.renderer.camera_array, place_records, place_sums, 0)
-        if self._priced and self._planes.alone is None:
-            state.price(self._prices)
-        state.step(self._rates)
+        priced = self._priced and self._planes.alone is None
+        state.step(self._rates, self._planes.steps, self._prices if priced else None)
         part.stepped = True
-        state.snap(self._planes.steps)
         if self._planes.alone is None:
             self._planes.bounds[part.base] = bounds_of(self.backend, state.chunk.means, state.stored[0], part.count)
         else:  # the next view may show the layer alone again, larger than this
@@ -257,8 +264,8 @@ class StreamedDescent:
     def _save(self, file: np.ndarray, span: slice, array: Any) -> None:
         put_rows(file, span, self.backend.read(array).reshape(-1))
 
-    def follow(self, share: float) -> None:
-        """As `Descent.follow`."""
+    def _follow(self, share: float) -> None:
+        """Note that the mean follows, for when the chunk is read next."""
         for part in self._parts:
             if share >= 1.0:
                 part.mean, part.pending = "values", []
