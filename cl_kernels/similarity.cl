@@ -67,7 +67,8 @@ __kernel void ssim_rows(
 #define SPAN_OF(rows)                                          \
   const size_t e = get_global_id(0) * SPAN;                    \
   const uint x0 = (uint)(e % across), y = (uint)(e / across) % (rows), channel = (uint)(e / across) / (rows); \
-  if (channel > 2 || x0 >= stride) return;
+  if (channel > 2 || x0 >= stride) return;                     \
+  const uint end = min(x0 + (uint)SPAN, stride);
 
 // clamp(x, 0, 1); NaN gives 0.
 inline FW shown(FW x) { return smaller(larger(x, (FW)0.0f), (FW)1.0f); }
@@ -96,12 +97,12 @@ __kernel void dssim_slopes(
   const size_t row = channel * (size_t)plane + y * (size_t)stride;
   // Moments of a, b, a a, b b and a b along the columns.
   float moments[5][SPAN_VECTORS * W];
-  for (uint v = 0; v * W < SPAN + size - 1; ++v) {
+  for (uint v = 0; v < SPAN + size - 1; v += W) {
     FW ma = (FW)0.0f, mb = (FW)0.0f, maa = (FW)0.0f, mbb = (FW)0.0f, mab = (FW)0.0f;
     // Windows that reach beyond the row have no slopes.
-    if (x0 + v * W < stride)
+    if (x0 + v < stride)
       for (uint k = 0; k < size; ++k) {
-        const size_t from = row + x0 + v * W + (size_t)k * stride;
+        const size_t from = row + x0 + v + (size_t)k * stride;
         const FW va = shown(LOADF(image, from)), vb = shown(LOADH(target, from)), tap = (FW)taps[k];
         const FW ta = tap * va, tb = tap * vb;
         ma = ma + ta;
@@ -110,25 +111,24 @@ __kernel void dssim_slopes(
         mbb = mbb + tb * vb;
         mab = mab + ta * vb;
       }
-    STOREF(ma, moments[0], v * W);
-    STOREF(mb, moments[1], v * W);
-    STOREF(maa, moments[2], v * W);
-    STOREF(mbb, moments[3], v * W);
-    STOREF(mab, moments[4], v * W);
+    STOREF(ma, moments[0], v);
+    STOREF(mb, moments[1], v);
+    STOREF(maa, moments[2], v);
+    STOREF(mbb, moments[3], v);
+    STOREF(mab, moments[4], v);
   }
   __global float *to = slopes + channel * (size_t)(3 * wide) + (y + size - 1) * (size_t)stride + size - 1;
-  for (uint v = 0; v < SPAN / W && x0 + v * W < stride; ++v) {
+  for (uint x = x0; x < end; x += W) {
     FW m[5];
     for (int c = 0; c < 5; ++c) {
       m[c] = (FW)0.0f;
-      for (uint k = 0; k < size; ++k) m[c] = m[c] + (FW)taps[k] * LOADF(moments[c], v * W + k);
+      for (uint k = 0; k < size; ++k) m[c] = m[c] + (FW)taps[k] * LOADF(moments[c], x - x0 + k);
     }
     const FW ab = m[0] * m[1], aa = m[0] * m[0], bb = m[1] * m[1];
     const FW means = aa + bb + (FW)SSIM_C1, variances = (m[2] - aa) + (m[3] - bb) + (FW)SSIM_C2;
     const FW light = quotient((FW)2.0f * ab + (FW)SSIM_C1, means);
     const FW both = quotient((FW)2.0f * (m[4] - ab) + (FW)SSIM_C2, variances);
     const FW by_mean = quotient(both * (m[1] - light * m[0]), means) + quotient(light * (both * m[0] - m[1]), variances);
-    const size_t x = x0 + v * W;
     const IW inside = MASK((IW)(int)x + LANE_INDEX < (IW)(int)columns);
     STOREF(pick(inside, (FW)2.0f * by_mean, (FW)0.0f), to, x);
     STOREF(pick(inside, -quotient(light * both, variances), (FW)0.0f), to, wide + x);
@@ -154,21 +154,21 @@ __kernel void dssim_residual(
 {
   SPAN_OF(rows)
   float sums[3][SPAN_VECTORS * W];
-  for (uint v = 0; v * W < SPAN + size - 1; ++v)
+  for (uint v = 0; v < SPAN + size - 1; v += W)
     for (int c = 0; c < 3; ++c) {
-      __global const float *from = slopes + (3 * channel + c) * (size_t)wide + y * (size_t)stride + x0 + v * W;
+      __global const float *from = slopes + (3 * channel + c) * (size_t)wide + y * (size_t)stride + x0 + v;
       FW sum = (FW)0.0f;
-      if (x0 + v * W < stride)
+      if (x0 + v < stride)
         for (uint k = 0; k < size; ++k) sum = sum + (FW)taps[k] * LOADF(from, (size_t)k * stride);
-      STOREF(sum, sums[c], v * W);
+      STOREF(sum, sums[c], v);
     }
-  for (uint v = 0; v < SPAN / W && x0 + v * W < stride; ++v) {
+  for (uint x = x0; x < end; x += W) {
     FW by[3];
     for (int c = 0; c < 3; ++c) {
       by[c] = (FW)0.0f;
-      for (uint k = 0; k < size; ++k) by[c] = by[c] + (FW)taps[k] * LOADF(sums[c], v * W + k);
+      for (uint k = 0; k < size; ++k) by[c] = by[c] + (FW)taps[k] * LOADF(sums[c], x - x0 + k);
     }
-    const size_t i = channel * (size_t)plane + y * (size_t)stride + x0 + v * W;
+    const size_t i = channel * (size_t)plane + y * (size_t)stride + x;
     const FW a = LOADF(image, i), b = shown(LOADH(target, i));
     const FW slope = by[0] + (FW)2.0f * a * by[1] + b * by[2];
     STOREF(LOADF(residual, i) + pick(MASK(a >= (FW)0.0f) & MASK(a <= (FW)1.0f), (FW)factor * slope, (FW)0.0f), residual, i);

@@ -22,9 +22,9 @@ FILLED_TOGETHER = (16, 8, 4, 2)
 """Elements of a pattern that fills an array, where its size allows. Patterns have at most 128 bytes."""
 SMALL_WRITE = 1 << 16
 """Most bytes of a write that does not wait for the queue: docs/results/tuning.md#small_write"""
-
 HELD_WRITE = 1 << 22
-"""Most bytes of values that stay, which a write holds on to without waiting. The budget does not count them."""
+"""Most bytes of values that stay, which a write holds on to without waiting. The budget does not count them:
+docs/results/tuning.md#one_pass"""
 
 
 class DeviceArray:

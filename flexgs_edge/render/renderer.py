@@ -33,7 +33,7 @@ from flexgs_edge.render.fit import (
     fits_whole,
     saves_bytes,
 )
-from flexgs_edge.render.residual import add_structure, scale_residual, target_residual
+from flexgs_edge.render.residual import add_structure, target_residual
 from flexgs_edge.render.statistics import Statistics, SumReader
 from flexgs_edge.render.tile_lists import list_tiles, sort_splats
 from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
@@ -306,11 +306,9 @@ class Renderer:
         view = self._prepare(scene, camera, whole=True)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, GRADIENT_SUMS)
-        residual = target_residual(self.backend, view.buffers, target)
+        residual = target_residual(self.backend, view.buffers, target, weight)
         if structure:
-            add_structure(self.backend, view.buffers, camera, structure)
-        if weight != 1.0:
-            scale_residual(self.backend, view.buffers, weight)
+            add_structure(self.backend, view.buffers, camera, weight * structure)
         self._blend(view, "blend_backward", (hits, sums, residual), again=True)
         return sums
 

@@ -14,21 +14,15 @@ from flexgs_edge.kernels.window import window
 from flexgs_edge.render.view_buffers import ViewBuffers
 
 
-def target_residual(backend: Backend, buffers: ViewBuffers, target: np.ndarray) -> Any:
-    """`target` ([3, H, W] f16, in the layout of `Renderer.render_planes`) minus the drawn view: [3 H W] f32 on the backend.
+def target_residual(backend: Backend, buffers: ViewBuffers, target: np.ndarray, factor: float = 1.0) -> Any:
+    """`factor` times `target` ([3, H, W] f16, as `Renderer.render_planes` lies) minus the drawn view: [3 H W] f32 on the backend.
 
     The target must not change afterwards, since the device may read it later.
     """
     half, residual = buffers.reference_arrays()
     backend.write(half, target.reshape(-1), stays=True)
-    backend.launch("residual", (residual.shape[0],), residual.shape[0], half, buffers.image, residual)
+    backend.launch("residual", (residual.shape[0],), residual.shape[0], factor, half, buffers.image, residual)
     return residual
-
-
-def scale_residual(backend: Backend, buffers: ViewBuffers, factor: float) -> None:
-    """Multiply the residual by `factor`."""
-    _, residual = buffers.reference_arrays()
-    backend.write(residual, backend.read(residual) * np.float32(factor))
 
 
 def add_structure(backend: Backend, buffers: ViewBuffers, camera: Camera, weight: float) -> None:
