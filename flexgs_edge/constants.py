@@ -22,8 +22,8 @@ ROW_BLOCK: Final = 256
 """Rows of a block. A view skips the blocks that it cannot show, with all that is done for each row: a multiple of LANES,
 so that vectors and work-groups stay within a block: docs/results/tuning.md#row_block"""
 ROW_SPAN: Final = 128
-"""Elements of a picture's row that one work-item of a processor has: a multiple of all vectors, many against the window's
-side, few enough for the nearest cache: docs/results/tuning.md#one_pass"""
+"""Elements of a picture's row that one work-item of a processor has: whole vectors of any width, many more than a window
+is wide, and few enough for the nearest cache: docs/results/tuning.md#one_pass"""
 SUM_LANES: Final = 16
 """Sums over views lie in groups of so many rows, all planes of a group side by side. Planes of all rows would be more
 streams than a processor fetches ahead: docs/results/tuning.md#sum_lanes"""

@@ -15,8 +15,9 @@ from flexgs_edge.render.view_buffers import ViewBuffers
 
 
 def target_residual(backend: Backend, buffers: ViewBuffers, target: np.ndarray, factor: float = 1.0) -> Any:
-    """`factor` times `target` ([3, H, W] f16, as `Renderer.render_planes` lies) minus the drawn view: [3 H W] f32 on the backend.
+    """What the drawn view lacks of `target` ([3, H, W] f16, laid out as by `Renderer.render_planes`), times `factor`.
 
+    The result is an array of the backend, [3 H W] f32: `factor` (`target` - view).
     The target must not change afterwards, since the device may read it later.
     """
     half, residual = buffers.reference_arrays()

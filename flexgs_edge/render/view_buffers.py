@@ -56,6 +56,7 @@ class ViewBuffers:
         self._references: tuple[Any, Any] | None = None
         self._structure: tuple[Any, Any] | None = None
         self._window = 0
+        """Side of the window that the taps and the zeros around the slopes are for; 0: none yet."""
         shapes = view_shapes(self.size, count)
         size = shapes_bytes(shapes)
         # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the
