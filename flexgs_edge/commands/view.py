@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from flexgs_edge.codec.open_fgs import file_version
 from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
@@ -89,8 +90,8 @@ def view(
     cameras = [] if run.views is None else list(run.views.cameras)
     look = {"near": run.options.near, "background": run.options.background, "antialiased": run.options.antialiased}
     name = Path(os.fspath(input)).resolve().name
-    files = web_files()
     with _coded(run, input) as scene:
+        files = web_files(file_version(scene))
         size = os.stat(scene).st_size
         if output is not None:
             page = viewer_page(files, page_config(name, cameras, look), scene.read_bytes()).text.encode()

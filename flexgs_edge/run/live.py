@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flexgs_edge.codec.open_fgs import file_version
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
 from flexgs_edge.grid.to_grid import to_grid
@@ -47,7 +48,7 @@ def live_scenes(run: Run[Options], path: str | os.PathLike[str], first: int) -> 
     if size > SCENE_MOST:
         return Live("", config, None, None, f"The file, {format_size(size)}, is too large for this page")
     original, note = _original(run)
-    return Live(join_modules(web_files(), LIVE), config, Path(path).read_bytes(), original, note)
+    return Live(join_modules(web_files(file_version(path)), LIVE), config, Path(path).read_bytes(), original, note)
 
 
 def _original(run: Run[Options]) -> tuple[bytes | None, str]:

@@ -12,6 +12,8 @@ ENTRIES = {"page": "viewer/src/page.js", "load": "viewer/src/load-worker.js", "s
 """The modules that are run: the page's, and those of the workers by the name that `startWorker` knows."""
 LIVE = {**ENTRIES, "page": "viewer/src/live.js"}
 """The same for the live scenes of a report."""
+_FORMATS = "decoder/src/formats.js"
+_FORMATS_2 = "decoder/src/formats2.js"
 _PATTERNS = ("viewer/*.html", "viewer/*.css", "viewer/src/*.js", "decoder/src/*.js")
 
 
@@ -24,8 +26,17 @@ def web_folder() -> Path:
     raise InputError(f"the viewer: expected {PAGE} in {package / 'web'}, found none: install flexgs-edge again")
 
 
-def web_files() -> dict[str, str]:
-    """Texts of all files that the viewer needs, by their path below `web/`."""
+def web_files(version: int = 1) -> dict[str, str]:
+    """Texts of all files that the viewer needs, by their path below `web/`.
+
+    Parameters
+    ----------
+    version : int
+        Container version of the scene. A page of a scene of version 2 reads no other files, so that it is short; one of a
+        scene of version 1 reads both.
+    """
     folder = web_folder()
     places = [place for pattern in _PATTERNS for place in sorted(folder.glob(pattern))]
-    return {place.relative_to(folder).as_posix(): place.read_text(encoding="utf-8") for place in places}
+    files = {place.relative_to(folder).as_posix(): place.read_text(encoding="utf-8") for place in places}
+    only_2 = files.pop(_FORMATS_2)
+    return {**files, _FORMATS: only_2} if version == 2 else files

@@ -9,20 +9,21 @@ import posixpath
 import re
 from collections.abc import Mapping
 
-from flexgs_edge.viewer.strip import strip_script
+from flexgs_edge.viewer.shorten import shorten_script
 
 _IMPORT = re.compile(r"^import (?:\{([^}]*)\} from )?'([^']+)';$", re.MULTILINE)
 _EXPORT_FROM = re.compile(r"^export \{([^}]*)\} from '([^']+)';$", re.MULTILINE)
-_EXPORT = re.compile(r"^export (?=(?:async )?(?:function\*?|class|const) (\w+))", re.MULTILINE)
-_LEFT = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:async )?(?:function\*?|class|const) \w+)", re.MULTILINE)
+_NAME = re.compile(r"^(?:async )?(?:function\*?|class|const|let) (\w+)", re.MULTILINE)
+_LEFT = re.compile(r"^(?:import|export|const [{[]|let [{[]).*$", re.MULTILINE)
 
 
 def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:
-    """One script that does what one of several modules does, without comments and spaces.
+    """One short script that does what one of several modules does.
 
-    On a page it is the entry `page`, in a worker the one with the worker's name. So page and workers share one text.
-    Each module becomes a function, so that names in two modules do not meet. What it exports has the same name for all others:
-    no two modules may export one name, and none may import under another name.
+    On a page it is the entry `page`, in a worker the one with the worker's name. So page and workers share one text. All
+    modules but the entries share one scope, since that makes the script shorter: no two of them may have one name at their
+    top, and none may import under another name.
 
     Parameters
     ----------
@@ -34,19 +35,19 @@ def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:
     Raises
     ------
     ValueError
-        For an import or export of a form that is not understood, and for a name that two modules export.
+        For an import, export or name of a form that is not understood, and for a name that two modules have.
     """
     parts: dict[str, str] = {}
-    owners: dict[str, str] = {}
     for path in entries.values():
-        _add(files, path, parts, owners)
+        _add(files, path, parts)
     begin = [f"{name}() {{\n{parts.pop(path)}\n}}," for name, path in entries.items()]
+    _check_names(parts)
     body = "\n".join([*parts.values(), "const entries = {", *begin, "};"])
     chosen = "entries[globalThis.document ? 'page' : globalThis.name]();"
-    return strip_script(f"(() => {{\n'use strict';\n{body}\n{chosen}\n}})();") + "\n"
+    return shorten_script(f"(() => {{\n'use strict';\n{body}\n{chosen}\n}})();") + "\n"
 
 
-def _add(files: Mapping[str, str], path: str, parts: dict[str, str], owners: dict[str, str]) -> None:
+def _add(files: Mapping[str, str], path: str, parts: dict[str, str]) -> None:
     """Add a module after all that it imports."""
     if path in parts:
         return
@@ -56,19 +57,20 @@ def _add(files: Mapping[str, str], path: str, parts: dict[str, str], owners: dic
         for found in pattern.finditer(text):
             if " as " in (found[1] or ""):
                 raise ValueError(f"{path}: cannot join {found[0]!r}")
-            _add(files, posixpath.normpath(posixpath.join(folder, found[2])), parts, owners)
-    exported = _EXPORT.findall(text)
-    for name in exported:
-        if name in owners:
-            raise ValueError(f"{path} and {owners[name]} both export {name}")
-        owners[name] = path
+            _add(files, posixpath.normpath(posixpath.join(folder, found[2])), parts)
     text = _EXPORT.sub("", _EXPORT_FROM.sub("", _IMPORT.sub("", text)))
     # A page from disk may start workers from a script only, and scripts have no `import.meta`.
     text = text.replace("import.meta.url", "document.baseURI")
     if left := _LEFT.search(text):
         raise ValueError(f"{path}: cannot join {left[0]!r}")
-    if exported:
-        names = ", ".join(exported)
-        parts[path] = f"const {{ {names} }} = (() => {{\n{text.strip()}\nreturn {{ {names} }};\n}})();"
-    else:
-        parts[path] = f"(() => {{\n{text.strip()}\n}})();"
+    parts[path] = text.strip()
+
+
+def _check_names(parts: Mapping[str, str]) -> None:
+    owners: dict[str, str] = {}
+    for path, text in parts.items():
+        # A template may hold lines that look like ours.
+        for name in _NAME.findall(re.sub(r"`[^`]*`", "", text)):
+            if name in owners:
+                raise ValueError(f"{path} and {owners[name]} both have {name}")
+            owners[name] = path

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.viewer.assets import ENTRIES, PAGE, STYLE
 from flexgs_edge.viewer.join import join_modules
+from flexgs_edge.viewer.shorten import shorten_style
 
 _CONFIG = '<script type="application/json" id="scene">{}</script>'
 _STYLE_LINK = '<link rel="stylesheet" href="style.css">'
@@ -85,7 +85,7 @@ def viewer_page(files: Mapping[str, str], config: Mapping[str, Any], scene: byte
     script = join_modules(files, ENTRIES)
     if "</script" in script.lower() or "<!--" in script:
         raise AssertionError("a script that would end in the middle")
-    style = _short_style(files[STYLE])
+    style = shorten_style(files[STYLE])
     policy = (
         f"default-src 'none'; script-src {_digest(script)} blob:; worker-src blob:; style-src {_digest(style)}; "
         f"img-src data: blob:; base-uri 'none'; form-action 'none'"
@@ -103,11 +103,6 @@ def viewer_page(files: Mapping[str, str], config: Mapping[str, Any], scene: byte
 
 def _digest(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-
-
-def _short_style(text: str) -> str:
-    """The style without indentation and ends of lines; our own has neither comments nor strings that would suffer."""
-    return re.sub(r"\s*\n\s*", "", text)
 
 
 def _config(config: Mapping[str, Any]) -> str:

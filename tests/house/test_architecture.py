@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 LONGEST_MODULE = 450
-HEAVY = ("pyopencl", "skimage", "scipy", "matplotlib", "plyfile", "PIL", "tqdm", "jinja2", "markupsafe")
+HEAVY = ("pyopencl", "skimage", "scipy", "matplotlib", "plyfile", "PIL", "tqdm", "jinja2", "markupsafe", "minify")
 
 
 def lint_imports(folder: Path, contract: str | None = None) -> subprocess.CompletedProcess[str]:
@@ -103,7 +103,7 @@ def modules_after(statement: str, repository: Path) -> set[str]:
         (
             "import flexgs_edge.kernels.twins, flexgs_edge.codec.open_fgs, flexgs_edge.methods.best.method\n"
             "import flexgs_edge.methods.paper.method, flexgs_edge.methods.foreign.method, flexgs_edge.commands.compress",
-            ("pyopencl", "skimage", "matplotlib", "plyfile", "jinja2"),
+            ("pyopencl", "skimage", "matplotlib", "plyfile", "jinja2", "minify"),
         ),
     ],
     ids=["package", "help", "rooms without a device"],

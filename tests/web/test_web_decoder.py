@@ -20,6 +20,7 @@ from flexgs_edge.codec.open_fgs import open_fgs, verify
 from flexgs_edge.codec.v2.container import trim_container, write_grid
 from flexgs_edge.errors import FormatError
 from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.viewer.assets import web_files
 from grid_scenes import make_grid
 from web_vectors import FOLDER, KINDS, expected, write_all, write_expected
 
@@ -64,6 +65,26 @@ def test_its_own_tests_pass(node: str) -> None:
     files = sorted(str(path) for path in (DECODER / "tests").glob("*.test.mjs"))
     result = subprocess.run([node, "--test", *files], capture_output=True, text=True, check=False, timeout=250)
     assert result.returncode == 0, result.stdout[-5000:]
+
+
+def test_a_page_of_version_2_refuses_version_1(node: str, tmp_path: Path) -> None:
+    for path, text in web_files(version=2).items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(text)
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    script = (
+        "const { open } = await import(process.argv[1]);\n"
+        "const { readFileSync } = await import('node:fs');\n"
+        "const tried = process.argv.slice(2).map((path) => open(readFileSync(path)).then((file) => file.count, String));\n"
+        "console.log((await Promise.all(tried)).join('\\n'));"
+    )
+    names = [FOLDER / "255_rows.fgs", FOLDER / "version_1_no_SH.fgs"]
+    command = [node, "--input-type=module", "-e", script, str(tmp_path / "decoder/src/index.js"), *map(str, names)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    assert result.stdout.splitlines() == [
+        "255",
+        "FgsError: byte 8: version: wanted 2, got 1: flexgs-edge view makes a page for it",
+    ]
 
 
 def test_the_vectors_are_read_as_they_say() -> None:

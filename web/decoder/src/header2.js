@@ -13,7 +13,7 @@ import {
 } from './limits.js';
 import { shown } from './shown.js';
 
-const KEYS = [
+const HEADER_KEYS = [
   'chunk_rows',
   'count',
   'cut_from',
@@ -33,9 +33,9 @@ const STEP_ORDER = ['position', 'scale', 'rotation', 'opacity', 'dc', 'sh', 'chr
 /** Read and check the header of a version 2 file; throws `HeaderError`. */
 export function decodeHeader2(bytes) {
   const record = parseJson(bytes);
-  const wanted = record instanceof Map && record.has('channels') ? [...KEYS, 'channels'].sort() : KEYS;
+  const wanted = record instanceof Map && record.has('channels') ? [...HEADER_KEYS, 'channels'].sort() : HEADER_KEYS;
   if (!hasKeys(record, wanted)) {
-    const keys = KEYS.join(', ');
+    const keys = HEADER_KEYS.join(', ');
     throw new HeaderError(`wanted an object with the keys ${keys} and perhaps channels, got ${shown(record)}`);
   }
   const count = checkedInteger('count', record.get('count'), 0, COUNT_MOST);

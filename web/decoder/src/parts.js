@@ -1,10 +1,6 @@
 import { crc32, u32 } from './bytes.js';
-import { decodeChunk } from './chunk.js';
 import { FgsError, StreamError } from './errors.js';
-import { leastBytes } from './header2.js';
 import { compareCrc, truncated } from './preamble.js';
-import { values2 } from './values.js';
-import { decodeChunk1, values1 } from './version1.js';
 
 /** A decoded chunk. */
 export class Chunk {
@@ -32,19 +28,25 @@ export class Chunk {
  * @returns {{chunk: Chunk, used: number}} and its bytes
  */
 export function decodePlace(frame, place, bytes, options) {
-  const { header, model, ranges } = frame;
-  if (header.version === 1) {
-    const codes = decodeChunk1(header, place.start, bytes, options.sh);
-    const values = () => values1(codes, header, ranges, place.start, place.rows);
-    return { chunk: new Chunk(place, codes, !options.open, values), used: place.bytes };
+  const { codes, used, values } = frame.format.decode(frame, place, bytes, options);
+  return { chunk: new Chunk(place, codes, !options.open, values), used };
+}
+
+/** Check a chunk and decode it. */
+export function checkedChunk(name, frame, place, offset, length, sum, bytes, sh) {
+  const part = `chunk ${place.index}`;
+  if (bytes.length !== length) throw truncated(name, offset, part, length, bytes.length);
+  compareCrc(name, part, offset, sum, crc32(bytes));
+  try {
+    return decodePlace(frame, place, bytes, { sh }).chunk;
+  } catch (error) {
+    throw chunkError(name, place.index, offset, error);
   }
-  const { codes, used } = decodeChunk(model, header.low, place.rows, bytes, options);
-  return { chunk: new Chunk(place, codes, !options.open, () => values2(codes, header)), used };
 }
 
 /** The checked chunk table: the length and checksum of each chunk. It lies at the end of the file. */
 export function readTable(name, frame, data) {
-  const { header, size } = frame;
+  const { header, size, format } = frame;
   const offset = size - header.tableBytes;
   if (data.length !== header.tableBytes) throw truncated(name, offset, 'chunk table', header.tableBytes, data.length);
   const body = data.subarray(0, data.length - 4);
@@ -52,11 +54,11 @@ export function readTable(name, frame, data) {
   const lengths = new Uint32Array(header.chunkCount);
   const sums = new Uint32Array(header.chunkCount);
   let at = header.chunksOffset;
-  for (const place of frame.plan()) {
+  for (const place of format.planChunks(header)) {
     const i = place.index;
     lengths[i] = u32(body, 8 * i);
     sums[i] = u32(body, 8 * i + 4);
-    const fault = wrongLength(header, place, lengths[i]);
+    const fault = format.wrongLength(place, lengths[i]);
     if (fault) throw new FgsError(name, offset + 8 * i, `chunk ${i}: length: wanted ${fault}, got ${lengths[i]}`);
     at += lengths[i];
   }
@@ -64,12 +66,6 @@ export function readTable(name, frame, data) {
     throw new FgsError(name, offset, `chunk table: wanted chunks that end at ${offset}, got ${at}`);
   }
   return { lengths, sums };
-}
-
-function wrongLength(header, place, length) {
-  if (header.version === 1) return length === place.bytes ? '' : String(place.bytes);
-  const least = leastBytes(place.rows);
-  return length < least || length % 2 ? `an even ${least} or more` : '';
 }
 
 /** The error of a chunk that does not decode, with its place; other errors as they are. */

@@ -1,12 +1,12 @@
 // The order of a channel's rows: first the multiples of 2^top, then the odd multiples of 2^(top - 1), and so on. A row has `reach`
 // neighbours on either side among the rows of earlier passes.
+import { VALUE_LIMIT } from './limits.js';
 
 const COARSE_ROWS = 256;
 /** Adding and subtracting it rounds a double below 2^51 to the nearest integer, ties to even. */
 const TO_INTEGER = 1.5 * 2 ** 52;
-const FLOAT = new Float32Array(1);
-const BITS = new Int32Array(FLOAT.buffer);
-const VALUE_LIMIT = 16383;
+const DISTANCE = new Float32Array(1);
+const DISTANCE_BITS = new Int32Array(DISTANCE.buffer);
 
 /**
  * Plan the passes over rows in these cells.
@@ -66,8 +66,8 @@ function weigh(knownX, knownY, knownZ, x, y, z, first, stride, count, width, wei
       SHARES[t] = share;
       total = fround(total + share);
     }
-    FLOAT[0] = least + 1;
-    near[row] = 256 * ((BITS[0] >>> 23) - 126);
+    DISTANCE[0] = least + 1;
+    near[row] = 256 * ((DISTANCE_BITS[0] >>> 23) - 126);
     const factor = fround(256 / total);
     const at = j * width;
     for (let t = 0; t < width; t++) weights[at + t] = fround(SHARES[t] * factor) + TO_INTEGER - TO_INTEGER;

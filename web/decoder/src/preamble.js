@@ -1,5 +1,6 @@
 import { crc32, hex8, u16, u32, u64 } from './bytes.js';
 import { FgsError } from './errors.js';
+import { FORMATS } from './formats.js';
 import { HEADER_MOST, MAGIC, PREAMBLE_BYTES } from './limits.js';
 import { shownBytes } from './shown.js';
 
@@ -22,6 +23,7 @@ export function readPreamble(name, bytes, size) {
   if (version !== 1 && version !== 2) {
     throw new FgsError(name, 8, `version: wanted 1, got ${version}: another program wrote it, or it is damaged`);
   }
+  if (!FORMATS[version]) throw new FgsError(name, 8, 'version: wanted 2, got 1: flexgs-edge view makes a page for it');
   compareCrc(name, 'preamble', 0, u32(bytes, 32), crc32(bytes.subarray(0, 32)));
   const required = u16(bytes, 10);
   if (required) {
@@ -34,12 +36,12 @@ export function readPreamble(name, bytes, size) {
     throw new FgsError(name, 16, `file size: wanted at most 2^53 - 1 bytes, got ${claimed}`);
   }
   const headerBytes = u32(bytes, 24);
-  const fault = wrongLength(version, headerBytes, Number(claimed) - PREAMBLE_BYTES);
+  const fault = wrongHeaderLength(version, headerBytes, Number(claimed) - PREAMBLE_BYTES);
   if (fault) throw new FgsError(name, 24, `header length: ${fault}, got ${headerBytes}`);
   return { version, size: Number(claimed), headerBytes, headerCrc: u32(bytes, 28) };
 }
 
-function wrongLength(version, length, room) {
+function wrongHeaderLength(version, length, room) {
   const most = Math.min(HEADER_MOST, room);
   if (version === 2) return length <= most ? '' : `wanted at most ${most}`;
   if (length % 1024 === 0 && length >= 2048 && length <= most) return '';

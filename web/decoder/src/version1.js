@@ -20,7 +20,7 @@ const NAMES = ARRAYS.map(([, , name]) => name).sort();
 const SMALLEST_STEP = 2 ** -126;
 
 /** Read and check the header; throws `HeaderError`. */
-export function decodeHeader1(bytes) {
+function decodeHeader1(bytes) {
   const record = parseJson(bytes);
   if (!hasKeys(record, KEYS)) {
     throw new HeaderError(`wanted an object with the keys ${KEYS.join(', ')}, got ${shown(record)}`);
@@ -61,8 +61,7 @@ export function decodeHeader1(bytes) {
   return { ...header, fileSize: header.chunksOffset + payload + header.tableBytes };
 }
 
-/** The fault of a header's claims in a file of `size` bytes; "" if there is none. */
-export function wrongSize1(header, size) {
+function wrongSize1(header, size) {
   return header.fileSize === size ? '' : `its counts, bits and groups make a file of ${header.fileSize}`;
 }
 
@@ -76,7 +75,7 @@ function planeBytes(rows, bits) {
 }
 
 /** Chunk after chunk, with its bytes. */
-export function* planChunks1(header) {
+function* planChunks1(header) {
   for (let index = 0; index < header.chunkCount; index++) {
     const start = index * CHUNK_ROWS;
     const rows = Math.min(CHUNK_ROWS, header.count - start);
@@ -98,7 +97,7 @@ function rowsIn(array, start) {
  * @param {string} name of the file, for errors
  * @param {Uint8Array} bytes of the ranges, without their checksum
  */
-export function readRanges(name, bytes, header) {
+function readRanges(name, bytes, header) {
   const numbers = new Float32Array(bytes.slice().buffer);
   let at = 0;
   return header.arrays.map((array) => {
@@ -130,7 +129,7 @@ function firstWrong({ low, step }, most) {
 }
 
 /** The codes of a chunk: for each array a plane for each channel. SH have fewer rows. */
-export function decodeChunk1(header, start, bytes, sh) {
+function decodeCodes(header, start, bytes, sh) {
   const codes = {};
   let at = 0;
   for (const array of header.arrays) {
@@ -158,7 +157,7 @@ function unpack(bytes, bits, rows) {
 }
 
 /** Values of a chunk: low + code * step, each operation rounded to binary32. Rows without SH have zeros. */
-export function values1(codes, header, ranges, start, rows) {
+function valuesOf(codes, header, ranges, start, rows) {
   const values = {};
   header.arrays.forEach((array, i) => {
     const out = new Float32Array(array.channels * rows);
@@ -194,3 +193,17 @@ function groupOf(row, all, groups) {
   while (Math.floor(((group + 1) * all) / groups) <= row) group++;
   return group;
 }
+
+/** What `formats.js` asks of a version. */
+export const VERSION1 = {
+  decodeHeader: decodeHeader1,
+  wrongSize: wrongSize1,
+  planChunks: planChunks1,
+  shared: ({ rangesOffset, rangesBytes }) => ({ part: 'ranges', offset: rangesOffset, length: rangesBytes }),
+  readShared: readRanges,
+  wrongLength: (place, length) => (length === place.bytes ? '' : String(place.bytes)),
+  decode({ header, shared }, place, bytes, { sh }) {
+    const codes = decodeCodes(header, place.start, bytes, sh);
+    return { codes, used: place.bytes, values: () => valuesOf(codes, header, shared, place.start, place.rows) };
+  },
+};

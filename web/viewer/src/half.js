@@ -1,10 +1,10 @@
-const FLOAT = new Float32Array(1);
-const BITS = new Uint32Array(FLOAT.buffer);
+const SINGLE = new Float32Array(1);
+const SINGLE_BITS = new Uint32Array(SINGLE.buffer);
 
 /** The bits of the nearest half float; values beyond its range are cut off. */
 export function toHalf(value) {
-  FLOAT[0] = Math.min(65504, Math.max(-65504, value));
-  const bits = BITS[0];
+  SINGLE[0] = Math.min(65504, Math.max(-65504, value));
+  const bits = SINGLE_BITS[0];
   const sign = (bits >>> 16) & 0x8000;
   const exponent = ((bits >>> 23) & 255) - 112;
   const fraction = bits & 0x7fffff;

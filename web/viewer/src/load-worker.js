@@ -1,9 +1,13 @@
-import { FgsError, open } from '../../decoder/src/index.js';
+import { FgsError } from '../../decoder/src/errors.js';
+import { StreamSource } from '../../decoder/src/incoming.js';
+import { openStreamed } from '../../decoder/src/streamed.js';
 import { packChunk } from './pack.js';
 
-/** Decode a scene and pack it for the textures. In: { source, name } or { error }. Out: { header }, { chunk }, { done } or { error }. */
+/** Decode a scene as it comes, and pack it for the textures. In: { source, name }. Out: { header }, { chunk }, { done } or { error }. */
 async function load(source, name) {
-  const file = await open(source, { name });
+  const response = typeof source === 'string' ? await fetch(source) : new Response(source);
+  if (!response.ok) throw new Error(`${source}: the server says ${response.status}`);
+  const file = await openStreamed(new StreamSource(response.body), name, sizeOf(source, response));
   const { count, shDegree, origin, settings, layers, size, version, header } = file;
   const shRows = header.channels ? (header.channels.rows[0] ?? 0) : (header.shCount ?? (shDegree ? count : 0));
   const { cutFrom } = header;
@@ -21,9 +25,15 @@ async function load(source, name) {
   self.postMessage({ done: true });
 }
 
+/** Bytes of a source, or null. A server may pack what it sends, and other servers need not tell that they do. */
+function sizeOf(source, { type, headers }) {
+  if (typeof source !== 'string') return source.size ?? source.length;
+  const told = type === 'basic' && !headers.get('Content-Encoding') && headers.get('Content-Length');
+  return told ? Number(told) : null;
+}
+
 self.onmessage = ({ data }) => {
-  const loaded = data.error ? Promise.reject(new Error(data.error)) : load(data.source, data.name);
-  loaded.catch((error) => {
+  load(data.source, data.name).catch((error) => {
     const advice = error instanceof FgsError ? '' : 'Cannot load the scene: ';
     self.postMessage({ error: advice + error.message });
   });

@@ -25,7 +25,6 @@ flat out vec4 colour;
 const float DILATION = 0.3;
 const float SHARE_MIN = 1.0 / (255.0 * 255.0);
 
-vec3 basisOf;
 int firstSh;
 
 uvec4 texel(int k) {

@@ -1,8 +1,8 @@
 // The order of drawing: back to front by depth along the view. Depths are float32, as in the program, and sorted stably by their
 // bits, so that splats of equal depth keep the order of their rows.
 
-const BITS = 11;
-const SIZE = 1 << BITS;
+const DIGIT_BITS = 11;
+const SIZE = 1 << DIGIT_BITS;
 
 /** Sorts growing lists of rows. */
 export class Sorter {
@@ -51,23 +51,23 @@ export class Sorter {
     }
     const { keys, places, spareKeys, spare } = this;
     pass(keys, places, count, 0, spareKeys, spare);
-    pass(spareKeys, spare, count, BITS, keys, places);
-    pass(keys, places, count, 2 * BITS, spareKeys, spare);
+    pass(spareKeys, spare, count, DIGIT_BITS, keys, places);
+    pass(keys, places, count, 2 * DIGIT_BITS, spareKeys, spare);
     reverse(spare, count, out);
     return count;
   }
 }
 
-const FLOAT = new Float32Array(1);
-const WORD = new Uint32Array(FLOAT.buffer);
+const DEPTH = new Float32Array(1);
+const DEPTH_WORD = new Uint32Array(DEPTH.buffer);
 
 function depths(means, first, [x, y, z, offset], near, importance, threshold, keys, places, count) {
   const rows = means.length / 3;
   for (let i = 0; i < rows; i++) {
-    FLOAT[0] = x * means[i] + y * means[rows + i] + z * means[2 * rows + i] + offset;
-    if (FLOAT[0] > near && importance[first + i] >= threshold) {
+    DEPTH[0] = x * means[i] + y * means[rows + i] + z * means[2 * rows + i] + offset;
+    if (DEPTH[0] > near && importance[first + i] >= threshold) {
       // Bits of positive floats sort as the floats do.
-      keys[count] = WORD[0];
+      keys[count] = DEPTH_WORD[0];
       places[count++] = first + i;
     }
   }

@@ -2,7 +2,7 @@ import { boxOf, Camera, outsidePose, upOf } from './camera.js';
 import { Controls } from './controls.js';
 import { Renderer } from './renderer.js';
 import { subtract, dot, times, add } from './vectors.js';
-import { sendScene, startWorker } from './workers.js';
+import { startWorker } from './workers.js';
 
 const GRID = 256 * 2 ** 20;
 const GROWTH_POWER = 1 / 8;
@@ -22,7 +22,7 @@ export class Viewer extends EventTarget {
     super();
     this.canvas = canvas;
     this.fresh = { load: startWorker('load'), sort: startWorker('sort'), first, started: performance.now() };
-    if (first) sendScene(this.fresh.load, first.source, first.name);
+    if (first) this.fresh.load.postMessage(first);
     this.renderer = new Renderer(canvas, { half });
     this.camera = new Camera([0, -1, 0]);
     this.controls = new Controls(canvas, () => this.camera, () => this.refresh());
@@ -72,7 +72,7 @@ export class Viewer extends EventTarget {
       await new Promise((resolve, reject) => {
         this.loader.onerror = (event) => reject(new Error(event.message || 'The worker that decodes did not start.'));
         this.loader.onmessage = ({ data }) => this.#loaded(data, agree).then((done) => done && resolve(), reject);
-        if (!begun) sendScene(this.loader, source, name);
+        if (!begun) this.loader.postMessage({ source, name });
       });
     } catch (error) {
       this.loader.terminate();

@@ -1,0 +1,50 @@
+"""Scripts, shaders and styles made short: they do the same."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from flexgs_edge.viewer import shorten
+from flexgs_edge.viewer.assets import web_files
+from flexgs_edge.viewer.shorten import shorten_script, shorten_style
+
+
+def test_shaders_lose_what_only_readers_need() -> None:
+    script = "const a = `#version 300 es\n  // why\n  int a = - -1;  // b\n  f( b ) [c & 1] / 2.0;\n`;"
+    assert "#version 300 es\nint a=- -1;\nf(b)[c&1]/2.0;\n" in shorten_script(script)
+
+
+def test_other_templates_stay() -> None:
+    assert "`\n  // no shader ${a}\n`" in shorten_script("f(`\n  // no shader ${a}\n`);")
+
+
+def test_styles() -> None:
+    assert shorten_style("a {\n  color: #ffffff;\n}\n") == "a{color:#fff}"
+
+
+def test_without_the_minifier(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shorten, "find_spec", lambda name: None)
+    assert shorten_script("const a = 1; // one\n") == "const a = 1; // one\n"
+    assert shorten_style("a { }") == "a { }"
+
+
+def test_the_decoder_and_the_viewer_made_short_pass_their_tests(tmp_path: Path, repository: Path) -> None:
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no node to run the tests of the decoder")
+    shutil.copytree(repository / "web", tmp_path / "web")
+    for path, text in web_files().items():
+        if path.endswith(".js"):
+            short = shorten_script(text)
+            assert len(short) < len(text)
+            (tmp_path / "web" / path).write_text(short)
+    for part in ("decoder", "viewer"):
+        run = subprocess.run(
+            [node, "--test", "tests/"], cwd=tmp_path / "web" / part, capture_output=True, text=True, timeout=200
+        )
+        assert run.returncode == 0 and "# fail 0" in run.stdout, run.stdout[-3000:] + run.stderr
+        assert "# pass 0" not in run.stdout
