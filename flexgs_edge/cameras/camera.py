@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -82,12 +83,14 @@ class Camera:
             cy=(self.cy + 0.5) * down - 0.5,
         )
 
-    def every(self, step: int, column: int = 0, row: int = 0) -> Camera:
-        """The view with every `step`-th pixel of both directions, from pixel (`column`, `row`) on.
+    def every(self, step: float, column: float = 0, row: float = 0) -> Camera:
+        """The view at points `step` pixels apart in both directions, from the place (`column`, `row`) on.
 
-        Their colours stay the same. It raises `InputError` if no pixel is left.
+        Places count from the middle of the first pixel, and no point lies beyond the middle of the last one. Colours stay
+        the same. It raises `InputError` if no point is left.
         """
-        width, height = -(-(self.width - column) // step), -(-(self.height - row) // step)
+        sides = (self.width - 1 - column, self.height - 1 - row)
+        width, height = (math.floor(side / step) + 1 for side in sides)
         if not (0 <= column < step and 0 <= row < step) or width < 1 or height < 1:
             raise InputError(
                 f"camera {self.name!r}: every {step} pixels from ({column}, {row}): no such pixels in {self.width}x{self.height}"

@@ -96,10 +96,11 @@ def test_splits_that_make_no_sense(holdout: int) -> None:
 
 def test_every_pixel_of_a_lattice_is_one_of_the_whole_view() -> None:
     camera, point = turned(), np.array([0.3, -0.2, 4.0])
-    for step, column, row in ((1, 0, 0), (2, 1, 0), (3, 2, 1)):
+    for step, column, row in ((1, 0, 0), (2, 1, 0), (3, 2, 1), (2.5, 1.25, 0.75)):
         part = camera.every(step, column, row)
         np.testing.assert_allclose(project(part, point) * step + (column, row), project(camera, point), rtol=1e-12)
-        assert (part.width, part.height) == (len(range(column, 64, step)), len(range(row, 48, step)))
+        columns, rows = np.arange(column, 63.5, step), np.arange(row, 47.5, step)
+        assert (part.width, part.height) == (np.count_nonzero(columns <= 63), np.count_nonzero(rows <= 47))
         # A quarter of a pixel's area of the lattice is a pixel's of the whole.
         assert part.dilation * step**2 == pytest.approx(camera.dilation)
 

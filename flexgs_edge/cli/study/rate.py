@@ -55,7 +55,9 @@ def effort_option(name: str, default: str, text: str) -> Callable[[help_page.Dec
     show_default=True,
     help="Ratios for --method best without each of its parts; none: skip this.",
 )
-@effort_option("--ablation-effort", "fast", "Effort of the search at --ablations. Less is faster.")
+@effort_option(
+    "--ablation-effort", "fast", "Effort of the search at --ablations. Less is faster; fast does not descend."
+)
 @help_page.option(
     "Points",
     "--distilled",
@@ -82,7 +84,8 @@ def command(
       - both methods of compress, at several ratios
       - the whole scene as .spz, .sog and .compressed.ply
       - --method best without each of its parts: measured costs, measuring
-        again, the refit, the SH degree of each Gaussian, the context coder
+        again, the refit, the SH degree of each Gaussian, the context coder;
+        where searches descend, also parts of the descents
 
     The same views judge every file: held-out photos where there are some. Results appear in DIR when all is done: open
     DIR/index.html; rate.csv has all points. More ratios and more effort take longer.

@@ -5,6 +5,7 @@ Work is counted and never timed, so the same command gives the same bytes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -23,8 +24,13 @@ REFITTED = 0.66
 """Expected loss after the first round of the colour refit, divided by the loss before it, until a candidate tells:
 docs/results/tuning.md#refitted"""
 LARGEST_STEP = 4
-"""Largest distance in pixels between those that we look at. Splats of one or two pixels must not fall between them
-in every view."""
+"""Largest distance in pixels between the points that we look at. Splats of one or two pixels must not fall between them
+in every view: docs/results/tuning.md#distances"""
+STEP_UNIT = 1 / 32
+"""Distances are multiples of it, so that no last bit of a sum decides."""
+SHIFTS = 0.7548776662466927, 0.5698402909980532
+"""Shares of a distance by which the lattice moves right and down from view to view: powers of the root of x^3 = x + 1, whose
+multiples fill the unit square evenly."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +58,9 @@ class Effort:
     views : int
         Most scored poses. We take more than `few` if these have too few pixels.
     pixels : int
-        Least pixels of all scored poses for each Gaussian. We look at every k-th pixel in both directions, with the
-        largest k that leaves as many. More pixels take longer, fewer make files larger: docs/results/tuning.md#pixels
+        Pixels of all scored poses for each Gaussian. We look at points so far apart that there are as many; at most all
+        pixels, and at least those of the largest distance. More take longer, fewer make files larger:
+        docs/results/tuning.md#pixels
     refitted : float
         `REFITTED` at this effort: the fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
         makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#refitted
@@ -99,51 +106,55 @@ class Effort:
 
 def sampling_steps(
     cameras: Sequence[Camera], pixels: int, coverage: float = 1.0, weights: np.ndarray | None = None
-) -> list[int]:
-    """The distance in pixels between those that we look at, for each pose.
+) -> list[float]:
+    """The distance in pixels between the points that we look at, for each pose, from 1 to `LARGEST_STEP`.
 
-    The distances are the largest, of at most `LARGEST_STEP`, that leave `pixels` in all. A pose of weight w gets about w times
-    as many pixels as one of weight 1, as errors add up over pixels.
+    The distances are the largest that leave about `pixels` points in all. A pose of weight w gets about w times as many
+    as one of weight 1, as errors add up over points.
 
     Parameters
     ----------
     cameras : sequence of Camera
         The poses.
     pixels : int
-        Least pixels of all poses together.
+        Points of all poses together.
     coverage : float
         Share of the pixels that the scene covers, which alone count. Default: all.
     weights : np.ndarray, optional
         [n] f64, above 0 to 1, one of them 1. Default: equal ones.
     """
-    spread = np.ones(len(cameras)) if weights is None else 1.0 / np.sqrt(weights)
-    # At these factors, one of the steps changes.
-    changes = np.unique(np.arange(1, LARGEST_STEP + 1)[:, None] / spread)
-    steps = np.ones(len(cameras), np.int64)
-    for factor in changes:
-        farther = np.clip(np.floor(factor * spread * (1 + 1e-9)), 1, LARGEST_STEP).astype(np.int64)
-        if coverage * pixels_of(cameras, farther.tolist()) < pixels:
-            break
-        steps = farther
-    return [int(step) for step in steps]
+    spread = [1.0] * len(cameras) if weights is None else [1.0 / math.sqrt(weight) for weight in weights.tolist()]
+
+    def steps(factor: int) -> list[float]:
+        return [min(max(math.floor(factor * each) * STEP_UNIT, 1.0), float(LARGEST_STEP)) for each in spread]
+
+    # Beyond the last factor, all distances are the largest. Fewer points belong to a larger one.
+    low, high = 1, math.ceil(LARGEST_STEP / STEP_UNIT)
+    while low < high:
+        middle = (low + high + 1) // 2
+        if coverage * pixels_of(cameras, steps(middle)) >= pixels:
+            low = middle
+        else:
+            high = middle - 1
+    return steps(low)
 
 
-def sampled_poses(cameras: Sequence[Camera], steps: Sequence[int]) -> list[Camera]:
-    """The views at every k-th pixel in both directions; `steps` has the k of each.
+def sampled_poses(cameras: Sequence[Camera], steps: Sequence[float]) -> list[Camera]:
+    """The views at points so far apart; `steps` has the distance of each.
 
-    Lattices of one step begin at other pixels in each view, by the order of the views' names. Names do not depend on the
-    order of the poses, where a moved scene may break ties in another way.
+    Lattices begin at other places in each view, by the order of the views' names. Names do not depend on the order of the
+    poses, where a moved scene may break ties in another way.
     """
     places = np.argsort(np.argsort([camera.name for camera in cameras], kind="stable"), kind="stable")
     return [
-        camera.every(step, *divmod(int(place) % step**2, step))
-        for place, camera, step in zip(places, cameras, steps, strict=True)
+        camera.every(step, *(step * (place * shift % 1.0) for shift in SHIFTS)) if step > 1 else camera
+        for place, camera, step in zip(places.tolist(), cameras, steps, strict=True)
     ]
 
 
-def pixels_of(cameras: Sequence[Camera], steps: Sequence[int]) -> int:
-    """Pixels of all views, each at every k-th one; `steps` has the k of each."""
-    return sum((camera.width // step) * (camera.height // step) for camera, step in zip(cameras, steps, strict=True))
+def pixels_of(cameras: Sequence[Camera], steps: Sequence[float]) -> int:
+    """About how many points all views have; `steps` has the distance of each."""
+    return sum(int(camera.width * camera.height / step**2) for camera, step in zip(cameras, steps, strict=True))
 
 
 EFFORTS = {

@@ -190,7 +190,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         def change() -> tuple[np.ndarray, dict[str, np.ndarray]]:
             kept = self.kept(self._cut(self.rounds.snapshots[-1]))
             schedule = self._schedule(descents.INTERLEAVED_SHARE, kept.planes, last=descents.INTERLEAVED_LAST)
-            return kept.rows, distil(kept.planes, kept.degrees, self.rounds.original, schedule)
+            return kept.rows, self._distil(kept, schedule)
 
         self.rounds.renew(change)
 
@@ -216,9 +216,9 @@ class GridSearch(MultiplierSearch[GridScene]):
         original, planes = self.rounds.original, snapshot.planes
         return probe_slopes(original.bench.renderer, planes, original.origin, original.cameras, self.effort.probed)
 
-    def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes) -> Planes:
-        original = self.rounds.original
-        first = first_layer(kept.planes, kept.degrees, self.first, self.bits, original) if self.first else None
+    def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
+        original, layered = self.rounds.original, self.first and step_sizes is not None
+        first = first_layer(kept.planes, kept.degrees, self.first, self.bits, original) if layered else None
         return distil(kept.planes, kept.degrees, original, schedule, step_sizes, first=first)
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:

@@ -14,6 +14,7 @@ from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
 from flexgs_edge.methods.paper.prune import ranks_from_order
+from flexgs_edge.studies.rate.descent_parts import DESCENT_PARTS
 
 
 class RankedPath(PruneRounds):
@@ -131,7 +132,7 @@ class Variant:
 WHOLE = Variant("whole", "nothing is taken away")
 
 
-def parts_of(order: np.ndarray, sh_degree: int) -> tuple[Variant, ...]:
+def parts_of(order: np.ndarray, sh_degree: int, descends: bool) -> tuple[Variant, ...]:
     """Variants that each lack one part. Those about SH are left out if the scene has none.
 
     Parameters
@@ -140,6 +141,8 @@ def parts_of(order: np.ndarray, sh_degree: int) -> tuple[Variant, ...]:
         [N] i64, rows by the paper's score, least important first.
     sh_degree : int
         SH degree of the scene.
+    descends : bool
+        Whether the searches descend: then variants lack parts of the descents, too.
     """
     parts = [
         Variant(
@@ -157,4 +160,6 @@ def parts_of(order: np.ndarray, sh_degree: int) -> tuple[Variant, ...]:
             Variant("SH all or none", "each Gaussian keeps all SH or none", search=AllOrNone),
             Variant("full SH", "every Gaussian keeps all SH", search=FullSh),
         ]
+    if descends:
+        parts += [Variant(name, words, search=search) for name, words, search in DESCENT_PARTS]
     return tuple(parts)

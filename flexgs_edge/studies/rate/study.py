@@ -13,7 +13,7 @@ from typing import Any
 
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.files import atomic_folder, check_folder
-from flexgs_edge.methods.best.effort import EFFORTS
+from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.plots import require_matplotlib
 from flexgs_edge.run.options import CompressOptions
@@ -133,7 +133,9 @@ def _experiments(
             found += Found((), (f"best ({MAX}: {error})",))
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder) as place:
         found += peer_points(studied, Path(place))
-    variants = parts_of(studied.orders["gs"], studied.run.source.sh_degree) if ablations else ()
+    source, options = studied.run.source, replace(studied.run.options, effort=ablation_effort)
+    descends = distil_steps(options, 1, source.count) > 0
+    variants = parts_of(studied.orders["gs"], source.sh_degree, descends) if ablations else ()
     if ablations and ablation_effort != effort:
         found += best_points(studied, WHOLE, ablation_effort, ratios, ablations)
     for variant in variants:

@@ -40,31 +40,36 @@ def test_who_descends() -> None:
         assert distil_steps(CompressOptions(**words), 100, least, foreign) == 0, (words, foreign)
 
 
-@pytest.mark.parametrize(("count", "step"), [(10, LARGEST_STEP), (100, 3), (240, 2), (260, 1), (10**6, 1)])
-def test_poses_have_no_more_pixels_than_the_rows_need(count: int, step: int) -> None:
+@pytest.mark.parametrize(
+    ("count", "step"), [(10, LARGEST_STEP), (113, 3), (120, 2.90625), (256, 2), (1030, 1), (10**6, 1)]
+)
+def test_poses_have_as_many_pixels_as_the_rows_need(count: int, step: float) -> None:
     cameras = [make_camera(64, 48) for _ in range(8)]
     assert sampling_steps(cameras, 24 * count) == [step] * 8
     assert sampling_steps(cameras, 24 * count, 0.5) == sampling_steps(cameras, 48 * count)
     assert sampling_steps(cameras, 24 * count, 0.0) == [1] * 8
     sampled = sampled_poses(cameras, [step] * 8)
-    assert {camera.width for camera in sampled} == {-(-64 // step)} | ({64 // step} if 64 % step else set())
-    if 1 < step < LARGEST_STEP:
-        pixels = sum(camera.width * camera.height for camera in sampled)
-        assert pixels >= 24 * count
-    # Not the same lattice in every view.
-    assert len({(camera.cx, camera.cy) for camera in sampled}) == min(step**2, 8)
+    pixels = sum(camera.width * camera.height for camera in sampled)
+    assert pixels == pytest.approx(sum(64 * 48 / step**2 for _ in cameras), rel=0.04)
+    # Not the same lattice in every view, and none beyond the last pixels.
+    assert len({(camera.cx, camera.cy) for camera in sampled}) == (8 if step > 1 else 1)
+    for camera, whole in zip(sampled, cameras, strict=True):
+        first = whole.cx - step * camera.cx, whole.cy - step * camera.cy
+        for at, count_, side in zip(first, (camera.width, camera.height), (64, 48), strict=True):
+            assert -1e-9 <= at < step and side - 1 - step < at + step * (count_ - 1) <= side - 1 + 1e-9
 
 
 def test_poses_get_pixels_by_their_weights() -> None:
-    """About in proportion, between all of them and one of the largest step; never fewer in all than the rows need."""
+    """In proportion, between all of them and those of the largest distance; never fewer in all than the rows need."""
     cameras = [make_camera(64, 48) for _ in range(4)]
     weights = np.array([1.0, 0.25, 1 / 9, 1e-6])
     assert sampling_steps(cameras, 1, weights=weights) == [4, 4, 4, 4]
-    assert sampling_steps(cameras, 4300, weights=weights) == [1, 2, 3, 4]
+    assert sampling_steps(cameras, 4360, weights=weights) == [1, 2, 3, 4]
+    assert sampling_steps(cameras, 2000, weights=weights) == [1.53125, 3.0625, 4, 4]
     assert sampling_steps(cameras, 4 * 64 * 48, weights=weights) == [1, 1, 1, 1]
     for pixels in range(800, 12_000, 700):
         steps = sampling_steps(cameras, pixels, weights=weights)
-        assert steps == sorted(steps) and sum((64 // step) * (48 // step) for step in steps) >= pixels
+        assert steps == sorted(steps) and sum(64 * 48 / step**2 for step in steps) >= pixels
 
 
 def test_large_scenes_are_scored_from_more_poses() -> None:
