@@ -124,12 +124,14 @@ def sampling_steps(
         [n] f64, above 0 to 1, one of them 1. Default: equal ones.
     """
     spread = [1.0] * len(cameras) if weights is None else [1.0 / math.sqrt(weight) for weight in weights.tolist()]
+    widest = max(spread)
 
     def steps(factor: int) -> list[float]:
-        return [min(max(math.floor(factor * each) * STEP_UNIT, 1.0), float(LARGEST_STEP)) for each in spread]
+        farther = [math.floor(factor * each / widest) * STEP_UNIT for each in spread]
+        return [min(max(step, 1.0), float(LARGEST_STEP)) for step in farther]
 
-    # Beyond the last factor, all distances are the largest. Fewer points belong to a larger one.
-    low, high = 1, math.ceil(LARGEST_STEP / STEP_UNIT)
+    # At the first factor all distances are the least, at the last one the largest.
+    low, high = 1, math.ceil(LARGEST_STEP / STEP_UNIT * widest / min(spread))
     while low < high:
         middle = (low + high + 1) // 2
         if coverage * pixels_of(cameras, steps(middle)) >= pixels:
@@ -181,7 +183,7 @@ EFFORTS = {
         views=400,
         pixels=24,
         refitted=0.7,
-        passes=6.0,
+        passes=8.0,
         interleaved=2,
         descends=10_000,
     ),

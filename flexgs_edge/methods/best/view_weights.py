@@ -27,7 +27,7 @@ LEAST = 1e-6
 """Least weight of a pose."""
 STEP = 4
 """Every fourth pixel in both directions is compared."""
-POWER, RARE_POWER = 4.0, 2.0
+POWER, RARE_POWER = 4.8, 2.4
 """Powers of the slope, and of how rare a pose's picture is. The slope alone would minimise the mean drop; higher powers lift
 the worst view, as a soft maximum does: docs/results/tuning.md#view_weights"""
 
