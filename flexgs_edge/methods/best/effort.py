@@ -196,7 +196,7 @@ EFFORTS = {
         few=400,
         views=400,
         pixels=24,
-        passes=12.0,
+        passes=16.0,
         interleaved=16,
         interleave_at=0.6,
     ),

@@ -62,11 +62,13 @@ def test_the_last_descent_before_a_size_has_about_the_rows_that_fit() -> None:
 
 
 class Mending(KnownSearch):
-    """Descents mark opacities; `calls` has the steps, rate and first opacity of each."""
+    """Descents to candidates mark opacities; `calls` has the steps, rate and first opacity of each."""
 
     calls: list[tuple[int, float, float]]
 
-    def _distil(self, kept: Kept, schedule: Schedule, steps: StepSizes) -> Any:
+    def _distil(self, kept: Kept, schedule: Schedule, steps: StepSizes | None = None) -> Any:
+        if steps is None:
+            return super()._distil(kept, schedule)
         logits = kept.planes["opacity_logits"]
         self.calls.append((schedule.iterations, schedule.rate, float(logits.max())))
         return {**kept.planes, "opacity_logits": np.full_like(logits, MARK)}
@@ -231,7 +233,10 @@ def between(
     counts: list[int] = []
     losses: list[tuple[float, float]] = []
 
-    def moved(planes: dict[str, np.ndarray], degrees: np.ndarray, original: Any, schedule: Schedule) -> Any:
+    def moved(
+        planes: dict[str, np.ndarray], degrees: np.ndarray, original: Any, schedule: Schedule, steps: Any, first: Any
+    ) -> Any:
+        assert steps is None and first is None
         assert schedule.last == INTERLEAVED_LAST and schedule.iterations == 50
         counts.append(len(degrees))
         return {**planes, "opacity_logits": np.full_like(planes["opacity_logits"], MARK)}
