@@ -58,8 +58,8 @@ class Effort:
     views : int
         Most scored poses. We take more than `few` if these have too few pixels.
     pixels : int
-        Pixels of all scored poses for each Gaussian. We look at points so far apart that there are as many; at most all
-        pixels, and at least those of the largest distance. More take longer, fewer make files larger:
+        Points of all scored poses that we look at, for each Gaussian. There are more if they would lie farther apart than
+        `LARGEST_STEP`, and fewer if the poses have fewer pixels. More take longer, fewer make files larger:
         docs/results/tuning.md#pixels
     refitted : float
         `REFITTED` at this effort: the fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low

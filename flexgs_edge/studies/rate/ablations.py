@@ -120,6 +120,8 @@ class Variant:
         Makes the rounds from the arguments of `PruneRounds`.
     refit : bool
         As for `compress`.
+    distil : int, optional
+        As for `compress`. Default: as the study has it.
     """
 
     name: str
@@ -127,6 +129,7 @@ class Variant:
     search: type[GridSearch] = GridSearch
     path: Callable[..., PruneRounds] = PruneRounds
     refit: bool = True
+    distil: int | None = None
 
 
 WHOLE = Variant("whole", "nothing is taken away")
@@ -161,5 +164,6 @@ def parts_of(order: np.ndarray, sh_degree: int, descends: bool) -> tuple[Variant
             Variant("full SH", "every Gaussian keeps all SH", search=FullSh),
         ]
     if descends:
+        parts.append(Variant("no descents", "colours are refitted instead of descents (--distil 0)", distil=0))
         parts += [Variant(name, words, search=search) for name, words, search in DESCENT_PARTS]
     return tuple(parts)

@@ -2,36 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.methods.best.candidates import Candidate
-from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.kept import Kept
-from flexgs_edge.methods.best.multiplier import Measure
 from flexgs_edge.methods.best.refit.distil import Schedule, distil
-from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.scene.source import Planes
-
-
-class NoDescents(GridSearch):
-    """A search that refits colours in the place of each descent."""
-
-    def __init__(
-        self,
-        rounds: PruneRounds,
-        size_of: Callable[[GridScene], int],
-        measure: Measure,
-        effort: Effort,
-        refit: bool = True,
-        on_step: Callable[[Candidate], None] | None = None,
-        *descent: Any,
-    ) -> None:
-        super().__init__(rounds, size_of, measure, effort, refit, on_step)
 
 
 class NoneBetween(GridSearch):
@@ -72,7 +50,6 @@ class NoMean(GridSearch):
 
 
 DESCENT_PARTS: tuple[tuple[str, str, type[GridSearch]], ...] = (
-    ("no descents", "colours are refitted instead of descents", NoDescents),
     ("none between", "no descents between the rounds of pruning", NoneBetween),
     ("no prices", "bits cost nothing in descents", NoPrices),
     ("no SSIM", "descents see squared errors alone", NoStructure),

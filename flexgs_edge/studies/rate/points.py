@@ -189,6 +189,8 @@ def best_points(
     """
     run, source = studied.run, studied.run.source
     options = replace(studied.run.options, effort=effort, refit=variant.refit, best_effort=True)
+    if variant.distil is not None:
+        options = replace(options, distil=variant.distil)
     # All sizes share their rounds, and so their poses: those of the largest size.
     largest = replace(
         options, max_drop=None, min_fidelity=None, max_size=None, min_ratio=min(ratios), max_worst_drop=None
