@@ -70,10 +70,17 @@ def test_slopes_of_a_moved_scene_are_the_same() -> None:
 
 
 def test_moved_scenes_are_compressed_alike(tmp_path: Path) -> None:
+    """In the middle of three targets: everything rounds otherwise, so that a search of a tiny scene may take another way."""
     project = make_project(tmp_path / "tiny")
-    words = {"effort": "fast", "max_drop": 1.0, "holdout": 4, "promise": "mean"}
-    found, note = compare(project, tmp_path, FACTOR, **words)
-    assert open_scene(tmp_path / "moved" / "point_cloud.ply").count == open_scene(project / "point_cloud.ply").count
-    assert len(read_cameras(tmp_path / "moved" / "cameras.json")) == 9
-    # Everything rounds otherwise: the second candidate loses 1.44 dB, not 1.23, and the search goes on from it.
-    assert min(found.same, found.choice) >= LEAST_SAME and abs(found.bytes_ratio - 1) <= 3 * MOST_BYTES, note
+    words = {"effort": "fast", "holdout": 4, "promise": "mean"}
+    same, bytes_, notes = [], [], []
+    for drop in (0.5, 1.0, 2.0):
+        place = tmp_path / str(drop)
+        place.mkdir()
+        found, note = compare(project, place, FACTOR, max_drop=drop, **words)
+        assert open_scene(place / "moved" / "point_cloud.ply").count == open_scene(project / "point_cloud.ply").count
+        assert len(read_cameras(place / "moved" / "cameras.json")) == 9
+        same.append(min(found.same, found.choice))
+        bytes_.append(abs(found.bytes_ratio - 1))
+        notes.append(note)
+    assert np.median(same) >= LEAST_SAME and np.median(bytes_) <= MOST_BYTES, notes
