@@ -14,7 +14,8 @@ const MOST_DEGREE = 3;
  */
 export async function splatsOf(file) {
   const degree = Math.min(file.shDegree, MOST_DEGREE);
-  const size = Math.max(1, file.count);
+  // Whole lines of a texture: of arrays that end before, Spark leaves out the last line.
+  const size = utils.getTextureSize(Math.max(1, file.count)).maxSplats;
   const extArrays = [new Uint32Array(4 * size), new Uint32Array(4 * size)];
   const extra = {};
   const arrays = PLACES.slice(0, [0, 1, 2, 4][degree]).map((name) => (extra[name] = new Uint32Array(4 * size)));
@@ -51,16 +52,44 @@ function putSh(arrays, start, rows, shRest, degree, fileDegree) {
     const [array, place] = [arrays[k >> 2], k & 3];
     for (let i = 0; i < rows; i++) {
       const [red, green, blue] = [0, 1, 2].map((colour) => shRest[(colour * each + k) * rows + i]);
-      // Of three zeros, Spark's logarithm has no exponent.
-      if (red || green || blue) array[4 * (start + i) + place] = utils.encodeExtRgb(red, green, blue);
+      array[4 * (start + i) + place] = sharedExponent(red, green, blue);
     }
   }
+}
+
+/**
+ * The word that Spark decodes to three numbers: 8 bits each, their signs, and one exponent of 5 bits. Spark's own `encodeExtRgb`
+ * takes the exponent below the largest number, and cuts that number off at the power of two, to as little as half.
+ */
+function sharedExponent(...numbers) {
+  const sizes = numbers.map(Math.abs);
+  const exponent = Math.min(31, Math.max(0, Math.ceil(Math.log2(Math.max(...sizes))) + 15));
+  const unit = 2 ** (exponent - 15) / 255;
+  return numbers.reduce(
+    (word, number, k) => word | (Math.min(255, Math.round(sizes[k] / unit)) << (8 * k)) | ((number < 0 ? 1 : 0) << (24 + k)),
+    exponent << 27,
+  );
 }
 
 /** What makes Spark draw a model as INRIA's renderer and `flexgs-edge render` do; its own defaults are others. */
 export function sparkOptions(antialiased = false) {
   const blur = antialiased ? { preBlurAmount: 0, blurAmount: 0.3 } : { preBlurAmount: 0.3, blurAmount: 0 };
-  // By default it leaves out parts of large splats, and those whose centres lie outside; beyond 2, their sizes go wrong.
-  const whole = { maxPixelRadius: 4096, clipXY: 2, accumExtSplats: true };
+  // By default it leaves out parts of large splats, and those whose centres lie outside of the picture.
+  const whole = { maxPixelRadius: 4096, clipXY: 1e6, accumExtSplats: true };
   return { ...blur, ...whole, minAlpha: 1 / 255, maxStdDev: 3.33, sortRadial: false };
+}
+
+/** In Spark's vertex shader, where the shape of a splat in the picture follows from its centre. */
+const SHAPE = 'vec2 J2 = -(J1 * viewCenter.xy) * invZ;';
+const LIMITED_SHAPE = `vec2 most = 1.3 / vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
+        vec2 J2 = -(J1 * clamp(viewCenter.xy * invZ, -most, most) * viewCenter.z) * invZ;`;
+
+/**
+ * Limit how large splats far outside of the picture become, as `flexgs-edge render` does: Spark has no option for it.
+ *
+ * @param {SparkRenderer} spark not drawn yet
+ */
+export function limitSides({ material }) {
+  if (!material.vertexShader.includes(SHAPE)) throw new Error('This version of Spark has another shader: take 2.2.');
+  material.vertexShader = material.vertexShader.replace(SHAPE, LIMITED_SHAPE);
 }

@@ -2,7 +2,7 @@ import * as THREE from 'three';
 import { OrbitControls } from 'three/addons/controls/OrbitControls.js';
 import { SparkRenderer, SplatMesh } from '@sparkjsdev/spark';
 import { open } from '@flexgs/decoder';
-import { sparkOptions, splatsOf } from './fgs-splats.js';
+import { limitSides, sparkOptions, splatsOf } from './fgs-splats.js';
 
 const asked = new URLSearchParams(location.search);
 const status = document.getElementById('status');
@@ -14,6 +14,7 @@ async function start() {
   const scene = new THREE.Scene();
   scene.background = new THREE.Color().setRGB(...(file.settings.background ?? [0, 0, 0]), THREE.SRGBColorSpace);
   const spark = new SparkRenderer({ renderer, ...sparkOptions(file.settings.antialiased === true) });
+  limitSides(spark);
   scene.add(spark);
   const mesh = new SplatMesh({ splats: await splatsOf(file) });
   // Scenes of INRIA's training look along z and have y down, and three.js has y up: turned, they stand upright.
