@@ -16,6 +16,8 @@ from flexgs_edge.run.options import CompressOptions
 
 LEAST_STEPS = 240
 """Least steps of a descent. Four rounds of a few poses mend less than they break: docs/results/tuning.md#least_steps"""
+FINE_PASSES = 0.75
+"""Share of `Effort.passes` where poses have every pixel: docs/results/tuning.md#fine_passes"""
 LEAST_VIEWS = 6
 """Least poses for a step of the refit. Steps from fewer poses overfit the scored poses, and all others get worse:
 docs/results/tuning.md#least_views"""
@@ -209,7 +211,7 @@ def effort_of(options: CompressOptions) -> Effort:
     return plan if options.distil is None else replace(plan, interleaved=0)
 
 
-def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool = False) -> int:
+def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool = False, fine: bool = False) -> int:
     """Steps of the descent to a candidate; 0 for none.
 
     Parameters
@@ -222,6 +224,8 @@ def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool
         Gaussians of the scene.
     foreign : bool
         The file has another format than `.fgs`, with a grid of its own.
+    fine : bool
+        The poses have every pixel: see `is_fine`.
     """
     if foreign:
         return 0
@@ -230,4 +234,4 @@ def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool
     plan = EFFORTS[options.effort]
     if not (plan.passes and options.refit and count >= plan.descends):
         return 0
-    return max(round(plan.passes * poses), LEAST_STEPS)
+    return max(round(plan.passes * (FINE_PASSES if fine else 1.0) * poses), LEAST_STEPS)

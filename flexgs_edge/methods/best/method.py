@@ -34,7 +34,7 @@ from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.keep import kept_as_it_is, layers_cost
 from flexgs_edge.methods.best.layers import HALF, LEAST_LAYERED, MOST_LAYERED, assign_layers, layered_where_cheap
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
-from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
+from flexgs_edge.methods.best.poses import ScoredPoses, is_fine, scored_poses
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, choose_storage, least_spilled, needed_bytes
 from flexgs_edge.methods.best.view_weights import KnownErrors
@@ -245,7 +245,8 @@ def open_rounds(
         From `scored_poses`; descents look at poses by it.
     """
     renderer, source, options, budget = bench.renderer, run.source, run.options, run.budget
-    storage, steps = renderer.storage, distil_steps(options, len(scored), source.count, run.output.format is not None)
+    foreign, fine = run.output.format is not None, is_fine(options, source)
+    storage, steps = renderer.storage, distil_steps(options, len(scored), source.count, foreign, fine)
     if storage.spills:
         size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest_of(scored), steps > 0)
     else:

@@ -9,6 +9,7 @@ import pytest
 
 from flexgs_edge.methods.best.effort import (
     EFFORTS,
+    FINE_PASSES,
     LARGEST_STEP,
     LEAST_STEPS,
     distil_steps,
@@ -32,6 +33,7 @@ def test_efforts_grow() -> None:
 def test_who_descends() -> None:
     passes, least = EFFORTS["balanced"].passes, EFFORTS["balanced"].descends
     assert distil_steps(CompressOptions(), 100, 1000 * least) == round(100 * passes)
+    assert distil_steps(CompressOptions(), 100, least, fine=True) == round(100 * passes * FINE_PASSES)
     assert distil_steps(CompressOptions(), 2, least) == LEAST_STEPS
     assert distil_steps(CompressOptions(), 100, least - 1) == 0 < distil_steps(CompressOptions(), 100, least)
     assert distil_steps(CompressOptions(effort="max"), 100, least - 1) > 0
