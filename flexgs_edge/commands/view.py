@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.codec.open_fgs import file_version
+from flexgs_edge.codec.open_fgs import file_version, read_header
 from flexgs_edge.codec.v1.container import write_container
+from flexgs_edge.codec.v2.boxes import BOXES
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.methods.paper.prune import nonzero_sh
@@ -91,14 +92,15 @@ def view(
     look = {"near": run.options.near, "background": run.options.background, "antialiased": run.options.antialiased}
     name = Path(os.fspath(input)).resolve().name
     with _coded(run, input) as scene:
-        files = web_files(file_version(scene))
+        spatial = BOXES in read_header(scene).settings
+        files = web_files(file_version(scene), spatial)
         size = os.stat(scene).st_size
         if output is not None:
-            page = viewer_page(files, page_config(name, cameras, look), scene.read_bytes()).text.encode()
+            page = viewer_page(files, page_config(name, cameras, look), scene.read_bytes(), spatial).text.encode()
             with atomic_write(output, force) as file:
                 file.write(page)
             return ViewResult(scene_info(run.scene), size, len(cameras), os.fspath(output), len(page))
-        made = viewer_page(files, page_config(name, cameras, look, "scene.fgs"))
+        made = viewer_page(files, page_config(name, cameras, look, "scene.fgs"), spatial=spatial)
         text = made.text.encode()
         resources = {PAGE: Resource("text/html; charset=utf-8", text, gzip.compress(text), made.policy)}
         resources[_SCENE] = Resource("application/octet-stream", scene)

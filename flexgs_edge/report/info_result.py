@@ -214,6 +214,8 @@ def _cell(value: float | None) -> str:
 def _settings_lines(settings: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, value in settings.items():
+        if isinstance(value, list) and any(isinstance(item, list) for item in value):
+            value = f"{len(value)} of them"
         if isinstance(value, dict):
             value = ", ".join(f"{key} {'none' if item is None else item}" for key, item in value.items())
         lines.append(f"  {name.replace('_', ' ')}: {'none' if value is None else value}")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.viewer.assets import ENTRIES, PAGE, STYLE
+from flexgs_edge.viewer.assets import ENTRIES, PAGE, SPATIAL, STYLE
 from flexgs_edge.viewer.join import join_modules
 from flexgs_edge.viewer.shorten import shorten_style
 
@@ -67,7 +67,9 @@ class Page:
     policy: str
 
 
-def viewer_page(files: Mapping[str, str], config: Mapping[str, Any], scene: bytes | None = None) -> Page:
+def viewer_page(
+    files: Mapping[str, str], config: Mapping[str, Any], scene: bytes | None = None, spatial: bool = False
+) -> Page:
     """The viewer and the decoder in one file.
 
     With one request, everything but the scene is there. Workers run the page's own script. The policy lets only the page's
@@ -81,8 +83,10 @@ def viewer_page(files: Mapping[str, str], config: Mapping[str, Any], scene: byte
         From `page_config`.
     scene : bytes, optional
         A `.fgs` to put into the page, which then opens from disk without a network.
+    spatial : bool
+        As for `web_files`.
     """
-    script = join_modules(files, ENTRIES)
+    script = join_modules(files, SPATIAL if spatial else ENTRIES)
     if "</script" in script.lower() or "<!--" in script:
         raise AssertionError("a script that would end in the middle")
     style = shorten_style(files[STYLE])

@@ -45,7 +45,7 @@ def scene(sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     degrees = np.full(source.count, source.sh_degree)
     grid = to_grid(planes, degrees, FINE, tuple(source.origin), layer)[0]
     place = tmp_path_factory.mktemp("scene") / "still_life.fgs"
-    write_grid(place, grid, {}, chunk_rows=4096)
+    write_grid(place, grid, {}, chunk_rows=8192)
     return place
 
 

@@ -16,7 +16,8 @@ from PIL import Image
 from browser import Browser
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.codec.open_fgs import open_fgs
-from flexgs_edge.codec.v2.container import GridContainer
+from flexgs_edge.codec.v2.container import GridContainer, write_grid
+from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.render import render_views
 from flexgs_edge.commands.trim import trim
 from flexgs_edge.commands.view import view
@@ -91,6 +92,73 @@ def test_what_is_there_of_a_cut_file_is_drawn_larger(
         go(tab, address)
         assert tab.run("viewer.growth") == 1
         assert tab.run("(() => { viewer.rows /= 2; return viewer.growth; })()") == pytest.approx(2**0.125)
+
+
+@pytest.fixture(scope="module")
+def spatial(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same scene in so many chunks that its file tells where they lie."""
+    place = tmp_path_factory.mktemp("spatial") / "still_life.fgs"
+    source = open_fgs(scene)
+    assert isinstance(source, GridSource)
+    write_grid(place, source.grid(), {}, chunk_rows=1024)
+    return place
+
+
+def test_chunks_in_sight_come_first(tab: Browser, spatial: Path, sample_dir: Path, drawn: Drawn) -> None:
+    """The last picture is that of `render`, whatever the order in which chunks came."""
+    header = GridContainer(spatial).header
+    with served(spatial, str(sample_dir / "cameras.json"), **LOOK) as address:
+        go(tab, address)
+        assert tab.run("viewer.space.complete")
+        assert tab.run("viewer.rows") == header.count
+        for pose, file in zip(POSES, drawn(False), strict=True):
+            wanted = np.asarray(Image.open(file), np.float64)
+            assert decibels(picture(tab, pose, wanted.shape[1], wanted.shape[0]), wanted) >= 50, pose
+    assert faults(tab) == []
+
+
+def test_a_budget_bounds_the_splats_that_are_held(tab: Browser, spatial: Path, sample_dir: Path) -> None:
+    """What was out of sight goes when the camera turns to what is missing."""
+    budget = 12 * 1024
+    with served(spatial, str(sample_dir / "cameras.json"), **LOOK) as address:
+        go(tab, f"{address}?splats={budget}")
+        held = "viewer.space.parts.filter((part) => part.here)"
+        assert tab.run(f"{held}.length") == 12
+        assert tab.run("viewer.renderer.drawn") <= budget
+        assert tab.run("viewer.growth") > 1
+        indices = f"JSON.stringify({held}.map((part) => part.index).sort())"
+        before = tab.run(indices)
+        # Into the scene, and to its side.
+        tab.run("(() => { viewer.camera.zoom(0.2); viewer.camera.look(2, 0); viewer.refresh(); })()")
+        until(tab, f"{indices} !== {json.dumps(before)} && viewer.asking === 0")
+        assert tab.run(f"{held}.length") == 12
+        assert tab.run("viewer.renderer.drawn") <= budget
+    assert faults(tab) == []
+
+
+def test_a_page_of_one_file_knows_what_is_in_sight(
+    tab: Browser, spatial: Path, sample_dir: Path, tmp_path: Path
+) -> None:
+    page = tmp_path / "page.html"
+    view(spatial, page, cameras=str(sample_dir / "cameras.json"))
+    go(tab, page.as_uri())
+    assert tab.run("viewer.space.complete")
+    assert faults(tab) == []
+
+
+def test_a_damaged_chunk_ends_a_scene_that_comes_by_sight(
+    tab: Browser, spatial: Path, sample_dir: Path, tmp_path: Path
+) -> None:
+    damaged = tmp_path / "damaged.fgs"
+    data = bytearray(spatial.read_bytes())
+    data[GridContainer(spatial).read_table()[20].section.offset + 9] ^= 1
+    damaged.write_bytes(data)
+    with served(damaged, str(sample_dir / "cameras.json")) as address:
+        tab.send("Page.navigate", url=address)
+        tab.wait("Page.loadEventFired")
+        until(tab, "document.querySelector('#status.error')")
+        assert "chunk 20" in tab.run("document.getElementById('status').textContent")
+        assert tab.run("viewer.renderer.drawn") == 0
 
 
 def test_a_browser_without_webgl2_is_told_so(tab: Browser, scene: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from flexgs_edge.codec.header import PREAMBLE_BYTES, Section, format_error
 from flexgs_edge.codec.sections import ChunkEntry, SectionFile, Verification, checked, preamble
+from flexgs_edge.codec.v2.boxes import with_boxes
 from flexgs_edge.codec.v2.channels import Channels
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes
 from flexgs_edge.codec.v2.decode import decode_chunk
@@ -51,7 +52,8 @@ def write_grid(
     grid : GridScene
         From `to_grid`.
     settings : mapping
-        JSON values that tell how the file was made; nothing that differs between runs or machines.
+        JSON values that tell how the file was made; nothing that differs between runs or machines. A file of many chunks
+        also tells where they lie.
     force : bool, optional
         Replace an existing file.
     chunk_rows : int, optional
@@ -135,9 +137,8 @@ def _header(
 ) -> GridHeader:
     low = encoded.low.tolist()
     channels = Channels.of(_by_alphabet(encoded.model, encoded.bits), [band.shape[1] for band in grid.sh])
-    return GridHeader.of_grid(
-        grid, encoded.layers, low, encoded.model.depth, chunk_rows, model_bytes, settings, channels
-    )
+    told = with_boxes(settings, grid, encoded.chunks)
+    return GridHeader.of_grid(grid, encoded.layers, low, encoded.model.depth, chunk_rows, model_bytes, told, channels)
 
 
 def _by_alphabet(model: Model, bits: np.ndarray) -> dict[str, float]:

@@ -123,7 +123,7 @@ export class FgsFile {
   readonly shDegree: number;
   /** World = origin + mean, in double precision. */
   readonly origin: [number, number, number];
-  /** How the file was made, and how it is drawn: `near`, `background`, `extent`, `antialiased`. */
+  /** How the file was made, and how it is drawn: `near`, `background`, `extent`, `antialiased`; and `boxes`, where chunks lie. */
   readonly settings: Record<string, unknown>;
   /** Rows of each layer. */
   readonly layers: number[];
@@ -131,6 +131,8 @@ export class FgsFile {
   readonly header: Header;
   /** Chunk after chunk, each decoded when it is asked for. A stream can be read once. */
   chunks(options?: ChunkOptions): AsyncGenerator<Chunk, void, void>;
+  /** One chunk; only of a source of which any part can be had: not of a stream, or of a server that does not know ranges. */
+  chunk?(index: number, options?: { sh?: boolean }): Promise<Chunk>;
   /** Stop reading a stream. */
   close(): Promise<void>;
 }

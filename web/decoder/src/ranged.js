@@ -10,39 +10,63 @@ export async function openRanged(source, name) {
   const header = readHeader(name, await source.read(PREAMBLE_BYTES, preamble.headerBytes), preamble);
   const { offset, length } = sharedPart(header);
   const frame = readFrame(name, header, preamble.size, await source.read(offset, length));
-  return new FgsFile(frame, (options) => rangedChunks(source, name, frame, options));
+  return new RangedFile(source, name, frame);
 }
 
-/** The chunks: each is checked before it is decoded. */
-async function* rangedChunks(source, name, frame, { sh, layers, first }) {
-  const { header, size, format } = frame;
-  const table = await source.read(size - header.tableBytes, header.tableBytes);
-  const { lengths, sums } = readTable(name, frame, table);
-  let offset = header.chunksOffset;
-  const [from, to] = wantedBytes(frame, lengths, first, layers);
-  source.ahead?.(from, to);
-  try {
-    for (const place of format.planChunks(header)) {
-      const length = lengths[place.index];
-      if (place.layer >= layers) return;
-      if (place.index >= first) {
-        const bytes = await source.read(offset, length);
-        yield checkedChunk(name, frame, place, offset, length, sums[place.index], bytes, sh);
-      }
-      offset += length;
+/** A file of which any chunk can be had. Each chunk is checked before it is decoded. */
+class RangedFile extends FgsFile {
+  #source;
+  #name;
+  #frame;
+  #parts = null;
+
+  constructor(source, name, frame) {
+    super(frame, (options) => this.#inOrder(options));
+    this.#source = source;
+    this.#name = name;
+    this.#frame = frame;
+  }
+
+  async chunk(index, { sh = true } = {}) {
+    const parts = await this.#places();
+    if (!(index in parts)) throw new RangeError(`wanted a chunk from 0 to ${parts.length - 1}, got ${index}`);
+    return this.#decoded(parts[index], sh);
+  }
+
+  async *#inOrder({ sh, layers, first }) {
+    const parts = (await this.#places()).slice(first).filter(({ place }) => place.layer < layers);
+    const last = parts.at(-1);
+    if (last) this.#source.ahead?.(parts[0].offset, last.offset + last.length);
+    try {
+      for (const part of parts) yield await this.#decoded(part, sh);
+    } finally {
+      await this.#source.cancel?.();
     }
-  } finally {
-    await source.cancel?.();
   }
-}
 
-/** Where the chunks that are asked for begin and end. */
-function wantedBytes({ header, format }, lengths, first, layers) {
-  let from = header.chunksOffset;
-  let to = from;
-  for (const place of format.planChunks(header)) {
-    if (place.index < first) from += lengths[place.index];
-    if (place.layer < layers) to += lengths[place.index];
+  async #decoded({ place, offset, length, sum }, sh) {
+    const bytes = await this.#source.read(offset, length);
+    return checkedChunk(this.#name, this.#frame, place, offset, length, sum, bytes, sh);
   }
-  return [from, to];
+
+  /** Where each chunk lies, by the table at the end. */
+  #places() {
+    this.#parts ??= this.#readPlaces().catch((error) => {
+      this.#parts = null;
+      throw error;
+    });
+    return this.#parts;
+  }
+
+  async #readPlaces() {
+    const { header, size, format } = this.#frame;
+    const table = await this.#source.read(size - header.tableBytes, header.tableBytes);
+    const { lengths, sums } = readTable(this.#name, this.#frame, table);
+    let offset = header.chunksOffset;
+    return Array.from(format.planChunks(header), (place) => {
+      const part = { place, offset, length: lengths[place.index], sum: sums[place.index] };
+      offset += part.length;
+      return part;
+    });
+  }
 }

@@ -67,6 +67,28 @@ test('between its ends a file comes in one range, whatever the ends are', () =>
     assert.equal((await open(ends(url, 5000, 36))).count, wanted.count);
   }));
 
+test('any chunk can be had of a source of which any part can be had', () =>
+  withServer('all', async (url) => {
+    const inOrder = [];
+    for await (const chunk of (await open(bytes)).chunks()) inOrder.push(chunk);
+    for (const source of [bytes, new Blob([bytes]), url, ends(url, 5000, 36)]) {
+      const file = await open(source);
+      for (const index of [2, 0]) {
+        const { start, layer, rows, codes, verified } = await file.chunk(index);
+        const { start: s, layer: l, rows: r, codes: c } = inOrder[index];
+        assert.deepEqual([start, layer, rows, codes, verified], [s, l, r, c, true]);
+      }
+      assert.equal((await file.chunk(1, { sh: false })).codes.sh.length, 0);
+      await assert.rejects(file.chunk(inOrder.length), /wanted a chunk from 0 to \d, got \d/);
+    }
+    assert.equal((await open(streamOf(bytes, 1000))).chunk, undefined);
+    const damaged = bytes.slice();
+    damaged[damaged.length - 200] ^= 1;
+    const file = await open(damaged);
+    await assert.rejects(file.chunk(inOrder.length - 1), FgsError);
+    assert.equal((await file.chunk(0)).index, 0);
+  }));
+
 test('a range that ends early, or a server that changed its mind', async () => {
   await withServer('all', (url) => assert.rejects(readAll(ends(url, 5000, 36)), /wanted \d+ bytes from 5000 on, got 2000/), 7000);
   await withServer('no', (url) => assert.rejects(readAll(ends(url, 5000, 36)), /does not answer to ranges any more/));

@@ -1,6 +1,6 @@
 // The page: its buttons and texts. All text of files reaches it as text, never as HTML.
 import { bytesInside } from './inside.js';
-import { Viewer } from './viewer.js';
+import { SceneViewer } from './scene-viewer.js';
 
 const find = (id) => document.getElementById(id);
 const config = JSON.parse(find('scene')?.textContent || '{}');
@@ -18,7 +18,7 @@ function start() {
   let viewer;
   try {
     const half = new URLSearchParams(location.search).get('bits') !== '8';
-    viewer = new Viewer(canvas, { half, first });
+    viewer = new SceneViewer(canvas, { half, first });
   } catch (error) {
     say(error.message, true);
     return;

@@ -4,7 +4,7 @@ const sorter = new Sorter();
 
 /** In: { add }, { share }, { view, near, buffer }, { clear }. Out, for each view: { order, count, ms }. */
 self.onmessage = ({ data }) => {
-  if (data.add) sorter.add(data.add.means, data.add.importance);
+  if (data.add) sorter.add(data.add.means, data.add.importance, data.add.start);
   if (data.share !== undefined) sorter.setShare(data.share);
   if (!data.view) return;
   const start = performance.now();

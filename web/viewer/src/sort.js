@@ -7,21 +7,17 @@ const SIZE = 1 << DIGIT_BITS;
 /** Sorts growing lists of rows. */
 export class Sorter {
   constructor() {
-    this.means = [];
+    this.parts = [];
     this.rows = 0;
-    this.importance = new Float32Array(0);
     this.threshold = -Infinity;
     this.share = 1;
   }
 
-  /** Add a chunk's planes of positions, and how much its rows show. */
-  add(means, importance) {
-    this.means.push(means);
-    const all = new Float32Array(this.rows + importance.length);
-    all.set(this.importance);
-    all.set(importance, this.rows);
-    this.importance = all;
-    this.rows = all.length;
+  /** Add a chunk's planes of positions, and how much its rows show. It takes the place of one that begins at the same row. */
+  add(means, importance, start = this.rows) {
+    const others = this.parts.filter((part) => part.start !== start);
+    this.parts = [...others, { means, importance, start }].sort((a, b) => a.start - b.start);
+    this.rows = this.parts.reduce((sum, part) => sum + part.importance.length, 0);
     this.keys = new Uint32Array(this.rows);
     this.spare = new Uint32Array(this.rows);
     this.places = new Uint32Array(this.rows);
@@ -33,7 +29,17 @@ export class Sorter {
   setShare(share) {
     this.share = share;
     const drop = Math.floor((1 - share) * this.rows);
-    this.threshold = drop > 0 ? Float32Array.from(this.importance).sort()[drop] : -Infinity;
+    this.threshold = drop > 0 ? this.#allImportance().sort()[drop] : -Infinity;
+  }
+
+  #allImportance() {
+    const all = new Float32Array(this.rows);
+    let at = 0;
+    for (const { importance } of this.parts) {
+      all.set(importance, at);
+      at += importance.length;
+    }
+    return all;
   }
 
   /**
@@ -44,11 +50,7 @@ export class Sorter {
    */
   sort(view, near, out) {
     let count = 0;
-    let first = 0;
-    for (const means of this.means) {
-      count = depths(means, first, view, near, this.importance, this.threshold, this.keys, this.places, count);
-      first += means.length / 3;
-    }
+    for (const part of this.parts) count = depths(part, view, near, this.threshold, this.keys, this.places, count);
     const { keys, places, spareKeys, spare } = this;
     pass(keys, places, count, 0, spareKeys, spare);
     pass(spareKeys, spare, count, DIGIT_BITS, keys, places);
@@ -61,14 +63,14 @@ export class Sorter {
 const DEPTH = new Float32Array(1);
 const DEPTH_WORD = new Uint32Array(DEPTH.buffer);
 
-function depths(means, first, [x, y, z, offset], near, importance, threshold, keys, places, count) {
+function depths({ means, importance, start }, [x, y, z, offset], near, threshold, keys, places, count) {
   const rows = means.length / 3;
   for (let i = 0; i < rows; i++) {
     DEPTH[0] = x * means[i] + y * means[rows + i] + z * means[2 * rows + i] + offset;
-    if (DEPTH[0] > near && importance[first + i] >= threshold) {
+    if (DEPTH[0] > near && importance[i] >= threshold) {
       // Bits of positive floats sort as the floats do.
       keys[count] = DEPTH_WORD[0];
-      places[count++] = first + i;
+      places[count++] = start + i;
     }
   }
   return count;

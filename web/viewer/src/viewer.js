@@ -4,8 +4,9 @@ import { Renderer } from './renderer.js';
 import { subtract, dot, times, add } from './vectors.js';
 import { startWorker } from './workers.js';
 
-const GRID = 256 * 2 ** 20;
-const GROWTH_POWER = 1 / 8;
+/** Bytes of graphics memory that are taken without asking. */
+export const GRID = 256 * 2 ** 20;
+export const GROWTH_POWER = 1 / 8;
 
 /**
  * A scene on a canvas. It draws when something changed, and while a key is held.
@@ -68,41 +69,50 @@ export class Viewer extends EventTarget {
     this.sorter = sort;
     this.sorter.onmessage = ({ data }) => this.#sorted(data);
     this.loader = load;
-    try {
-      await new Promise((resolve, reject) => {
-        this.loader.onerror = (event) => reject(new Error(event.message || 'The worker that decodes did not start.'));
-        this.loader.onmessage = ({ data }) => this.#loaded(data, agree).then((done) => done && resolve(), reject);
-        if (!begun) this.loader.postMessage({ source, name });
-      });
-    } catch (error) {
-      this.loader.terminate();
-      this.#fail(error.message);
-      throw error;
-    }
+    await new Promise((resolve, reject) => {
+      const failed = (error) => {
+        load.terminate();
+        this.#fail(error.message);
+        reject(error);
+      };
+      load.onerror = (event) => failed(new Error(event.message || 'The worker that decodes did not start.'));
+      load.onmessage = ({ data }) => this.loaded(data, agree).then((done) => done && resolve(), failed);
+      if (!begun) load.postMessage({ source, name });
+    });
   }
 
-  async #loaded(data, agree) {
+  /** Act on what the worker sends. Returns whether all is there. */
+  async loaded(data, agree) {
     if (data.error) throw new Error(data.error);
     if (data.header) return this.#begin(data.header, agree);
-    if (data.chunk) await this.ready;
+    await this.ready;
     if (data.chunk) this.#add(data.chunk);
     if (data.done) {
-      await this.ready;
       this.loader.terminate();
-      this.stats.wholeMs = performance.now() - this.started;
-      this.#tell('loaded');
-      this.refresh();
+      this.finish();
     }
     return Boolean(data.done);
   }
 
+  finish() {
+    this.stats.wholeMs = performance.now() - this.started;
+    this.#tell('loaded');
+    this.refresh();
+  }
+
+  /** How many rows need room, and how many of them have SH. */
+  roomOf(header) {
+    return header;
+  }
+
   async #begin(header, agree) {
     this.header = header;
-    const bytes = Renderer.bytesOf(header);
+    const room = this.roomOf(header);
+    const bytes = Renderer.bytesOf(room);
     // Chunks that come while the user decides wait for the answer.
     this.ready = bytes > GRID ? agree(bytes) : Promise.resolve(true);
     if (!(await this.ready)) throw new Error('The scene was not loaded.');
-    this.renderer.begin(header);
+    this.renderer.begin(room);
     const { near, background, antialiased } = header.settings;
     if (typeof near === 'number') this.look.near = near;
     if (Array.isArray(background) && background.length === 3) this.look.background = background.map(Number);
@@ -119,20 +129,21 @@ export class Viewer extends EventTarget {
   #add(chunk) {
     this.renderer.add(chunk);
     this.rows += chunk.rows;
-    if (!this.box) {
-      this.box = boxOf(chunk.means, chunk.rows);
-      if (!this.poses.length) this.poses = [outsidePose(this.box, this.header.origin)];
-      this.setPose(this.pose);
-      this.#tell('poses');
-    }
-    this.sorter.postMessage({ add: { means: chunk.means, importance: chunk.importance } }, [
-      chunk.means.buffer,
-      chunk.importance.buffer,
-    ]);
+    if (!this.box) this.placeBox(boxOf(chunk.means, chunk.rows));
+    const { means, importance, start } = chunk;
+    this.sorter.postMessage({ add: { means, importance, start } }, [means.buffer, importance.buffer]);
     this.sortedFor = null;
     // Not with the next frame: a frame of what is there may take longer than the sort.
     this.#sortIfNeeded();
     this.refresh();
+  }
+
+  /** The scene lies in this box: so far away the camera turns around it. */
+  placeBox(box) {
+    this.box = box;
+    if (!this.poses.length) this.poses = [outsidePose(box, this.header.origin)];
+    this.setPose(this.pose);
+    this.#tell('poses');
   }
 
   /** Take the place of a pose. */
@@ -184,10 +195,7 @@ export class Viewer extends EventTarget {
     if (!this.header) return;
     const start = performance.now();
     this.#sortIfNeeded();
-    const ratio = (globalThis.devicePixelRatio || 1) * this.scale;
-    const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio));
-    const height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
-    this.renderer.draw(this.camera.view(width, height), this.look, this.growth);
+    this.renderer.draw(this.view, this.look, this.growth);
     this.stats.frameMs = performance.now() - start;
     this.stats.drawn = this.renderer.drawn;
     if (this.renderer.drawn && !this.stats.firstMs) {
@@ -195,6 +203,13 @@ export class Viewer extends EventTarget {
       this.#tell('first');
     }
     this.#tell('frame');
+  }
+
+  /** The camera's view on the canvas as it is. */
+  get view() {
+    const ratio = (globalThis.devicePixelRatio || 1) * this.scale;
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((size) => Math.max(1, Math.round(size * ratio)));
+    return this.camera.view(width, height);
   }
 
   #sortIfNeeded() {

@@ -45,6 +45,19 @@ test('a share of the splats is that of the most important, in several chunks', (
   assert.ok([...out.subarray(0, 25)].every((row) => row >= 75));
 });
 
+test('a chunk takes the place of one that began at the same row', () => {
+  const sorter = new Sorter();
+  const at = (...z) => Float32Array.from([...z.map(() => 0), ...z.map(() => 0), ...z]);
+  sorter.add(at(4, 2), Float32Array.of(1, 1), 10);
+  sorter.add(at(3, 1), Float32Array.of(1, 1), 0);
+  const out = new Uint32Array(4);
+  assert.equal(sorter.sort([0, 0, 1, 0], 0.2, out), 4);
+  assert.deepEqual([...out], [10, 0, 11, 1]);
+  sorter.add(at(9), Float32Array.of(1), 10);
+  assert.equal(sorter.sort([0, 0, 1, 0], 0.2, out), 3);
+  assert.deepEqual([...out.subarray(0, 3)], [10, 0, 1]);
+});
+
 test('chunks are packed: rows with SH lie apart', () => {
   const rows = 3;
   const each = 3;

@@ -1,0 +1,3 @@
+import { SpatialViewer } from './spatial-viewer.js';
+
+export const SceneViewer = SpatialViewer;
