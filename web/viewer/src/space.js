@@ -131,7 +131,8 @@ function planesOf({ rotation, fx, fy, width, height }) {
 
 /** How far the box reaches to the inner side of a plane through the eye. */
 function farthest({ low, high }, plane, eye) {
-  return dot(plane, subtract(plane.map((value, axis) => (value > 0 ? high : low)[axis]), eye));
+  const corner = plane.map((value, axis) => (value > 0 ? high : low)[axis]);
+  return dot(plane, subtract(corner, eye));
 }
 
 function distanceTo({ low, high }, eye) {

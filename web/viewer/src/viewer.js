@@ -26,7 +26,11 @@ export class Viewer extends EventTarget {
     if (first) this.fresh.load.postMessage(first);
     this.renderer = new Renderer(canvas, { half });
     this.camera = new Camera([0, -1, 0]);
-    this.controls = new Controls(canvas, () => this.camera, () => this.refresh());
+    this.controls = new Controls(
+      canvas,
+      () => this.camera,
+      () => this.refresh(),
+    );
     this.look = { near: 0.2, degree: 4, antialiased: false, background: [0, 0, 0] };
     this.scale = 1;
     this.poses = [];
@@ -208,7 +212,9 @@ export class Viewer extends EventTarget {
   /** The camera's view on the canvas as it is. */
   get view() {
     const ratio = (globalThis.devicePixelRatio || 1) * this.scale;
-    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((size) => Math.max(1, Math.round(size * ratio)));
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((size) =>
+      Math.max(1, Math.round(size * ratio)),
+    );
     return this.camera.view(width, height);
   }
 

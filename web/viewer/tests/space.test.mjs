@@ -13,7 +13,16 @@ function header(changes = {}) {
     boxes.push([x - 10, -10, -10, x + 10, 10, 10, k % 3]);
   }
   const layers = [8 * ROWS, 8 * ROWS - 3];
-  return { count: 157, shDegree: 1, layers, chunkRows: ROWS, steps: { position: 0.1 }, settings: { boxes }, anyChunk: true, ...changes };
+  return {
+    count: 157,
+    shDegree: 1,
+    layers,
+    chunkRows: ROWS,
+    steps: { position: 0.1 },
+    settings: { boxes },
+    anyChunk: true,
+    ...changes,
+  };
 }
 
 /** A view from x = `at` along z, so narrow that it shows two or three chunks. */
