@@ -29,7 +29,7 @@ export class Space {
   /** Whether a header tells where each chunk lies. */
   static tells({ anyChunk, settings: { boxes }, layers, chunkRows }) {
     const count = layers.reduce((sum, rows) => sum + Math.ceil(rows / chunkRows), 0);
-    if (!anyChunk || !Array.isArray(boxes) || count < 1 || boxes.length < count) return false;
+    if (!anyChunk || !Array.isArray(boxes) || !(count > 0 && boxes.length >= count)) return false;
     return boxes.every((box) => Array.isArray(box) && box.length === 7 && box.every(Number.isSafeInteger) && box[6] >= 0);
   }
 

@@ -114,4 +114,5 @@ test('without boxes that can be used, chunks come as they are', () => {
   }
   assert.equal(Space.tells(header({ anyChunk: false })), false);
   assert.equal(Space.tells(header({ layers: [0], count: 0 })), false);
+  assert.equal(Space.tells(header({ chunkRows: undefined, steps: undefined })), false, 'version 1');
 });
