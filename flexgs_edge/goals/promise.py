@@ -202,6 +202,12 @@ def excesses(target: Target, size: int, measurement: Measurement) -> list[float]
     return [own, *(excess for excess in found if excess is not None)]
 
 
+def breaks_a_view(target: Target, measurement: Measurement) -> bool:
+    """Whether the bound on the worst view is missed."""
+    parts = target.parts if isinstance(target, Promised) else ()
+    return any((part.excess(measurement) or 0.0) > 0.0 for part in parts if isinstance(part, WorstView))
+
+
 def bounds_ssim(target: Target) -> bool:
     """Whether SSIM is among the parts of the promise."""
     return bool(_ssim_parts(target))

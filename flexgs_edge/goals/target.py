@@ -58,6 +58,8 @@ class Measurement:
         SSIM lost, against photos or modelled; `None` if not measured.
     made_gap : float or None
         How much less fidelity made poses have, dB; `None` if not measured.
+    losses : tuple of float or None
+        Drop of each view that decides, dB, in their order; `None` for views with hardly any coverage.
     """
 
     drop: float | None
@@ -68,6 +70,7 @@ class Measurement:
     usual: float | None = None
     ssim_drop: float | None = None
     made_gap: float | None = None
+    losses: tuple[float | None, ...] = ()
 
     def figure(self, figure: Figure) -> float | None:
         """The figure of this name that decides, dB; `None` if renders are identical or photos are missing."""

@@ -192,10 +192,11 @@ class Quality:
     @property
     def usual_drop(self) -> float | None:
         """Mean over the views of the drop that decides, where a view that gains counts as 0, dB; `None` without views."""
-        losses = [max(loss, 0.0) for loss in self._losses() if loss is not None]
+        losses = [max(loss, 0.0) for loss in self.losses if loss is not None]
         return math.fsum(losses) / len(losses) if losses else None
 
-    def _losses(self) -> list[float | None]:
+    @property
+    def losses(self) -> list[float | None]:
         """The drop of each view that decides: against the photo, else modelled; `None` for views with hardly any coverage."""
         drops = [view.drop for view in self.views]
         if None not in drops:

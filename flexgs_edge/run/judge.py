@@ -334,6 +334,7 @@ def measurement_of(quality: Quality) -> Measurement:
         usual=quality.usual_drop,
         ssim_drop=quality.ssim_drop,
         made_gap=quality.made_gap,
+        losses=tuple(quality.losses),
     )
 
 

@@ -17,6 +17,7 @@ from flexgs_edge.goals.promise import (
     MeanSsim,
     Promised,
     WorstView,
+    breaks_a_view,
     in_the_way,
     kept_promise,
     promised,
@@ -64,6 +65,15 @@ def test_the_worst_view_misses_by_what_it_loses_beyond_the_mean() -> None:
     ):
         found = replace(GOOD, usual=mean, worst=Measurement(worst, 30.0, worst))
         assert part.excess(found) == pytest.approx(excess / 2), (mean, worst)
+
+
+def test_a_view_breaks_where_its_bound_is_missed() -> None:
+    target = Promised(MaxDrop(1.0), PARTS)
+    for worst, breaks in ((1.0, False), (1.69, False), (1.71, True)):
+        found = Measurement(1.0, 40.0, 1.0, worst=Measurement(worst, 38.0, worst), usual=1.0)
+        assert breaks_a_view(target, found) is breaks
+        assert not breaks_a_view(MaxDrop(1.0), found)
+        assert not breaks_a_view(Promised(MaxDrop(1.0), PARTS[1:]), found)
 
 
 def test_what_was_not_measured_does_not_decide() -> None:

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.goals.line import AIM, next_point
-from flexgs_edge.goals.promise import bounds_ssim, excesses, means
+from flexgs_edge.goals.promise import bounds_ssim, breaks_a_view, excesses, means
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
@@ -35,6 +35,7 @@ from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART, Measure, Multi
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import LAST, Schedule, distil
 from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
+from flexgs_edge.methods.best.view_weights import looking_more
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.source import MemorySource, Planes
 
@@ -45,8 +46,7 @@ FURTHER = 0.92
 DRIFT = -0.12
 """Change of the excess by a second refit, which goes on where the first one ended: docs/results/tuning.md#drift"""
 PRICED = -0.035
-"""Expected log of the size after a descent over that before it: prices on bits make files smaller. Scenes differ, so that the
-first candidate may be too small: docs/results/tuning.md#landing"""
+"""Expected log of the size after a descent over that before it; as bits have a price: docs/results/tuning.md#landing"""
 ABOVE = 0.02
 """How far above a size we aim, since results that are too large can be landed: docs/results/tuning.md#landing"""
 CLOSE_SIZE = 0.003
@@ -58,8 +58,7 @@ DECAY = 0.8
 """Share of the last drift that the next refit adds again. It is above zero because refits overfit the scored poses:
 docs/results/tuning.md#decay"""
 FARTHER = 0.05
-"""How much farther below the target we aim for each candidate in a row that missed it, from the second on; behind descents from
-the first on, since what is left is landed: docs/results/tuning.md#follow"""
+"""How much farther below the target we aim for each candidate in a row that missed it: docs/results/tuning.md#follow"""
 PROBES = 4
 """Most probes between two candidates."""
 FARTHEST = 2.0
@@ -107,8 +106,8 @@ class GridSearch(MultiplierSearch[GridScene]):
         self._slopes: Slopes | None = None
         self._refitted: Refitted | None = None
         # Without a refit of SH, a candidate takes nothing over from the one before. Descents begin anew as well.
-        self._drift = DRIFT if effort.refit_rounds and not steps else 0.0
-        self._expected = 0.0
+        self._drift, self._expected = DRIFT if effort.refit_rounds and not steps else 0.0, 0.0
+        self._original = rounds.original  # candidates change how often descents look at its poses
         self._interleaved, self._left = effort.interleaved if steps else 0, 0.0
 
     def run(self, target: Target, best_effort: bool = False) -> RateResult[GridScene]:
@@ -217,7 +216,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         return probe_slopes(original.bench.renderer, planes, original.origin, original.cameras, self.effort.probed)
 
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
-        original, layered = self.rounds.original, self.first and step_sizes is not None
+        original, layered = self._original, self.first and step_sizes is not None
         first = first_layer(kept.planes, kept.degrees, self.first, self.bits, original) if layered else None
         return distil(kept.planes, kept.degrees, original, schedule, step_sizes, first=first)
 
@@ -336,7 +335,10 @@ class GridSearch(MultiplierSearch[GridScene]):
         size = self.size_of(grid)
         if target.limit_bytes is not None:
             grid, size = self._landed(grid, size, target.limit_bytes)
-        return self._measured(grid, size, multiplier, target, started, kept.left_out), grid
+        candidate = self._measured(grid, size, multiplier, target, started, kept.left_out)
+        if breaks_a_view(target, candidate.measurement):
+            self._original = looking_more(self._original, candidate.measurement.losses)
+        return candidate, grid
 
     def _measured(
         self, grid: GridScene, size: int, multiplier: float, target: Target, started: float, left_out: int
@@ -409,14 +411,13 @@ class GridSearch(MultiplierSearch[GridScene]):
             nonlocal best
             started = time.perf_counter()
             mended = self._with_constants(smaller) if self.refit else smaller
-            size = self.size_of(mended)
-            step = self._measured(mended, size, chosen.multiplier, target, started, chosen.left_out)
+            step = self._measured(mended, self.size_of(mended), chosen.multiplier, target, started, chosen.left_out)
             steps.append(step)
             if self.on_step:
                 self.on_step(step)
             if better(step, best[0], target):
                 best = step, mended
-            return excesses(goal, size, step.measurement)
+            return excesses(goal, step.size, step.measurement)
 
         found = excesses(goal, chosen.size, chosen.measurement)
         if max(found) >= -NEAR_QUALITY:

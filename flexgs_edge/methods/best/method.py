@@ -263,9 +263,10 @@ def open_rounds(
                 # Neighbours in space become neighbours in memory, so views are drawn faster.
                 rows = storage.take(rows, near_rows(storage.take(planes["means"], rows), storage))
                 between = poses_between(scored) if steps else ()
-                turns = known.slopes([*scored, *between]) if known and steps else None
+                poses = [*scored, *between]
+                turns, nearest = (known.slopes(poses), known.nearest(poses)) if known and steps else (None, None)
                 rounds = make(
-                    Original(bench, source.origin, scored, references, between, run.progress, steps, turns),
+                    Original(bench, source.origin, scored, references, between, run.progress, steps, turns, nearest),
                     planes,
                     rows,
                     refit=options.refit,
