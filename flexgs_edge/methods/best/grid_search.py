@@ -38,6 +38,7 @@ from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
 from flexgs_edge.methods.best.view_weights import looking_more
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.source import MemorySource, Planes
+from flexgs_edge.views.original import Original
 
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
@@ -107,7 +108,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         self._refitted: Refitted | None = None
         # Without a refit of SH, a candidate takes nothing over from the one before. Descents begin anew as well.
         self._drift, self._expected = DRIFT if effort.refit_rounds and not steps else 0.0, 0.0
-        self._original = rounds.original  # candidates change how often descents look at its poses
+        self._looking: Original | None = None  # candidates change how often descents look at its poses
         self._interleaved, self._left = effort.interleaved if steps else 0, 0.0
 
     def run(self, target: Target, best_effort: bool = False) -> RateResult[GridScene]:
@@ -133,8 +134,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         LOG.info("no descent reaches the target: colours are refitted instead")
         self._interleaved, self._begin, self._left = 0, 0, 0.0
         self.steps, self.pruned_part, self.keeps_best = 0, PRUNED_PART, False
-        self._refitted, self._slopes = None, None
-        self._drift = DRIFT if self.effort.refit_rounds else 0.0
+        self._refitted, self._slopes, self._drift = None, None, DRIFT if self.effort.refit_rounds else 0.0
         return self._also(found, super().run(target, best_effort), target)
 
     @staticmethod
@@ -216,7 +216,7 @@ class GridSearch(MultiplierSearch[GridScene]):
         return probe_slopes(original.bench.renderer, planes, original.origin, original.cameras, self.effort.probed)
 
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
-        original, layered = self._original, self.first and step_sizes is not None
+        original, layered = self._looking or self.rounds.original, self.first and step_sizes is not None
         first = first_layer(kept.planes, kept.degrees, self.first, self.bits, original) if layered else None
         return distil(kept.planes, kept.degrees, original, schedule, step_sizes, first=first)
 
@@ -337,7 +337,7 @@ class GridSearch(MultiplierSearch[GridScene]):
             grid, size = self._landed(grid, size, target.limit_bytes)
         candidate = self._measured(grid, size, multiplier, target, started, kept.left_out)
         if breaks_a_view(target, candidate.measurement):
-            self._original = looking_more(self._original, candidate.measurement.losses)
+            self._looking = looking_more(self._looking or self.rounds.original, candidate.measurement.losses)
         return candidate, grid
 
     def _measured(
