@@ -47,7 +47,7 @@ FURTHER = 0.92
 DRIFT = -0.12
 """Change of the excess by a second refit, which goes on where the first one ended: docs/results/tuning.md#drift"""
 PRICED = -0.035
-"""Expected log of the size after a descent over that before it; as bits have a price: docs/results/tuning.md#landing"""
+"""Expected log of the size after a descent over that before it, below 0 since bits cost: docs/results/tuning.md#landing"""
 ABOVE = 0.02
 """How far above a size we aim, since results that are too large can be landed: docs/results/tuning.md#landing"""
 CLOSE_SIZE = 0.003

@@ -1,7 +1,7 @@
 import { shPerLine, TEXELS, TEXTURE_WIDTH } from './pack.js';
 import { Renderer } from './renderer.js';
 import { Space } from './space.js';
-import { GRID, GROWTH_POWER, Viewer } from './viewer.js';
+import { GROWTH_POWER, UNASKED_BYTES, Viewer } from './viewer.js';
 
 /** Chunks that are asked for at once: one comes while another is decoded. */
 const AT_ONCE = 2;
@@ -19,7 +19,7 @@ export class SpatialViewer extends Viewer {
     const asked = Number(new URLSearchParams(location.search).get('splats'));
     const each = Renderer.bytesOf({ count: 1, shRows: 1, shDegree: degree });
     const perLine = Math.min(TEXTURE_WIDTH / TEXELS, degree ? shPerLine(degree) : Infinity);
-    return Math.min(asked > 0 ? asked : GRID / each, gl.getParameter(gl.MAX_TEXTURE_SIZE) * perLine);
+    return Math.min(asked > 0 ? asked : UNASKED_BYTES / each, gl.getParameter(gl.MAX_TEXTURE_SIZE) * perLine);
   }
 
   roomOf(header) {

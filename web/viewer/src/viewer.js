@@ -5,7 +5,7 @@ import { subtract, dot, times, add } from './vectors.js';
 import { startWorker } from './workers.js';
 
 /** Bytes of graphics memory that are taken without asking. */
-export const GRID = 256 * 2 ** 20;
+export const UNASKED_BYTES = 256 * 2 ** 20;
 export const GROWTH_POWER = 1 / 8;
 
 /**
@@ -114,7 +114,7 @@ export class Viewer extends EventTarget {
     const room = this.roomOf(header);
     const bytes = Renderer.bytesOf(room);
     // Chunks that come while the user decides wait for the answer.
-    this.ready = bytes > GRID ? agree(bytes) : Promise.resolve(true);
+    this.ready = bytes > UNASKED_BYTES ? agree(bytes) : Promise.resolve(true);
     if (!(await this.ready)) throw new Error('The scene was not loaded.');
     this.renderer.begin(room);
     const { near, background, antialiased } = header.settings;
