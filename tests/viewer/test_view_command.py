@@ -111,6 +111,9 @@ def test_arguments_that_are_wrong(scene: Path) -> None:
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_it_serves_until_it_is_stopped(scene: Path, stop: signal.Signals) -> None:
     command = [sys.executable, "-m", "flexgs_edge", "view", str(scene), "--no-browser", "-q"]
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        # As in a job that a shell has put in the background: the server would take that over, and never stop.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     folder = Path(__file__).resolve().parents[2]
     with subprocess.Popen(
         command,
