@@ -207,8 +207,9 @@ class CompressOptions(ViewOptions):
         Version of a `.spz` that is written. Older programs read only 3. Default: 3.
     layers : int, optional
         Write the file in 1 to 4 layers, between which `trim` can cut it (`best`). Descents make the first of them look better,
-        for some more bytes. Default: 2 plain ones for a file of a megabyte or more and at most 262 144 Gaussians, if the first
-        layer costs at most 2 % more bytes and no target forbids them; else 1.
+        for some more bytes. Default: 2 plain ones for a file of a megabyte or more, if the first layer costs at most 2 %
+        more bytes and no target forbids them; else 1. Of more than 262 144 Gaussians, at most three fifths of the scene
+        may be left.
     scratch : str, optional
         Folder for scratch files of scenes that do not fit into memory (`best`). Default: the folder of the output.
     resume : bool

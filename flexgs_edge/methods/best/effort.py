@@ -18,6 +18,8 @@ LEAST_STEPS = 240
 """Least steps of a descent. Four rounds of a few poses mend less than they break: docs/results/tuning.md#least_steps"""
 FINE_PASSES = 0.75
 """Share of `Effort.passes` where poses have every pixel: docs/results/tuning.md#fine_passes"""
+MANY_POSES = 125
+"""Beyond so many poses, steps of a descent grow with the root of their number: docs/results/tuning.md#many_poses"""
 LEAST_VIEWS = 6
 """Least poses for a step of the refit. Steps from fewer poses overfit the scored poses, and all others get worse:
 docs/results/tuning.md#least_views"""
@@ -69,7 +71,8 @@ class Effort:
     probed : int
         Most poses that trial grids are measured on: docs/results/tuning.md#probed
     passes : float
-        How often the descent to a candidate looks at every scored pose. 0 (default): colours are refitted instead.
+        How often the descent to a candidate looks at every scored pose, if there are no more than `MANY_POSES`. 0 (default):
+        colours are refitted instead.
     interleaved : int
         Most descents between rounds of pruning, before the first candidate, so that pruning knows what mends itself:
         docs/results/tuning.md#interleaved
@@ -234,4 +237,5 @@ def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool
     plan = EFFORTS[options.effort]
     if not (plan.passes and options.refit and count >= plan.descends):
         return 0
-    return max(round(plan.passes * (FINE_PASSES if fine else 1.0) * poses), LEAST_STEPS)
+    counted = min(poses, math.sqrt(MANY_POSES * poses))
+    return max(round(plan.passes * (FINE_PASSES if fine else 1.0) * counted), LEAST_STEPS)

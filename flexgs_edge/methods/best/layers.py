@@ -18,6 +18,7 @@ from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
 from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.rounds import take_rows
+from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.growth import growth
@@ -33,9 +34,20 @@ LEAST_LAYERED, FIRST_LAYER, MOST_COST, LAYER_POSES = 1_000_000, 0.125, 1.02, 32
 first layer has this share of the bits. Most bytes of a layered file over those of one without, and most poses that decide:
 docs/results/web.md#layers"""
 MOST_LAYERED = 1 << 18
-"""Most rows of such a file. Sorting takes arrays of all rows, which no memory limit has counted."""
-ROUND = 0.8
-"""Share of the bits that stays before costs are measured again. Removed Gaussians interact, so costs go out of date."""
+"""So many rows may always be sorted. Of more, see `can_sort`."""
+SORTED_ROW_BYTES = 41
+"""Bytes of memory that sorting takes for each row, even if the scene lies in scratch files: see `_worthiest`."""
+ROUND, LARGE_ROUND = 0.8, 0.5
+"""Share of the bits that stays before costs are measured again; of more than `MOST_LAYERED` rows, the second. Removed Gaussians
+interact, so costs go out of date: docs/results/web.md#layers"""
+
+
+def can_sort(rows: int, original: int) -> bool:
+    """Whether rows can be sorted in the memory that the search of a scene of `original` Gaussians had for its lists of rows.
+
+    The answer must not depend on the memory limit, as the same command makes the same bytes under each.
+    """
+    return rows <= MOST_LAYERED or rows * SORTED_ROW_BYTES <= original * SPILLED_ROW_BYTES
 
 
 def layered_where_cheap(
@@ -77,8 +89,8 @@ def assign_layers(
 ) -> GridScene:
     """Sort the Gaussians into layers by cost of removal for each bit.
 
-    Costs are measured again after each fifth of the bits, on the decoded scene, because a cut file has no refit. What is left is
-    measured as large as viewers draw it (`growth`).
+    Costs are measured again after each fifth of the bits (of many rows, each half) on the decoded scene, because a cut file has
+    no refit. What is left is measured as large as viewers draw it (`growth`).
     Gaussians that no pose sees come last.
 
     Parameters
@@ -150,19 +162,26 @@ def _worthiest(
     origin: np.ndarray,
     progress: Progress = SILENT,
 ) -> np.ndarray:
-    """What stays of the rows `left` when all but `part` of their bits are gone, a fifth at a time. It is never empty."""
+    """What stays of the rows `left` when all but `part` of their bits are gone, a part at a time. It is never empty."""
     renderer, storage = bench.renderer, bench.renderer.storage
-    spent = np.array([bits.of_degree(degree) for degree in range(int(degrees.max(initial=0)) + 1)])[degrees]
-    end = part * spent[left].sum()
-    while len(left) > 1 and spent[left].sum() > end:
+    cost = np.array([bits.of_degree(degree) for degree in range(int(degrees.max(initial=0)) + 1)])
+    spent = cost[degrees[left]]
+    end = part * spent.sum()
+    while len(left) > 1 and spent.sum() > end:
         kept = take_rows(planes, left, storage)
         for rows, (scales,) in read_ahead(len(left), kept["log_scales"]):
             put_rows(kept["log_scales"], rows, scales + growth(len(left), len(degrees)))
         with renderer.load(MemorySource(kept, origin=origin), sum_bytes(2) + cost_bytes(0)) as scene:
             costs = measure_costs(bench, scene, cameras, sh_costs=False, progress=progress)
-        worth = np.where(costs.weight2 > 0, costs.removal / spent[left], -1.0)
+        del kept
+        worth = costs.removal / spent
+        worth[costs.weight2 <= 0] = -1.0
         order = np.argsort(worth, kind="stable")
-        gone = np.cumsum(spent[left][order])
-        goal = gone[-1] - max(end, ROUND * gone[-1])
+        del costs, worth
+        spent = spent[order]
+        gone = np.cumsum(spent, out=spent)
+        goal = gone[-1] - max(end, (LARGE_ROUND if len(left) > MOST_LAYERED else ROUND) * gone[-1])
         left = np.delete(left, order[: min(int(np.searchsorted(gone, goal)) + 1, len(left) - 1)])
+        del order, gone
+        spent = cost[degrees[left]]
     return left

@@ -32,7 +32,7 @@ from flexgs_edge.methods.best.effort import distil_steps, effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.keep import kept_as_it_is, layers_cost
-from flexgs_edge.methods.best.layers import HALF, LEAST_LAYERED, MOST_LAYERED, assign_layers, layered_where_cheap
+from flexgs_edge.methods.best.layers import HALF, LEAST_LAYERED, assign_layers, can_sort, layered_where_cheap
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
 from flexgs_edge.methods.best.poses import ScoredPoses, is_fine, scored_poses
 from flexgs_edge.methods.best.rounds import PruneRounds
@@ -143,7 +143,7 @@ def _layered(
         with run.clock.stage("layers"):
             parts = (HALF,) * (run.options.layers - 1)
             return assign_layers(grid, parts, coder.bits(grid), bench, cameras, run.progress)
-    if grid.count > MOST_LAYERED or coder.size(grid) < LEAST_LAYERED:
+    if not can_sort(grid.count, run.source.count) or coder.size(grid) < LEAST_LAYERED:
         return grid
     with run.clock.stage("layers"):
         return layered_where_cheap(grid, coder, bench, cameras, run.target.limit_bytes, run.progress)

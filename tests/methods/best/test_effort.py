@@ -12,6 +12,7 @@ from flexgs_edge.methods.best.effort import (
     FINE_PASSES,
     LARGEST_STEP,
     LEAST_STEPS,
+    MANY_POSES,
     distil_steps,
     sampled_poses,
     sampling_steps,
@@ -35,6 +36,7 @@ def test_who_descends() -> None:
     assert distil_steps(CompressOptions(), 100, 1000 * least) == round(100 * passes)
     assert distil_steps(CompressOptions(), 100, least, fine=True) == round(100 * passes * FINE_PASSES)
     assert distil_steps(CompressOptions(), 2, least) == LEAST_STEPS
+    assert distil_steps(CompressOptions(), 4 * MANY_POSES, least) == round(2 * MANY_POSES * passes)
     assert distil_steps(CompressOptions(), 100, least - 1) == 0 < distil_steps(CompressOptions(), 100, least)
     assert distil_steps(CompressOptions(effort="max"), 100, least - 1) > 0
     assert distil_steps(CompressOptions(distil=7), 100, least - 1) == 7

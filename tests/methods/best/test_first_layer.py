@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import tracemalloc
+from contextlib import nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -9,9 +12,11 @@ import numpy as np
 import pytest
 
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.methods.best.allocation import BitModel
+from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.grid_coder import GridCoder
-from flexgs_edge.methods.best.layers import first_layer
+from flexgs_edge.methods.best.layers import SORTED_ROW_BYTES, _worthiest, first_layer
 from flexgs_edge.methods.best.method import grid_search
 from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES, Schedule, distil
@@ -85,6 +90,33 @@ def test_rows_of_a_first_layer(original: Original) -> None:
     others = np.random.default_rng(3).permutation(inside)
     assert error(alone(planes, inside), original) < 0.8 * error(alone(planes, others), original)
     assert first_layer(planes, DEGREES, 1e-6, bits, original).sum() == 1
+
+
+def test_sorting_takes_as_much_memory_as_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside what lies in scratch files, however the costs fall."""
+    count, rng = 1 << 17, np.random.default_rng(5)
+    storage = ScratchStorage(tmp_path, whole=1 << 10)
+    planes = {name: storage.copy(np.zeros((FIELD[name].width(3), count), np.float32)) for name in FIELD}
+    degrees = rng.integers(0, 4, count).astype(np.uint8)
+    drawn: list[int] = []
+
+    def measured(bench: Bench, scene: Any, *_: Any, **__: Any) -> RemovalCosts:
+        drawn.append(scene)
+        costs = RemovalCosts.empty(0, scene, storage)
+        costs.removal[:], costs.weight2[:] = rng.random(scene), rng.random(scene) > 0.1
+        return costs
+
+    monkeypatch.setattr("flexgs_edge.methods.best.layers.measure_costs", measured)
+    renderer = SimpleNamespace(storage=storage, load=lambda source, _: nullcontext(source.count))
+    bench = cast(Bench, SimpleNamespace(renderer=renderer))
+    tracemalloc.start()
+    try:
+        left = _worthiest(planes, degrees, np.arange(count), 0.1, BitModel(), bench, [], np.zeros(3))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert drawn[0] == count and len(drawn) > 8 and 0 < len(left) < 0.2 * count
+    assert peak < SORTED_ROW_BYTES * count
 
 
 def test_gradients_of_a_layer_alone(original: Original) -> None:

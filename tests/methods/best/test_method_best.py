@@ -24,6 +24,7 @@ from flexgs_edge.grid.values import from_grid
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.grid_coder import SETTINGS_MOST, GridCoder, bit_model
+from flexgs_edge.methods.best.layers import can_sort
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.open_scene import open_scene
@@ -294,7 +295,8 @@ def test_large_files_have_two_layers_where_they_cost_little(
     layers: int,
 ) -> None:
     monkeypatch.setattr("flexgs_edge.methods.best.method.LEAST_LAYERED", least)
-    monkeypatch.setattr("flexgs_edge.methods.best.method.MOST_LAYERED", most)
+    monkeypatch.setattr("flexgs_edge.methods.best.layers.MOST_LAYERED", most)
+    monkeypatch.setattr("flexgs_edge.methods.best.layers.SORTED_ROW_BYTES", 10**3)
     monkeypatch.setattr("flexgs_edge.methods.best.layers.MOST_COST", cost)
     # As it is, the file fits by a few bytes, which a second layer would not.
     target = {"max_size": tiny[1].size + 20} if limit else {"max_drop": 1.0}
@@ -307,6 +309,12 @@ def test_large_files_have_two_layers_where_they_cost_little(
     assert len(rows) == layers and sum(rows) == result.count
     if layers == 2:
         assert 0 < rows[0] < 0.3 * result.count
+
+
+def test_rows_are_sorted_where_their_lists_fit() -> None:
+    """Three fifths of a large scene fit into what its search had for lists of rows; a small scene always does."""
+    assert can_sort(1 << 18, 1 << 18) and can_sort(1_170_000, 2_000_000)
+    assert not can_sort(1_200_000, 2_000_000)
 
 
 def test_cameras_are_needed(project: Path, tmp_path: Path) -> None:
