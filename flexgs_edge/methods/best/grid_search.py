@@ -33,7 +33,7 @@ from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_
 from flexgs_edge.methods.best.layers import first_layer
 from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART, Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.distil import LAST, Schedule, distil
+from flexgs_edge.methods.best.refit.distil import LAST, Schedule, distil, structure_of
 from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
 from flexgs_edge.methods.best.view_weights import looking_more
 from flexgs_edge.render.fit import sum_bytes
@@ -218,7 +218,8 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
         original, layered = self._looking or self.rounds.original, self.first and step_sizes is not None
         first = first_layer(kept.planes, kept.degrees, self.first, self.bits, original) if layered else None
-        return distil(kept.planes, kept.degrees, original, schedule, step_sizes, first=first)
+        weight = structure_of(self._lead)
+        return distil(kept.planes, kept.degrees, original, schedule, step_sizes, structure=weight, first=first)
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
         subsets = self.effort.subsets_of(len(self.rounds.original.cameras))
@@ -350,8 +351,7 @@ class GridSearch(MultiplierSearch[GridScene]):
     def _distilled(self, kept: Kept, step_sizes: StepSizes, schedule: Schedule) -> GridScene:
         """Move all values towards the references, put them on the grid, and refit the constant colour."""
         moved = self._distil(kept, schedule, step_sizes)
-        storage = self.rounds.storage
-        grid = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved), storage)[0]
+        grid = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved), self.rounds.storage)[0]
         return self._with_constants(grid) if self.refit else grid
 
     def _with_constants(self, grid: GridScene) -> GridScene:

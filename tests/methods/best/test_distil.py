@@ -21,7 +21,16 @@ from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.distil import FIELD_RATES, HELD, STRUCTURE, Schedule, distil
+from flexgs_edge.methods.best.refit.distil import (
+    FIELD_RATES,
+    FULL_LEAD,
+    HELD,
+    LED_STRUCTURE,
+    STRUCTURE,
+    Schedule,
+    distil,
+    structure_of,
+)
 from flexgs_edge.quality.ssim import ssims
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import CompressOptions
@@ -104,6 +113,11 @@ def test_a_descent_gets_closer_than_a_refit_of_colours(workshop: Workshop) -> No
         workshop.fidelity, (workshop.kept, refitted, workshop.distil(12), workshop.distil(360))
     )
     assert long > refit + 2 > before + 4 and long > short > before, (before, refit, short, long)
+
+
+def test_structure_weighs_more_where_ssim_decides() -> None:
+    assert structure_of(0.0) == STRUCTURE < structure_of(FULL_LEAD / 2) < structure_of(FULL_LEAD) == LED_STRUCTURE
+    assert structure_of(9.0) == LED_STRUCTURE
 
 
 def test_the_structural_term_keeps_structure(workshop: Workshop) -> None:

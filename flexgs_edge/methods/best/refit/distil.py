@@ -29,8 +29,9 @@ FIELD_RATES = {
 }
 """Largest changes of the other values in a step: 1.6 (opacities) to 8 times (scales, SH) the reference program's. That program
 takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
-STRUCTURE = 0.02
-"""Weight of 1 - SSIM in the loss, in units of a squared error: docs/results/tuning.md#structure"""
+STRUCTURE, LED_STRUCTURE, FULL_LEAD = 0.02, 0.04, 0.3
+"""Weight of 1 - SSIM in the loss, in units of a squared error: where the mean decides, and where SSIM does, by at least the third
+(log of how much more of its bound it has used): docs/results/tuning.md#structure"""
 LAST, LAST_HELD = 0.06, 0.03
 """Rates at the end as a share of those at the beginning, while geometry moves and while it is held. They fall by the same factor
 at each step. With more, the views that come last decide too much: docs/results/tuning.md#last"""
@@ -118,6 +119,11 @@ class Schedule:
             rounds.append(rng.permutation(np.repeat(np.arange(views), times)))
             left -= len(rounds[-1])
         return np.concatenate(rounds)[: self.iterations]
+
+
+def structure_of(lead: float) -> float:
+    """Weight of 1 - SSIM in the loss where SSIM is nearer to its bound than the mean by `lead`, which is 0 or more."""
+    return STRUCTURE + (LED_STRUCTURE - STRUCTURE) * min(lead / FULL_LEAD, 1.0)
 
 
 def rates_for(cameras: Sequence[Camera], means_rate: float) -> dict[str, float]:
