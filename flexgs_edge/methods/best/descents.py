@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule
+from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule, share_of_lead
 
 DISTILLED, DISTILLED_POWER = 0.46, -0.2
 """Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
@@ -13,6 +13,8 @@ the power by which it changes with the steps: docs/results/tuning.md#distilled""
 BEHIND_SHORT, BEHIND_LONG = 0.03, 0.02
 """Log of the loss after a first candidate's descent, `SHORT` or `LONG`, over the middle of what the last descent between rounds
 left and of the probe: docs/results/tuning.md#distilled"""
+BEHIND_LED = -0.09
+"""What a full lead of SSIM adds to `BEHIND_SHORT`, as descents then weigh structure more: docs/results/tuning.md#distilled"""
 FULL_PASSES = 10
 """Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
 goes the course `SHORT`: docs/results/tuning.md#full_passes"""
@@ -63,10 +65,13 @@ class Descents:
         Of the descent to a candidate; 0 for none.
     poses : int
         Scored poses.
+    lead : float
+        As for `structure_of`.
     """
 
     steps: int
     poses: int
+    lead: float = 0.0
 
     @property
     def passes(self) -> float:
@@ -83,7 +88,9 @@ class Descents:
         """Expected excess after a first candidate's descent, from that before it, and from that which the descent before left."""
         if left is None:
             return excess + math.log(DISTILLED * math.pow(max(self.passes, 1.0), DISTILLED_POWER))
-        return (left + excess) / 2 + (BEHIND_LONG if self._long else BEHIND_SHORT)
+        return (left + excess) / 2 + (
+            BEHIND_LONG if self._long else BEHIND_SHORT + BEHIND_LED * share_of_lead(self.lead)
+        )
 
     @property
     def _long(self) -> bool:

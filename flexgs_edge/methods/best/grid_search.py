@@ -200,7 +200,7 @@ class GridSearch(MultiplierSearch[GridScene]):
 
     @property
     def _descents(self) -> descents.Descents:
-        return descents.Descents(self.steps, len(self.rounds.original.cameras))
+        return descents.Descents(self.steps, len(self.rounds.original.cameras), self._lead)
 
     def _before_refit(self, multiplier: float) -> GridScene:
         kept, step_sizes = self._choice(multiplier)

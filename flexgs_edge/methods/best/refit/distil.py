@@ -123,7 +123,12 @@ class Schedule:
 
 def structure_of(lead: float) -> float:
     """Weight of 1 - SSIM in the loss where SSIM is nearer to its bound than the mean by `lead`, which is 0 or more."""
-    return STRUCTURE + (LED_STRUCTURE - STRUCTURE) * min(lead / FULL_LEAD, 1.0)
+    return STRUCTURE + (LED_STRUCTURE - STRUCTURE) * share_of_lead(lead)
+
+
+def share_of_lead(lead: float) -> float:
+    """0 where the mean decides, up to 1 where SSIM leads by `FULL_LEAD` or more."""
+    return min(lead / FULL_LEAD, 1.0)
 
 
 def rates_for(cameras: Sequence[Camera], means_rate: float) -> dict[str, float]:
