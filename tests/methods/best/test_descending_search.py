@@ -33,7 +33,7 @@ from flexgs_edge.methods.best.descents import (
     rate_from,
 )
 from flexgs_edge.methods.best.kept import Kept
-from flexgs_edge.methods.best.refit.distil import Schedule
+from flexgs_edge.methods.best.refit.distil import STRUCTURE, Schedule
 from flexgs_edge.methods.best.rounds import take_rows
 from known_search import AT, BYTES, EFFORT, FakeRounds, KnownSearch, World, powers, search
 
@@ -234,9 +234,9 @@ def between(
     losses: list[tuple[float, float]] = []
 
     def moved(
-        planes: dict[str, np.ndarray], degrees: np.ndarray, original: Any, schedule: Schedule, steps: Any, first: Any
+        planes: dict[str, np.ndarray], degrees: np.ndarray, original: Any, schedule: Schedule, steps: Any, **words: Any
     ) -> Any:
-        assert steps is None and first is None
+        assert steps is None and words == {"first": None, "structure": STRUCTURE}  # the mean alone is asked for
         assert schedule.last == INTERLEAVED_LAST and schedule.iterations == 50
         counts.append(len(degrees))
         return {**planes, "opacity_logits": np.full_like(planes["opacity_logits"], MARK)}
