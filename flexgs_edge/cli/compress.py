@@ -166,8 +166,8 @@ Several scenes:
     type=int,
     default=None,
     help="Layers, up to 4, that `flexgs-edge trim` can cut and viewers show one by one. Descents make the first of them "
-    "look better, for some more bytes. Default: 2 plain ones for 1 MB or more, if they cost at most 2 %; beyond 262144 "
-    "Gaussians, of at most three fifths of the scene.",
+    "look better, for some more bytes. Default: 2 plain ones for 1 MB or more, if they cost at most 2 %, and if at most "
+    "262144 Gaussians or three fifths of the scene are left.",
 )
 @shared_options.report_option
 @option(OUTPUT, "--dry-run", is_flag=True, help="Write nothing (no -o needed). The size shown is exact.")

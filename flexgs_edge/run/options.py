@@ -208,8 +208,7 @@ class CompressOptions(ViewOptions):
     layers : int, optional
         Write the file in 1 to 4 layers, between which `trim` can cut it (`best`). Descents make the first of them look better,
         for some more bytes. Default: 2 plain ones for a file of a megabyte or more, if the first layer costs at most 2 %
-        more bytes and no target forbids them; else 1. Of more than 262 144 Gaussians, at most three fifths of the scene
-        may be left.
+        more bytes, no target forbids them, and at most 262 144 Gaussians or three fifths of the scene are left; else 1.
     scratch : str, optional
         Folder for scratch files of scenes that do not fit into memory (`best`). Default: the folder of the output.
     resume : bool

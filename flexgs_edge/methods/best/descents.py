@@ -14,7 +14,7 @@ BEHIND_SHORT, BEHIND_LONG = 0.03, 0.02
 """Log of the loss after a first candidate's descent, `SHORT` or `LONG`, over the middle of what the last descent between rounds
 left and of the probe: docs/results/tuning.md#distilled"""
 BEHIND_LED = -0.09
-"""What a full lead of SSIM adds to `BEHIND_SHORT`, as descents then weigh structure more: docs/results/tuning.md#distilled"""
+"""What a full lead of SSIM adds to `BEHIND_SHORT`, as descents then weigh structure more: docs/results/tuning.md#behind_led"""
 FULL_PASSES = 10
 """Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
 goes the course `SHORT`: docs/results/tuning.md#full_passes"""
@@ -66,7 +66,7 @@ class Descents:
     poses : int
         Scored poses.
     lead : float
-        As for `structure_of`.
+        By how much SSIM is nearer to its bound than the mean, as for `structure_of`.
     """
 
     steps: int
@@ -88,9 +88,8 @@ class Descents:
         """Expected excess after a first candidate's descent, from that before it, and from that which the descent before left."""
         if left is None:
             return excess + math.log(DISTILLED * math.pow(max(self.passes, 1.0), DISTILLED_POWER))
-        return (left + excess) / 2 + (
-            BEHIND_LONG if self._long else BEHIND_SHORT + BEHIND_LED * share_of_lead(self.lead)
-        )
+        behind = BEHIND_LONG if self._long else BEHIND_SHORT + BEHIND_LED * share_of_lead(self.lead)
+        return (left + excess) / 2 + behind
 
     @property
     def _long(self) -> bool:

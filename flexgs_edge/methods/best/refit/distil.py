@@ -30,8 +30,9 @@ FIELD_RATES = {
 """Largest changes of the other values in a step: 1.6 (opacities) to 8 times (scales, SH) the reference program's. That program
 takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
 STRUCTURE, LED_STRUCTURE, FULL_LEAD = 0.02, 0.04, 0.3
-"""Weight of 1 - SSIM in the loss, in units of a squared error: where the mean decides, and where SSIM does, by at least the third
-(log of how much more of its bound it has used): docs/results/tuning.md#structure"""
+"""Weights of 1 - SSIM in the loss, in units of a squared error, where the mean decides and where SSIM does; and the lead of SSIM
+from which the second one holds in full. A lead is the log of how much more of its bound SSIM has used than the mean:
+docs/results/tuning.md#led_structure"""
 LAST, LAST_HELD = 0.06, 0.03
 """Rates at the end as a share of those at the beginning, while geometry moves and while it is held. They fall by the same factor
 at each step. With more, the views that come last decide too much: docs/results/tuning.md#last"""
