@@ -208,6 +208,14 @@ def breaks_a_view(target: Target, measurement: Measurement) -> bool:
     return any((part.excess(measurement) or 0.0) > 0.0 for part in parts if isinstance(part, WorstView))
 
 
+def broken_views(target: Target, measurement: Measurement) -> list[int]:
+    """Places, among the views that decide, of those that lose more than the bound on the worst view."""
+    parts = target.parts if isinstance(target, Promised) else ()
+    bounds = [part.allowed(measurement) for part in parts if isinstance(part, WorstView)]
+    losses = enumerate(measurement.losses)
+    return [place for place, loss in losses if loss is not None and any(loss > bound for bound in bounds)]
+
+
 def bounds_ssim(target: Target) -> bool:
     """Whether SSIM is among the parts of the promise."""
     return bool(_ssim_parts(target))

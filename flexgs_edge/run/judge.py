@@ -163,12 +163,12 @@ class Judge:
         self._reserved -= freed
         self._budget.give(freed)
 
-    def photos_that_decide(self, target: Target) -> tuple[Sequence[Camera], Callable[[int], np.ndarray] | None]:
-        """The views and what loads the photo of one, by its place, if the drop against photos decides; else nothing."""
+    def photos_that_decide(self, target: Target) -> Callable[[int], np.ndarray] | None:
+        """What loads the photo of a view, by its place, if the drop against photos decides; else `None`."""
         photos = self.photos
         if photos is None or target.figure != "drop":
-            return (), None
-        return self.cameras, lambda place: photos.load(self.indices[place])
+            return None
+        return lambda place: photos.load(self.indices[place])
 
     @property
     def kept(self) -> int:

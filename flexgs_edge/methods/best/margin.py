@@ -22,8 +22,10 @@ would make files larger."""
 TIMES = {0: NEARER, 2: FARTHER, 4: NEARER, 6: FARTHER}
 
 
-def with_margin(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """The first `most` of `cameras` to score, and five made poses for every eight of them.
+def margin_of(
+    renderer: Renderer, source: SceneSource, poses: Sequence[Camera], cameras: Sequence[Camera]
+) -> list[Camera]:
+    """Five made poses for every eight.
 
     Parameters
     ----------
@@ -31,20 +33,19 @@ def with_margin(renderer: Renderer, source: SceneSource, cameras: Sequence[Camer
         With nothing loaded.
     source : SceneSource
         The original.
+    poses : sequence of Camera
+        Poses that are scored, the most important first.
     cameras : sequence of Camera
-        All training poses, the most important first.
-    most : int
-        Most given poses.
+        All training poses.
     """
-    real = list(cameras[:most])
-    moved = [place for place in range(len(real)) if place % EVERY in TIMES]
-    depths = dict(zip(moved, visible_depths(renderer, source, [real[place] for place in moved]), strict=True))
+    moved = [place for place in range(len(poses)) if place % EVERY in TIMES]
+    depths = dict(zip(moved, visible_depths(renderer, source, [poses[place] for place in moved]), strict=True))
     made = []
-    for place, camera in enumerate(real):
+    for place, camera in enumerate(poses):
         if place in depths:
             made.append(at_distance(camera, depths[place], TIMES[place % EVERY]))
         elif place % EVERY == BETWEEN and len(cameras) > 1:
             others = [other for other in cameras if other is not camera]
             away = [float(np.square(other.center - camera.center).sum()) for other in others]
             made.append(between(camera, others[int(np.argmin(away))]))
-    return real + made
+    return made

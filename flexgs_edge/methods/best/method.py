@@ -33,7 +33,7 @@ from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.keep import kept_as_it_is, layers_cost
 from flexgs_edge.methods.best.layers import HALF, LEAST_LAYERED, assign_layers, can_sort, layered_where_cheap
-from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
+from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch, PosesLacking
 from flexgs_edge.methods.best.poses import ScoredPoses, is_fine, scored_poses
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, choose_storage, least_spilled, needed_bytes
@@ -55,6 +55,9 @@ from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
 
 LOG = logging.getLogger("flexgs_edge")
+
+SEARCHES = 3
+"""Most searches, each with more poses beside views that lost too much: docs/results/tuning.md#needed"""
 
 Report = Callable[[Candidate], None]
 SearchMaker = Callable[[PruneRounds, Measure, Report], MultiplierSearch[Product]]
@@ -79,14 +82,7 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
     """
     output = run.output.path
     with Judges(run, bench) as judges:
-        poses = scored_poses(
-            run.seen.of(run.seen.train),
-            run.options,
-            bench.renderer,
-            run.source,
-            judges.decide.covered_decides,
-            *judges.decide.photos_that_decide(run.target),
-        )
+        poses = choose_poses(run, bench, judges.decide)
         folder = Path(run.options.scratch or (tempfile.gettempdir() if output is None else output.parent))
         storage = bench.renderer.storage = choose_storage(run, bench.renderer, poses.cameras, folder)
         judges.prepare()
@@ -176,6 +172,32 @@ def grid_search(
     return make
 
 
+def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge, lost: Sequence[int] = ()) -> ScoredPoses:
+    """`scored_poses` for a run.
+
+    Parameters
+    ----------
+    run : Run
+        Planned.
+    bench : Bench
+        Its renderer has nothing loaded.
+    judge : Judge
+        On the views that decide.
+    lost : sequence of int
+        As for `scored_poses`. Default: none.
+    """
+    return scored_poses(
+        run.seen.of(run.seen.train),
+        run.options,
+        bench.renderer,
+        run.source,
+        judge.covered_decides,
+        judge.cameras,
+        judge.photos_that_decide(run.target),
+        lost,
+    )
+
+
 def search_best(
     make: SearchMaker[Product],
     run: Run[CompressOptions],
@@ -185,6 +207,8 @@ def search_best(
     checkpoint: Checkpoint | None = None,
 ) -> tuple[Product, SearchResult]:
     """Search, and return the product to write and all candidates that led to it.
+
+    Where candidates keep breaking views, the search begins anew with poses beside these, `SEARCHES` times in all at most.
 
     Parameters
     ----------
@@ -208,12 +232,37 @@ def search_best(
     BudgetError
         When the scene does not fit.
     """
+    lost: list[int] = []
+    tried: list[Step] = []
+    for left in reversed(range(SEARCHES if run.options.makes_poses else 1)):
+        try:
+            product, search = _search_from(poses, make, run, bench, judge, checkpoint, asks=left > 0)
+            break
+        except PosesLacking as lacking:
+            lost += lacking.views
+            tried += [as_step(step, run.source.count) for step in lacking.steps]
+        # Outside of the handler, whose error would keep the last search in memory.
+        LOG.info("%d views lose too much: searching again with poses beside them", len(set(lost)))
+        poses = choose_poses(run, bench, judge, lost)
+        checkpoint = None if checkpoint is None else checkpoint.further()
+    return product, replace(search, steps=(*tried, *search.steps))
+
+
+def _search_from(
+    poses: ScoredPoses,
+    make: SearchMaker[Product],
+    run: Run[CompressOptions],
+    bench: Bench,
+    judge: Judge,
+    checkpoint: Checkpoint | None,
+    asks: bool = False,
+) -> tuple[Product, SearchResult]:
     with (
         open_rounds(run, bench, poses.cameras, checkpoint=checkpoint, known=poses.known) as rounds,
         run.clock.stage("search"),
     ):
         product, search = search_rounds(
-            make, rounds, run, judge, on_step=lambda step: LOG.info("%s", step_words(step, run.target))
+            make, rounds, run, judge, on_step=lambda step: LOG.info("%s", step_words(step, run.target)), asks=asks
         )
         return product, replace(search, scored=Scored(len(poses.cameras), poses.made, rounds.unseen))
 
@@ -285,6 +334,7 @@ def search_rounds(
     run: Run[CompressOptions],
     judge: Judge,
     on_step: Callable[[Step], None] | None = None,
+    asks: bool = False,
 ) -> tuple[Product, SearchResult]:
     """Search as `search_best` does, from rounds that are open already."""
     renderer, source = rounds.original.bench.renderer, run.source
@@ -299,7 +349,7 @@ def search_rounds(
             on_step(as_step(step, source.count))
 
     search = make(rounds, measure, report)
-    search.most = run.options.max_gaussians
+    search.most, search.asks = run.options.max_gaussians, asks
     found = search.run(run.target, run.options.best_effort)
     if found.chosen.left_out:
         LOG.warning(

@@ -17,7 +17,7 @@ import numpy as np
 
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import TargetError
-from flexgs_edge.goals.promise import bounds_ssim, mean_alone, means
+from flexgs_edge.goals.promise import bounds_ssim, broken_views, mean_alone, means
 from flexgs_edge.goals.steps import better, obstacle
 from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.methods.best.allocation import BitModel, choose, drop_bands, keep_most, keep_one
@@ -45,9 +45,27 @@ EXTRA_STEPS = 4
 """Most candidates beyond the effort's own, while none holds or the best is far below the target."""
 FLAT = 0.1
 """If two candidates have the most Gaussians allowed, and the log of the loss differs by less, the search ends."""
+BROKEN = 2
+"""So many candidates in a row that break views ask for more poses: docs/results/tuning.md#needed"""
 LEAD_FROM = 1.0
 """Rounds of pruning measure SSIM once, as soon as the log of the loss is this near to their end. Where less is lost, SSIM says
 little about the end: docs/results/tuning.md#lead"""
+
+
+class PosesLacking(Exception):
+    """Candidates in a row broke the bound on the worst view: scored poses see too little of what a view shows.
+
+    Parameters
+    ----------
+    views : sequence of int
+        Places of the broken views among those that decide.
+    steps : sequence of Candidate
+        The candidates.
+    """
+
+    def __init__(self, views: Sequence[int], steps: Sequence[Candidate]) -> None:
+        super().__init__("views lose too much")
+        self.views, self.steps = tuple(views), tuple(steps)
 
 
 class MultiplierSearch(ABC, Generic[Product]):
@@ -68,6 +86,8 @@ class MultiplierSearch(ABC, Generic[Product]):
     ----------
     most : int or None
         Most Gaussians of a candidate (`--max-gaussians`).
+    asks : bool
+        Whether `run` raises `PosesLacking`.
     ended : bool
         Whether the search was interrupted and answers with what it has.
     """
@@ -87,6 +107,7 @@ class MultiplierSearch(ABC, Generic[Product]):
         self.rounds, self.measure, self.effort, self.on_step = rounds, measure, effort, on_step
         self.bits = BitModel()
         self.most: int | None = None
+        self.asks = False
         self.ended = False
         self._lead, self._begin = 0.0, 0
 
@@ -145,6 +166,8 @@ class MultiplierSearch(ABC, Generic[Product]):
         ------
         TargetError
             When no candidate holds and `best_effort` is not set; it names the closest one.
+        PosesLacking
+            When `BROKEN` candidates in a row break views, if the search `asks`.
         """
         steps: list[Candidate] = []
         tried: list[Candidate] = []
@@ -161,6 +184,7 @@ class MultiplierSearch(ABC, Generic[Product]):
             steps.append(step)
             if self.on_step:
                 self.on_step(step)
+            self._ask(steps, tried, target)
             mended = None if step.holds else self._mended(step, product, target, tried)
             if mended is not None:
                 self.discard(product)
@@ -190,6 +214,14 @@ class MultiplierSearch(ABC, Generic[Product]):
                 f"{last} (--best-effort writes it){obstacle(target, chosen)}"
             )
         return RateResult(product, chosen, chosen.holds, (*steps, *tried))
+
+    def _ask(self, steps: Sequence[Candidate], tried: Sequence[Candidate], target: Target) -> None:
+        """Raise `PosesLacking` if the last candidates all broke views."""
+        if not self.asks or target.limit_bytes is not None or len(steps) < BROKEN:
+            return
+        broken = [broken_views(target, step.measurement) for step in steps[-BROKEN:]]
+        if all(broken):
+            raise PosesLacking(sorted(set().union(*broken)), (*steps, *tried))
 
     def _start(self, target: Target) -> float:
         """Prune until pruning alone has used up its share of the target; returns the multiplier of that cut."""

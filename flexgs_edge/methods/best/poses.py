@@ -11,7 +11,8 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.order import covering_order
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, pixels_of, sampled_poses, sampling_steps
-from flexgs_edge.methods.best.margin import with_margin
+from flexgs_edge.methods.best.margin import margin_of
+from flexgs_edge.methods.best.needed_poses import needed_poses, poses_beside
 from flexgs_edge.methods.best.view_weights import KnownErrors, base_errors, rareness, view_weights
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import DEFAULT_MAX_DROP, CompressOptions
@@ -25,6 +26,9 @@ COVERAGE_POSES = 32
 """Poses that tell how much of the views the scene covers. All 220 of one scene took a tenth of the run."""
 SAMPLE_ROWS = 4096
 """Most Gaussians whose positions tell which poses see which part of the scene."""
+BESIDE_FINER = 2.0
+"""How much finer we look at poses beside a view that lost too much, for each search that lost it:
+docs/results/tuning.md#needed"""
 
 
 @dataclass(frozen=True)
@@ -52,13 +56,15 @@ def scored_poses(
     renderer: Renderer,
     source: SceneSource,
     covered_decides: bool = False,
-    known: Sequence[Camera] = (),
+    deciding: Sequence[Camera] = (),
     photo: Callable[[int], np.ndarray] | None = None,
+    lost: Sequence[int] = (),
 ) -> ScoredPoses:
     """Choose as many poses as the effort scores. Each next pose is the one that adds most to what those before it see.
 
-    With `makes_poses`, generated poses come on top (see `with_margin`). A few poses chosen like this give costs about as
-    good as all poses do: docs/results/speed.md#scoring-fewer-views
+    A few poses chosen like this give costs about as good as all poses do: docs/results/speed.md#scoring-fewer-views
+
+    With `makes_poses`, generated poses come on top: see `margin_of` and `needed_poses`.
 
     Parameters
     ----------
@@ -72,10 +78,14 @@ def scored_poses(
         The original.
     covered_decides : bool
         As for `Quality`: only pixels that the scene covers count as pixels to look at. Default: all pixels count.
-    known : sequence of Camera
-        The views that decide, if photos do.
+    deciding : sequence of Camera
+        The views that decide.
     photo : callable, optional
-        The photo of one of these ([H, W, 3] f32). Poses then get pixels by `view_weights`. Default: alike.
+        The photo of one of these ([H, W, 3] f32) by its place, if photos decide. Poses then get pixels by
+        `view_weights`. Default: alike.
+    lost : sequence of int
+        Places, among the views that decide, of those that lost too much, in one search or in several. They get poses beside
+        them, with the more points, the more often they lost. Default: none.
     """
     plan = EFFORTS[options.effort]
     positions = some_positions(source)
@@ -84,13 +94,19 @@ def scored_poses(
     ordered = [cameras[i] for i in (*order, *rest)]
     fine = is_fine(options, source)
     most = plan.views if fine else plan.poses_of([camera.width * camera.height for camera in ordered], source.count)
-    chosen = with_margin(renderer, source, ordered, most) if options.makes_poses else ordered[:most]
-    given = {id(camera) for camera in cameras}
+    chosen, given = ordered[:most], {id(camera) for camera in cameras}
+    beside = {place: poses_beside(deciding[place], chosen) for place in sorted(set(lost))}
+    if options.makes_poses:
+        margin = margin_of(renderer, source, chosen, cameras)
+        further = [pose for poses in beside.values() for pose in poses]
+        scored = [*chosen, *margin, *further]
+        needed = needed_poses(scored, chosen, ordered[most:], deciding, positions, renderer.near)
+        chosen = [*scored, *needed, *margin_of(renderer, source, [*further, *needed], cameras)]
     drawn = chosen
     errors = None
     if photo is not None:
         drop = options.max_drop or DEFAULT_MAX_DROP
-        errors = KnownErrors(known, base_errors(renderer, source, known, photo), drop)
+        errors = KnownErrors(deciding, base_errors(renderer, source, deciding, photo), drop)
     if not fine:
         steps = sampling_steps(chosen, source.count * plan.pixels)
         if errors is not None:
@@ -100,6 +116,9 @@ def scored_poses(
         if max(steps) > 1 and covered_decides:
             # A small object in a large view would fall between the pixels.
             steps = sampling_steps(chosen, source.count * plan.pixels, _coverage(renderer, source, chosen))
+        finer = {id(pose): BESIDE_FINER ** lost.count(place) for place, poses in beside.items() for pose in poses}
+        pairs = zip(chosen, steps, strict=True)
+        steps = [max(step / finer.get(id(pose), 1.0), 1.0) for pose, step in pairs]
         drawn = sampled_poses(chosen, steps)
     return ScoredPoses(drawn, sum(id(camera) not in given for camera in chosen), errors)
 

@@ -17,7 +17,7 @@ from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
 from flexgs_edge.methods.best.refit.descent import descent_bytes
 from flexgs_edge.methods.best.refit.streamed_descent import streamed_descent_bytes, streamed_rows
-from flexgs_edge.methods.best.rounds import PARTS, parts_of, sum_row_bytes
+from flexgs_edge.methods.best.rounds import MOST_PARTS, PARTS, parts_of, sum_row_bytes
 from flexgs_edge.render.ahead import AHEAD_ROW_BYTES
 from flexgs_edge.render.fit import (
     GRADIENT_SUMS,
@@ -89,7 +89,7 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
     source, options, budget = run.source, run.options, run.budget
     largest = largest_of(scored)
     rows, keep = source.count, EFFORTS[options.effort].keep
-    whole = rows * row_bytes(source.sh_degree, keep, parts_of(len(scored)))
+    whole = rows * row_bytes(source.sh_degree, keep, _most_parts(options, scored))
     distils = distil_steps(options, len(scored), source.count) > 0
     size, least = needed_bytes(renderer, source, scored, options, distils)
     if size + least <= budget.free:
@@ -117,7 +117,7 @@ def needed_bytes(
 ) -> tuple[int, int]:
     """Bytes that a search in memory holds, and the least bytes that drawing needs beside them."""
     size, sums = (
-        source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep, parts_of(len(scored))),
+        source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep, _most_parts(options, scored)),
         sum_row_bytes(source.sh_degree),
     )
     if distils:
@@ -125,6 +125,11 @@ def needed_bytes(
         sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))
         size += source.count * DESCENTS * stored_bytes(source.sh_degree)
     return size, _least_bytes(renderer, source, largest_of(scored), sums, distils)
+
+
+def _most_parts(options: CompressOptions, scored: Sequence[Camera]) -> int:
+    """Sets that the poses make at most: a search may begin anew with more of them, and then it must fit as well."""
+    return MOST_PARTS if options.makes_poses else parts_of(len(scored))
 
 
 def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera, distils: bool) -> int:

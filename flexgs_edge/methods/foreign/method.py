@@ -11,8 +11,7 @@ import numpy as np
 from flexgs_edge.goals.steps import Step, step_words
 from flexgs_edge.goals.target import Target
 from flexgs_edge.io.exchange import read_foreign
-from flexgs_edge.methods.best.method import search_best
-from flexgs_edge.methods.best.poses import scored_poses
+from flexgs_edge.methods.best.method import choose_poses, search_best
 from flexgs_edge.methods.foreign.by_cost import file_search
 from flexgs_edge.methods.foreign.by_rank import search_pruned_files
 from flexgs_edge.methods.foreign.file_maker import open_files, publish
@@ -53,9 +52,7 @@ def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray 
             LOG.warning("%s does not say that the model is antialiased: viewers must be told", format.suffix)
         poses = None
         if order is None and bench is not None and judges is not None:
-            cameras, covered = run.seen.of(run.seen.train), judges.decide.covered_decides
-            deciding = judges.decide.photos_that_decide(run.target)
-            poses = scored_poses(cameras, options, bench.renderer, run.source, covered, *deciding)
+            poses = choose_poses(run, bench, judges.decide)
         with open_files(run, format, bench, judges) as files:
             if plan.target is not None:
                 LOG.info("searching for %s", plan.target.describe())
