@@ -242,7 +242,7 @@ def search_best(
             lost += lacking.views
             tried += [as_step(step, run.source.count) for step in lacking.steps]
         # Outside of the handler, whose error would keep the last search in memory.
-        LOG.info("%d views lose too much: searching again with poses beside them", len(set(lost)))
+        LOG.info("views that lose too much: %d; searching again with poses beside them", len(set(lost)))
         poses = choose_poses(run, bench, judge, lost)
         checkpoint = None if checkpoint is None else checkpoint.further()
     return product, replace(search, steps=(*tried, *search.steps))
