@@ -167,7 +167,7 @@ class MultiplierSearch(ABC, Generic[Product]):
         TargetError
             When no candidate holds and `best_effort` is not set; it names the closest one.
         PosesLacking
-            When `BROKEN` candidates in a row break views, if the search `asks`.
+            When `BROKEN` candidates in a row break views and none holds, if the search `asks`. Their products are freed.
         """
         steps: list[Candidate] = []
         tried: list[Candidate] = []
@@ -184,7 +184,11 @@ class MultiplierSearch(ABC, Generic[Product]):
             steps.append(step)
             if self.on_step:
                 self.on_step(step)
-            self._ask(steps, tried, target)
+            broken = self._broken(steps, target)
+            if broken:
+                for made in [product] if best is None else [product, best[1]]:
+                    self.discard(made)
+                raise PosesLacking(broken, (*steps, *tried))
             mended = None if step.holds else self._mended(step, product, target, tried)
             if mended is not None:
                 self.discard(product)
@@ -215,13 +219,12 @@ class MultiplierSearch(ABC, Generic[Product]):
             )
         return RateResult(product, chosen, chosen.holds, (*steps, *tried))
 
-    def _ask(self, steps: Sequence[Candidate], tried: Sequence[Candidate], target: Target) -> None:
-        """Raise `PosesLacking` if the last candidates all broke views."""
-        if not self.asks or target.limit_bytes is not None or len(steps) < BROKEN:
-            return
+    def _broken(self, steps: Sequence[Candidate], target: Target) -> list[int]:
+        """Views that the last candidates broke, if the search asks for poses: each of these broke one, and none so far holds."""
+        if not self.asks or target.limit_bytes is not None or len(steps) < BROKEN or any(step.holds for step in steps):
+            return []
         broken = [broken_views(target, step.measurement) for step in steps[-BROKEN:]]
-        if all(broken):
-            raise PosesLacking(sorted(set().union(*broken)), (*steps, *tried))
+        return sorted(set().union(*broken)) if all(broken) else []
 
     def _start(self, target: Target) -> float:
         """Prune until pruning alone has used up its share of the target; returns the multiplier of that cut."""

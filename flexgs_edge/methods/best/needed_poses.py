@@ -27,7 +27,7 @@ BESIDE = 4
 MOST_TIMES = 2
 """Needed poses are at most so many times the given ones that are scored."""
 POINTS = 512
-"""Most points that tell what poses see. With 2048, times are four times as long, and the same poses are needed."""
+"""Most points that tell what poses see."""
 
 
 def needed_poses(
@@ -150,7 +150,10 @@ def _pairs(
             for other in nearest(camera, given, NEIGHBOURS):
                 pairs[min(place, other), max(place, other)] = None
     found = [(given[first], given[second]) for first, second in pairs]
+    scored = {id(camera) for camera in given}
     for view in deciding:
+        if id(view) in scored:
+            continue
         own = _seen(view, points, near)
         if _gain(own, _known(own, there)) >= LEAST_GAIN:
             found += [(given[place], view) for place in nearest(view, given, BESIDE)]

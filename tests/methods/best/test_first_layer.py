@@ -93,8 +93,8 @@ def test_rows_of_a_first_layer(original: Original) -> None:
 
 
 def test_sorting_takes_as_much_memory_as_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside what lies in scratch files, however the costs fall."""
-    count, rng = 1 << 17, np.random.default_rng(5)
+    """Beside what lies in scratch files, however the costs fall. So many rows that what else is allocated hardly counts."""
+    count, rng = 1 << 19, np.random.default_rng(5)
     storage = ScratchStorage(tmp_path, whole=1 << 10)
     planes = {name: storage.copy(np.zeros((FIELD[name].width(3), count), np.float32)) for name in FIELD}
     degrees = rng.integers(0, 4, count).astype(np.uint8)

@@ -21,7 +21,7 @@ from flexgs_edge.methods.best.poses import scored_poses
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import CompressOptions
 from kernel_fixtures import large_budget, open_form
-from known_search import AT, BYTES, EFFORT, FakeRounds, KnownSearch, World, powers
+from known_search import AT, BYTES, EFFORT, FakeRounds, KnownSearch, World, powers, search
 from synthetic import make_camera, random_scene
 from tiny_project import make_project
 
@@ -139,6 +139,41 @@ def test_candidates_in_a_row_that_break_a_view_ask_for_poses() -> None:
         asking(Breaking(2.4), PROMISED).run(PROMISED)
     assert caught.value.views == (2,) and len(caught.value.steps) == BROKEN
     assert all(broken_views(PROMISED, step.measurement) == [2] for step in caught.value.steps)
+
+
+class Found(KnownSearch):
+    """Counts what the search frees."""
+
+    freed = 0
+
+    def discard(self, product: Any) -> None:
+        self.freed += 1
+
+
+def test_a_search_that_asks_frees_its_products() -> None:
+    world, rounds = Breaking(2.4), FakeRounds()
+    world.rounds = rounds
+    finder = Found(rounds, world.size_of, world.measure, EFFORT, refit=False)  # type: ignore[arg-type]
+    finder.world, finder.asks = world, True
+    with pytest.raises(PosesLacking):
+        finder.run(PROMISED)
+    assert finder.freed == BROKEN
+
+
+def test_a_search_with_a_result_that_holds_does_not_ask() -> None:
+    """The view breaks where more is lost than the mean of the first candidate."""
+    world = Breaking(2.4)
+    finder = asking(world, PROMISED)
+    found = search(powers(), MaxDrop(0.5), best_effort=True).chosen
+    holding = replace(found, excess=-0.5, measurement=replace(found.measurement, losses=(0.1, 0.1, 0.1)))
+    missed = [step for step in broken_steps(world) if not step.holds]
+    assert finder._broken(missed, PROMISED) == [2] and finder._broken([holding, *missed], PROMISED) == []
+
+
+def broken_steps(world: World) -> list[Any]:
+    with pytest.raises(PosesLacking) as caught:
+        asking(world, PROMISED).run(PROMISED)
+    return list(caught.value.steps)
 
 
 @pytest.mark.parametrize(
