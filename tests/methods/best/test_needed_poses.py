@@ -141,7 +141,7 @@ def test_candidates_in_a_row_that_break_a_view_ask_for_poses() -> None:
     assert all(broken_views(PROMISED, step.measurement) == [2] for step in caught.value.steps)
 
 
-class Found(KnownSearch):
+class Freeing(KnownSearch):
     """Counts what the search frees."""
 
     freed = 0
@@ -153,7 +153,7 @@ class Found(KnownSearch):
 def test_a_search_that_asks_frees_its_products() -> None:
     world, rounds = Breaking(2.4), FakeRounds()
     world.rounds = rounds
-    finder = Found(rounds, world.size_of, world.measure, EFFORT, refit=False)  # type: ignore[arg-type]
+    finder = Freeing(rounds, world.size_of, world.measure, EFFORT, refit=False)  # type: ignore[arg-type]
     finder.world, finder.asks = world, True
     with pytest.raises(PosesLacking):
         finder.run(PROMISED)
@@ -161,7 +161,7 @@ def test_a_search_that_asks_frees_its_products() -> None:
 
 
 def test_a_search_with_a_result_that_holds_does_not_ask() -> None:
-    """The view breaks where more is lost than the mean of the first candidate."""
+    """Two candidates break a view. With one that holds before them, the search keeps that one."""
     world = Breaking(2.4)
     finder = asking(world, PROMISED)
     found = search(powers(), MaxDrop(0.5), best_effort=True).chosen
