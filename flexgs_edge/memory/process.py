@@ -125,7 +125,8 @@ def return_freed_memory() -> None:
 def trim_heap() -> None:
     """Return what is freed by now to the system; does nothing with another C library than glibc.
 
-    For work that starts after other work: its limit counts all resident memory. `return_freed_memory` comes before work.
+    `return_freed_memory` bounds the holes of arrays that are mapped; the heaps of threads keep those of smaller arrays until
+    this call. Call it before work whose limit counts all resident memory: docs/results/tuning.md#memory
     """
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -14,6 +14,7 @@ from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.tested import processors_with_verdicts
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.open_bench import counted_backend
@@ -107,9 +108,11 @@ def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
     if not storage.spills:
         return source
     renderer.release()
+    trim_heap()
     budget.require("decoding the file", min(source.count, CHUNK_ROWS) * DECODE_BYTES)
     with ahead(source, budget):
         planes = read_all(source, storage)
+    trim_heap()
     return MemorySource(planes, source.sh_degree, source.origin, source.name)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from flexgs_edge.codec.v2.container import coded_size, write_grid
 from flexgs_edge.codec.v2.encode import Encoded, encode_grid
 from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import coding_device
@@ -35,6 +36,7 @@ class GridCoder:
         self._last: tuple[GridScene, Encoded] | None = None
 
     def _encode(self, grid: GridScene) -> Encoded:
+        self._trim()
         device = coding_device(self._renderer.backend, self._renderer.budget, grid.count, grid.sh_degree)
         return encode_grid(grid, device=device, storage=self._renderer.storage)
 
@@ -53,12 +55,21 @@ class GridCoder:
 
     def size(self, grid: GridScene, settings: Mapping[str, Any] | None = None) -> int:
         """Bytes of the file that `write` makes. A search does not know the `settings` yet: without them it is an upper bound."""
-        size = coded_size(grid, settings or {}, encoded=self.encoded(grid))
+        encoded = self.encoded(grid)
+        self._trim()
+        size = coded_size(grid, settings or {}, encoded=encoded)
         return size + self._settings_room if settings is None else size
 
     def write(self, path: str | os.PathLike[str], grid: GridScene, settings: Mapping[str, Any]) -> int:
         """See `write_grid`."""
-        return write_grid(path, grid, settings, encoded=self.encoded(grid))
+        encoded = self.encoded(grid)
+        self._trim()
+        return write_grid(path, grid, settings, encoded=encoded)
+
+    def _trim(self) -> None:
+        """Return the holes that drawing and counting left in the heap, where memory is short."""
+        if self._renderer.storage.spills:
+            trim_heap()
 
 
 def bit_model(grid: GridScene, encoded: Encoded) -> BitModel:
