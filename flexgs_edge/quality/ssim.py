@@ -62,19 +62,21 @@ def ssims(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> l
         backend.write(taps, window())
         backend.fill(moments, 0)  # the kernel reads beyond the last row, but does not use it
         padded = np.zeros((height, stride), np.float32)
-        found: list[float | None] = []
-        for pair in pairs:
-            total = 0.0
-            for channel in range(3):
-                for image, array in zip(pair, images, strict=True):
+        totals = [0.0] * len(pairs)
+        for channel in range(3):
+            held: list[np.ndarray | None] = [None, None]
+            for place, pair in enumerate(pairs):
+                for slot, image in enumerate(pair):
+                    if held[slot] is image:
+                        continue
                     np.clip(image[..., channel], 0.0, 1.0, out=padded[:, :width])
-                    backend.write(array, padded)
+                    backend.write(images[slot], padded)
+                    held[slot] = image
                 backend.launch("ssim_columns", (count,), count, stride, plane, taps, *images, moments)
                 backend.launch("ssim_rows", (count,), count, plane, taps, moments, similar)
                 inside = backend.read(similar).reshape(rows, stride)[:, : width - SSIM_WINDOW + 1]
-                total += float(inside.mean(dtype=np.float64))
-            found.append(total / 3)
-        return found
+                totals[place] += float(inside.mean(dtype=np.float64))
+        return [total / 3 for total in totals]
     finally:
         for array in arrays:
             array.release()

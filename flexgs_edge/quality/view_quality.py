@@ -308,6 +308,7 @@ def compare_view(
     original: np.ndarray,
     photo: np.ndarray | None = None,
     original_error: float | None = None,
+    original_ssim: float | None = None,
     ssims: Figures | None = None,
     lpips: Distance | None = None,
     coverage: float = 1.0,
@@ -325,6 +326,8 @@ def compare_view(
         The photo, [H, W, 3] f32 in [0, 1].
     original_error : float, optional
         Mean squared error of `original` against `photo`, if it is known already.
+    original_ssim : float, optional
+        SSIM of the same two, if it is known already.
     ssims : callable, optional
         Measures the similarity of all pairs of images; by default SSIM is left out.
     lpips : callable, optional
@@ -336,7 +339,7 @@ def compare_view(
     """
     if photo is not None and original_error is None:
         original_error = mse(original, photo)
-    similar = _three(ssims, image, original, photo)
+    similar = _three(ssims, image, original, photo, original_ssim)
     view = ViewQuality(
         name=name,
         error=mse(image, original),
@@ -362,11 +365,18 @@ def with_flip(
 
 
 def _three(
-    figures: Figures | None, image: np.ndarray, original: np.ndarray, photo: np.ndarray | None
+    figures: Figures | None,
+    image: np.ndarray,
+    original: np.ndarray,
+    photo: np.ndarray | None,
+    originals: float | None = None,
 ) -> list[float | None]:
-    """Figures of the image against the original and the photo, and of the original against the photo."""
+    """Figures of the image against the original and the photo, and of the original against the photo: `originals` if known."""
     found: list[float | None] = [None] * 3
     if figures:
-        pairs = [(image, original), *([(image, photo), (original, photo)] if photo is not None else ())]
+        found[2] = originals
+        pairs = [(image, original)]
+        if photo is not None:
+            pairs += [(image, photo), (original, photo)][: 2 if originals is None else 1]
         found[: len(pairs)] = figures(pairs)
     return found

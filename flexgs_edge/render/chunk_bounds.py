@@ -59,29 +59,25 @@ class ChunkBounds:
         rotation, shift = camera[:9].reshape(3, 3), camera[9:12]
         (fx, fy, cx, cy), (width, height), dilation = camera[12:16], camera[24:26], camera[26]
         slopes = [math.hypot(1.0, np.abs(camera[at : at + 2]).max()) for at in (17, 19)]
-        none = np.zeros(len(self.extent))
-        seen = np.ones(len(self.extent), bool)
         with np.errstate(over="ignore", invalid="ignore"):
-            # Reach: `spread` scene units at depth 1, and `pixels` at any.
-            spread = [SIGMAS * self.extent * abs(f) * slope for f, slope in zip((fx, fy), slopes, strict=True)]
+            # Reach: `spread` times the extent at depth 1, in scene units, and `pixels` at any.
+            spread = [SIGMAS * abs(f) * slope for f, slope in zip((fx, fy), slopes, strict=True)]
             pixels = SIGMAS * math.sqrt(dilation)
             if inria_extent:
                 spread = [SIGMA_RADIUS_INRIA / SIGMAS * (spread[0] + spread[1])] * 2
                 pixels = SIGMA_RADIUS_INRIA * (2 * math.sqrt(dilation) + INRIA_SPREAD) + 1 + TILE
-            sides = (
-                (0.0, 1.0, none - camera[16]),
-                (fx, cx + 1 + pixels, spread[0]),
-                (-fx, width - cx + pixels, spread[0]),
-                (fy, cy + 1 + pixels, spread[1]),
-                (-fy, height - cy + pixels, spread[1]),
-            )
-            # Means and largest distances of the boxes along the axes of the camera.
-            along, corner = rotation @ self.middle, np.abs(self.middle) + self.half
-            far = np.abs(rotation) @ corner + np.abs(shift)[:, None]
-            for place, (across, deep, room) in enumerate(sides):
-                axis = 0 if place < 3 else 1
-                reach = np.abs(across * rotation[axis] + deep * rotation[2]) @ self.half + room
-                most = across * (along[axis] + shift[axis]) + deep * (along[2] + shift[2]) + reach
-                terms = abs(across) * far[axis] + abs(deep) * far[2]
-                seen &= ~(most < -ROUNDING * (terms + np.abs(room)))
-        return seen
+            # The sides of the picture, near plane first: its axis, and the factors of x or y and of depth.
+            axis = [0, 0, 0, 1, 1]
+            across = np.array([0.0, fx, -fx, fy, -fy])
+            deep = np.array([1.0, cx + 1 + pixels, width - cx + pixels, cy + 1 + pixels, height - cy + pixels])
+            room = np.outer([0.0, spread[0], spread[0], spread[1], spread[1]], self.extent)
+            room[0] -= camera[16]
+            # Their values at the middles of the boxes, and how much more at the corner where they are largest.
+            factors = across[:, None] * rotation[axis] + deep[:, None] * rotation[2]
+            offsets = across * shift[axis] + deep * shift[2]
+            most = factors @ self.middle + np.abs(factors) @ self.half + room + offsets[:, None]
+            # What rounds: every term by its size.
+            sizes = np.abs(across)[:, None] * np.abs(rotation[axis]) + np.abs(deep)[:, None] * np.abs(rotation[2])
+            constant = np.abs(across * shift[axis]) + np.abs(deep * shift[2])
+            terms = sizes @ (np.abs(self.middle) + self.half) + np.abs(room) + constant[:, None]
+            return ~(most < -ROUNDING * terms).any(axis=0)

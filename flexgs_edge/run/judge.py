@@ -86,6 +86,7 @@ class Judge:
         self._kept: dict[tuple[str, int], np.ndarray] = {}
         self._away: dict[tuple[str, int], np.ndarray] = {}
         self._original_error: list[float] = []
+        self._original_ssim: dict[int, float | None] = {}
         self._coverage: list[float] = []
         self._coarse_error: dict[int, float] = {}
         self._known: dict[bytes, Quality] = {}
@@ -112,7 +113,8 @@ class Judge:
         InputError
             When no view sees any Gaussian.
         """
-        self._original_error, self._coverage, self._coarse_error, self._known = [], [], {}, {}
+        self._original_error, self._original_ssim, self._coverage = [], {}, []
+        self._coarse_error, self._known = {}, {}
         cameras = progress.track(self.renderer.in_turn(scene, self.cameras), "drawing the original", len(self.cameras))
         for i, camera in enumerate(cameras):
             # Clamp once, and store channel by channel as renders do: comparisons are then much faster.
@@ -209,13 +211,15 @@ class Judge:
         found: list[ViewQuality] = []
         images = self.bench.images(scene, self.cameras)
         for i, image in enumerate(progress.track(images, "comparing views", len(self.cameras))):
-            error = self._original_error[i] if self.photos is not None else None
+            error, similar = self._original_error[i] if self.photos is not None else None, self._original_ssim.get(i)
             references = self.original(i), self._photo(i)
             if known is not None:
                 found.append(with_flip(known.views[i], image, *references, self._flips))
                 continue
             name, coverage = self.cameras[i].name, self._coverage[i]
-            found.append(compare_view(name, image, *references, error, ssims, lpips, coverage, flips))
+            found.append(compare_view(name, image, *references, error, similar, ssims, lpips, coverage, flips))
+            if ssims:
+                self._original_ssim[i] = found[-1].original_ssim
         made = None if known is None else known.made
         if known is None and self.made is not None:
             made = self.made.quality(scene)
