@@ -70,8 +70,8 @@ class ChunkBounds:
             axis = [0, 0, 0, 1, 1]
             across = np.array([0.0, fx, -fx, fy, -fy])
             deep = np.array([1.0, cx + 1 + pixels, width - cx + pixels, cy + 1 + pixels, height - cy + pixels])
-            room = np.outer([0.0, spread[0], spread[0], spread[1], spread[1]], self.extent)
-            room[0] -= camera[16]
+            room = np.empty((len(axis), len(self.extent)))
+            room[0], room[1:] = -camera[16], np.outer(np.repeat(spread, 2), self.extent)
             # Their values at the middles of the boxes, and how much more at the corner where they are largest.
             factors = across[:, None] * rotation[axis] + deep[:, None] * rotation[2]
             offsets = across * shift[axis] + deep * shift[2]
@@ -80,4 +80,5 @@ class ChunkBounds:
             sizes = np.abs(across)[:, None] * np.abs(rotation[axis]) + np.abs(deep)[:, None] * np.abs(rotation[2])
             constant = np.abs(across * shift[axis]) + np.abs(deep * shift[2])
             terms = sizes @ (np.abs(self.middle) + self.half) + np.abs(room) + constant[:, None]
-            return ~(most < -ROUNDING * terms).any(axis=0)
+            outside: np.ndarray = (most < -ROUNDING * terms).any(axis=0)
+        return ~outside

@@ -13,6 +13,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.generated import between
+from flexgs_edge.cameras.nearness import nearest
 from flexgs_edge.cameras.order import SAME_VIEW, in_picture
 
 LEAST_GAIN = 0.2
@@ -91,23 +92,6 @@ def poses_beside(view: Camera, given: Sequence[Camera]) -> list[Camera]:
         The given poses that are scored.
     """
     return [between(given[place], view) for place in nearest(view, given, BESIDE)]
-
-
-def nearest(camera: Camera, others: Sequence[Camera], count: int) -> list[int]:
-    """Places of at most `count` cameras nearest to one, the nearest first; those that look the other way do not count.
-
-    The squared distance of two cameras is that of their places, in mean squared distances of all from their middle, plus that of
-    their directions.
-    """
-    if not others:
-        return []
-    centres = np.stack([other.center for other in others])
-    ahead = np.stack([other.rotation[2] for other in others])
-    spread = float(np.square(centres - centres.mean(axis=0)).sum(axis=1).mean()) or 1.0
-    turned = np.square(ahead - camera.rotation[2]).sum(axis=1)
-    away = np.square(centres - camera.center).sum(axis=1) / spread + turned
-    order = np.argsort(away.round(2 * GAIN_DIGITS), kind="stable")
-    return [int(place) for place in order if others[place] is not camera and turned[place] < 2.0][:count]
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.cameras.nearness import squared_distances
 from flexgs_edge.cameras.order import in_picture
 from flexgs_edge.quality.psnr import mse
 from flexgs_edge.render.renderer import Renderer
@@ -70,7 +71,8 @@ class KnownErrors:
 
     def nearest(self, cameras: Sequence[Camera]) -> np.ndarray:
         """[n] i64, the place of the view that is nearest to each of n cameras."""
-        return _nearest(self.cameras, cameras)
+        places: np.ndarray = squared_distances(cameras, self.cameras).argmin(axis=1)
+        return places
 
 
 def base_errors(
@@ -155,16 +157,3 @@ def rareness(cameras: Sequence[Camera], points: np.ndarray, near: float) -> np.n
     # A pose that shows none of the points counts as the least of the others.
     shown = found > 0
     return np.where(shown, found, found[shown].min()) if shown.any() else np.ones(len(cameras))
-
-
-def _nearest(known: Sequence[Camera], cameras: Sequence[Camera]) -> np.ndarray:
-    """[n] i64, the nearest known view of each camera: by place, in deviations of the known places, and by direction."""
-    centres = np.stack([camera.center for camera in known])
-    spread = float(np.sqrt(np.square(centres - centres.mean(axis=0)).sum(axis=1).mean())) or 1.0
-
-    def places(views: Sequence[Camera]) -> np.ndarray:
-        return np.stack([np.concatenate([camera.center / spread, camera.rotation[2]]) for camera in views])
-
-    away = np.square(places(cameras)[:, None] - places(known)[None]).sum(axis=2)
-    nearest: np.ndarray = away.argmin(axis=1)
-    return nearest
