@@ -45,6 +45,10 @@ EXTRA_STEPS = 4
 """Most candidates beyond the effort's own, while none holds or the best is far below the target."""
 FLAT = 0.1
 """If two candidates have the most Gaussians allowed, and the log of the loss differs by less, the search ends."""
+SAME_COUNT, HEMMED = 0.01, 0.65
+"""If of two candidates one holds and one misses, and the logs of their counts differ by less than the first, only their grids
+differ. Then chance decides as much as the multiplier does. The search ends once the logs of their sizes differ by less than the
+second, as a share of `Effort.close`: docs/results/tuning.md#hemmed"""
 BROKEN = 2
 """So many candidates in a row that break views ask for more poses: docs/results/tuning.md#needed"""
 LEAD_FROM = 1.0
@@ -200,7 +204,7 @@ class MultiplierSearch(ABC, Generic[Product]):
                 best = (step, product)
             else:
                 self.discard(product)
-            close = best[0].holds and best[0].excess > -self._close(target)
+            close = best[0].holds and (best[0].excess > -self._close(target) or self._hemmed_in(best[0], steps, target))
             enough = best[0].holds and best[0].excess > -self.effort.far and count + 1 >= self.effort.steps
             # A size that is missed can always be met by a larger multiplier.
             in_vain = target.limit_bytes is None and not best[0].holds and self._used_up(steps)
@@ -218,6 +222,15 @@ class MultiplierSearch(ABC, Generic[Product]):
                 f"{last} (--best-effort writes it){obstacle(target, chosen)}"
             )
         return RateResult(product, chosen, chosen.holds, (*steps, *tried))
+
+    def _hemmed_in(self, best: Candidate, steps: Sequence[Candidate], target: Target) -> bool:
+        """Whether a candidate of as many Gaussians misses and is so little smaller that another one is not worth its time."""
+        missed = [
+            step.size
+            for step in steps
+            if not step.holds and step.size < best.size and abs(math.log(step.count / best.count)) < SAME_COUNT
+        ]
+        return bool(missed) and math.log(best.size / max(missed)) < HEMMED * self._close(target)
 
     def _broken(self, steps: Sequence[Candidate], target: Target) -> list[int]:
         """Views that the last candidates broke, if the search asks for poses: each of these broke one, and none so far holds."""

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from flexgs_edge.errors import TargetError
-from flexgs_edge.goals.target import MaxDrop, MaxSize, MinFidelity, Target
-from flexgs_edge.methods.best.candidates import Candidate
+from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, MinFidelity, Target
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.kept import Refitted
 from flexgs_edge.methods.best.multiplier import EXTRA_STEPS
 from known_search import AT, BYTES, EFFORT, UNIT, FakeRounds, KnownSearch, World, best_of, powers, search
@@ -52,12 +53,34 @@ def test_a_rough_world_gives_the_best_point_that_was_seen(pace: float, wiggle: f
 
 def test_steps_are_not_asked_twice() -> None:
     world = World(lambda m: 0.5 if m < AT else 2.0, lambda m: BYTES * (m / AT) ** -0.45)  # a cliff: nothing is close
-    found = search(world, MaxDrop(1.0))
+    found = search(world, MaxDrop(1.0), effort=replace(EFFORT, close=0.0))
     asked = EFFORT.steps + EXTRA_STEPS
     multipliers, landed = ([step.multiplier for step in part] for part in (found.steps[:asked], found.steps[asked:]))
     assert found.reached and len(set(multipliers)) == len(multipliers) == asked
     assert set(landed) == {found.chosen.multiplier}
     assert found.chosen.multiplier == pytest.approx(AT, rel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "asked"),
+    [(100, 97, 2), (100, 90, 3), (98, 97, 3)],
+    ids=["hemmed in", "sizes apart", "other rows"],
+)
+def test_only_grids_differ_and_sizes_are_close(count: int, size: int, asked: int) -> None:
+    """A miss, then one that holds by far: whether a third candidate is made."""
+    world, script = powers(), [(0.02, size, count), (-0.3, 100, 100), (-0.01, 95, 100)]
+
+    class Scripted(KnownSearch):
+        def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, GridScene]:
+            excess, bytes_, rows = script.pop(0)
+            _, grid = super()._whole(multiplier, target)
+            return Candidate(multiplier, rows, 0, bytes_, Measurement(1.0, 30.0, 1.0), excess, 0.0), grid
+
+        def _landed_on_quality(self, found: RateResult[GridScene], target: Target) -> RateResult[GridScene]:
+            return found
+
+    found = search(world, MaxDrop(1.0), kind=Scripted, effort=replace(EFFORT, steps=2, close=0.09))
+    assert len(found.steps) == asked and found.reached
 
 
 def test_out_of_reach_names_the_closest_point() -> None:
