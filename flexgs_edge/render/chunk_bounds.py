@@ -76,7 +76,7 @@ class ChunkBounds:
             factors = across[:, None] * rotation[axis] + deep[:, None] * rotation[2]
             offsets = across * shift[axis] + deep * shift[2]
             most = factors @ self.middle + np.abs(factors) @ self.half + room + offsets[:, None]
-            # What rounds: every term by its size.
+            # The sizes of all terms bound how much is rounded.
             sizes = np.abs(across)[:, None] * np.abs(rotation[axis]) + np.abs(deep)[:, None] * np.abs(rotation[2])
             constant = np.abs(across * shift[axis]) + np.abs(deep * shift[2])
             terms = sizes @ (np.abs(self.middle) + self.half) + np.abs(room) + constant[:, None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -88,6 +89,21 @@ def test_a_view_with_a_photo() -> None:
     assert view.flip_original == float(image[1, 0, 0] - original[1, 0, 0])
     assert view.flip_photo == float(image[1, 0, 0] - photo[1, 0, 0])
     assert view.original_flip == float(original[1, 0, 0] - photo[1, 0, 0])
+
+
+def test_a_known_ssim_of_the_original_is_not_measured_again() -> None:
+    original, image = images(3, 20, 20)
+    photo, asked = np.clip(original + 0.1, 0, 1), []
+
+    def ssims(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
+        asked.extend(pairs)
+        return [0.25] * len(pairs)
+
+    view = view_quality.compare_view("v", image, original, photo, original_ssim=0.75, ssims=ssims)
+    assert (view.ssim_original, view.ssim_photo, view.original_ssim) == (0.25, 0.25, 0.75)
+    assert [(a is image, b is original, b is photo) for a, b in asked] == [(True, True, False), (True, False, True)]
+    # Without a measure of its own, a view has no SSIM at all.
+    assert view_quality.compare_view("v", image, original, photo, original_ssim=0.75).original_ssim is None
 
 
 def test_a_view_without_a_photo_has_no_drop() -> None:
