@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
@@ -33,6 +35,8 @@ COMMANDS = {
     "devices": "List the OpenCL devices, and say which one is used.",
 }
 """Subcommands and the first sentence of their help. They are repeated here so that `--help` imports no subcommand."""
+AGAIN = 1.0
+"""`timeout` sends its signal twice: to the program, and to its process group."""
 
 
 @click.group(
@@ -73,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and exit with its code. Only this function turns errors into messages."""
     state = State()
     with suppress(ValueError):  # raised outside the main thread, whose owner handles signals
-        signal.signal(signal.SIGTERM, _on_terminate)
+        _exit_on(signal.SIGTERM)
     try:
         code = command.main(
             args=None if argv is None else list(argv), prog_name="flexgs-edge", standalone_mode=False, obj=state
@@ -85,9 +89,20 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _on_terminate(number: int, frame: object) -> NoReturn:
-    """Stop as Ctrl-C does, so that no partly written file is left behind."""
-    raise SystemExit(128 + number)
+def _exit_on(number: int) -> None:
+    """End at this signal as at Ctrl-C, so that no partly written file is left behind.
+
+    The same signal again, within `AGAIN` seconds, would break the cleaning up.
+    """
+    heard = -math.inf
+
+    def end(number: int, frame: object) -> None:
+        nonlocal heard
+        if time.monotonic() - heard >= AGAIN:
+            heard = time.monotonic()
+            raise SystemExit(128 + number)
+
+    signal.signal(number, end)
 
 
 def _exit_code(error: BaseException) -> int:

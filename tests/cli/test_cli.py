@@ -338,6 +338,24 @@ def test_ctrl_c_leaves_nothing_behind(sample_dir: Path, tmp_path: Path) -> None:
     assert "interrupted" in rest and "Traceback" not in rest and list(tmp_path.iterdir()) == [poses]
 
 
+def test_a_signal_that_comes_twice_breaks_no_cleaning_up(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`timeout` sends SIGTERM to the program and to its group."""
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        assert run("devices", capsys=capsys)[0] in (0, 4)
+        with pytest.raises(SystemExit) as ended:
+            signal.raise_signal(signal.SIGTERM)
+        assert ended.value.code == 128 + signal.SIGTERM
+        signal.raise_signal(signal.SIGTERM)
+        monkeypatch.setattr(app, "AGAIN", 0.0)
+        with pytest.raises(SystemExit):
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def test_devices_lists_and_explains(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, err = run("devices", "--json", "-", capsys=capsys)
     record = json.loads(out)
