@@ -13,7 +13,7 @@ from flexgs_edge.goals.promise import MeanSsim, Promised, WorstView
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.methods.best import descents, grid_search
+from flexgs_edge.methods.best import descents, grid_results, grid_search
 from flexgs_edge.methods.best.candidates import Candidate
 from flexgs_edge.methods.best.descents import (
     BEHIND_LONG,
@@ -251,7 +251,7 @@ def between(
             by_size = target.limit_bytes is not None
             return 0.0 if by_size else math.exp(self._guess(self.rounds.snapshots[-1].planes, target))
 
-    monkeypatch.setattr(grid_search, "distil", moved)
+    monkeypatch.setattr(grid_results, "distil", moved)
     Mending.calls = calls = []
     effort = replace(EFFORT, interleaved=most)
     result = search(world, target, FakeRounds(), kind=Watched, refit=True, steps=100, effort=effort)

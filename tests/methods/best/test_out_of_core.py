@@ -24,7 +24,7 @@ from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.storage import ScratchStorage
-from flexgs_edge.methods.best import grid_search
+from flexgs_edge.methods.best import grid_results
 from flexgs_edge.methods.best import method as best_method
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.descents import INTERLEAVED_SHARE, PILOT
@@ -346,7 +346,7 @@ def test_descents_between_the_rounds_are_not_done_again(
     compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
     words = {**words, "resume": True, "scratch": str(tmp_path)}
     moved: list[int] = []
-    whole, descend = GridSearch._whole, grid_search.distil
+    whole, descend = GridSearch._whole, grid_results.distil
 
     def distil(planes: Any, degrees: Any, original: Original, schedule: Schedule, *more: Any, **words: Any) -> Any:
         moved.append(schedule.iterations)
@@ -355,7 +355,7 @@ def test_descents_between_the_rounds_are_not_done_again(
     def stop(*_: Any) -> Any:
         raise Stop
 
-    monkeypatch.setattr(grid_search, "distil", distil)
+    monkeypatch.setattr(grid_results, "distil", distil)
     monkeypatch.setattr(GridSearch, "_whole", stop)
     with pytest.raises(Stop):
         compress(project / "point_cloud.ply", tmp_path / "b.fgs", **words)
