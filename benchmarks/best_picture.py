@@ -61,8 +61,8 @@ def draw_bytes(axes: Axes, search: dict[str, Any], contents: dict[str, Any]) -> 
     axes.barh(range(len(stages)), [size / 1e6 for _, size in stages], color=colours, height=0.45)
     for place, (words, size) in enumerate(stages):
         shown = f"{size / 1e6:.2f} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"
-        axes.text(0.055, place - 0.33, f"{words}: {shown}", color=INK, va="bottom")
-    axes.set(xscale="log", xlim=(0.05, 12), ylim=(len(stages) - 0.5, -0.8), yticks=[], xlabel="MB")
+        axes.text(0.011, place - 0.33, f"{words}: {shown}", color=INK, va="bottom")
+    axes.set(xscale="log", xlim=(0.01, 12), ylim=(len(stages) - 0.5, -0.8), yticks=[], xlabel="MB")
     axes.set_title("What stays (balanced)", loc="left")
 
 
@@ -81,7 +81,7 @@ def draw_search(axes: Axes, searches: dict[str, dict[str, Any]]) -> None:
     axes.text(axes.get_xlim()[1], 1.01, "target: 1 dB", color="#D55E00", ha="right", va="bottom")
     axes.set(xlabel="kB", ylabel="drop against the photos, dB")
     axes.set_title("Candidates (filled: within the target; ringed: the answer)", loc="left")
-    axes.legend(loc="upper right")
+    axes.legend(loc="lower left")
 
 
 def main() -> None:
