@@ -76,6 +76,10 @@ class GridResults(MultiplierSearch[GridScene]):
         self.size_of, self.refit, self.steps, self.first = size_of, refit, steps, first
         if steps:
             self.pruned_part, self.keeps_best = descents.PRUNED_DISTILLED, True
+        self._forget()
+
+    def _forget(self) -> None:
+        """Begin as if no candidate had been made."""
         self._slopes: Slopes | None = None
         self._refitted: Refitted | None = None
         self._looking: Original | None = None  # candidates change how often descents look at its poses

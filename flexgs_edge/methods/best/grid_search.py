@@ -21,11 +21,9 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import values_of
 from flexgs_edge.methods.best import descents
 from flexgs_edge.methods.best.candidates import LARGEST_STRIDE, SIZE_SLOPE, SLOPE, Candidate, RateResult, bounds, misses
-from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.grid_results import GridResults
 from flexgs_edge.methods.best.landing import NEAR_QUALITY, land_on_quality
-from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART, Measure
-from flexgs_edge.methods.best.rounds import PruneRounds
+from flexgs_edge.methods.best.multiplier import LOG, PRUNED_PART
 
 FURTHER = 0.92
 """Loss after a further round of the colour refit, divided by the loss before it: docs/results/tuning.md#further"""
@@ -57,21 +55,11 @@ class GridSearch(GridResults):
     Parameters are those of `GridResults`.
     """
 
-    def __init__(
-        self,
-        rounds: PruneRounds,
-        size_of: Callable[[GridScene], int],
-        measure: Measure,
-        effort: Effort,
-        refit: bool = True,
-        on_step: Callable[[Candidate], None] | None = None,
-        steps: int = 0,
-        first: float = 0.0,
-    ) -> None:
-        super().__init__(rounds, size_of, measure, effort, refit, on_step, steps, first)
+    def _forget(self) -> None:
+        super()._forget()
         # Without a refit of SH, a candidate takes nothing over from the one before. Descents begin anew as well.
-        self._drift, self._expected = DRIFT if effort.refit_rounds and not steps else 0.0, 0.0
-        self._interleaved, self._left = effort.interleaved if steps else 0, 0.0
+        self._drift, self._expected = DRIFT if self.effort.refit_rounds and not self.steps else 0.0, 0.0
+        self._interleaved, self._left = self.effort.interleaved if self.steps else 0, 0.0
 
     def run(self, target: Target, best_effort: bool = False) -> RateResult[GridScene]:
         """As `MultiplierSearch.run`, and then `land_on_quality` if a quality is asked for."""
