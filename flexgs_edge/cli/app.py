@@ -35,7 +35,7 @@ COMMANDS = {
     "devices": "List the OpenCL devices, and say which one is used.",
 }
 """Subcommands and the first sentence of their help. They are repeated here so that `--help` imports no subcommand."""
-AGAIN = 1.0
+REPEAT_SECONDS = 1.0
 """`timeout` sends its signal twice: to the program, and to its process group."""
 
 
@@ -92,13 +92,13 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
 def _exit_on(number: int) -> None:
     """End at this signal as at Ctrl-C, so that no partly written file is left behind.
 
-    The same signal again, within `AGAIN` seconds, would break the cleaning up.
+    The same signal again, within `REPEAT_SECONDS`, would break the cleaning up.
     """
     heard = -math.inf
 
     def end(number: int, frame: object) -> None:
         nonlocal heard
-        if time.monotonic() - heard >= AGAIN:
+        if time.monotonic() - heard >= REPEAT_SECONDS:
             heard = time.monotonic()
             raise SystemExit(128 + number)
 

@@ -349,7 +349,7 @@ def test_a_signal_that_comes_twice_breaks_no_cleaning_up(
             signal.raise_signal(signal.SIGTERM)
         assert ended.value.code == 128 + signal.SIGTERM
         signal.raise_signal(signal.SIGTERM)
-        monkeypatch.setattr(app, "AGAIN", 0.0)
+        monkeypatch.setattr(app, "REPEAT_SECONDS", 0.0)
         with pytest.raises(SystemExit):
             signal.raise_signal(signal.SIGTERM)
     finally:

@@ -82,9 +82,8 @@ class GridSearch(GridResults):
         if found.reached:
             return found
         LOG.info("no descent reaches the target: colours are refitted instead")
-        self._interleaved, self._begin, self._left = 0, 0, 0.0
-        self.steps, self.pruned_part, self.keeps_best = 0, PRUNED_PART, False
-        self._refitted, self._slopes, self._drift = None, None, DRIFT if self.effort.refit_rounds else 0.0
+        self.steps, self.pruned_part, self.keeps_best, self._begin = 0, PRUNED_PART, False, 0
+        self._forget()
         return self._also(found, super().run(target, best_effort), target)
 
     @staticmethod
