@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -60,12 +61,14 @@ class Camera:
             array.flags.writeable = False
             object.__setattr__(self, field, array)
 
-    @property
+    @cached_property
     def center(self) -> np.ndarray:
         """[3] f64, the camera's place in the world."""
         # Not by the transpose: files keep rotations to six digits, which 1e6 units from the origin is an error of a
         # unit.
-        return product(inverse(self.rotation), -self.translation)
+        place = product(inverse(self.rotation), -self.translation)
+        place.flags.writeable = False
+        return place
 
     def scaled(self, width: int, height: int) -> Camera:
         """The same view at another size in pixels."""
