@@ -125,12 +125,19 @@ def _along_curve(
     return storage.take(codes, order), order
 
 
-def recolour(grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray, storage: Storage = IN_MEMORY) -> GridScene:
-    """Replace the colours of a scene: [3, n] and [3 * K, n] f32 in the grid's row order, on the same steps."""
+def recolour(
+    grid: GridScene, sh_dc: np.ndarray, sh_rest: np.ndarray | None = None, storage: Storage = IN_MEMORY
+) -> GridScene:
+    """Replace the colours of a scene: [3, n] and [3 * K, n] f32 in the grid's row order, on the same steps.
+
+    Without `sh_rest`, the codes above degree 0 stay.
+    """
     dc = storage.empty((3, grid.count), np.int32)
     for part in blocks(grid.count):
         rows, some = np.arange(part.start, part.stop), read_rows(sh_dc, part)[:, None]
         put_rows(dc, part, _colour_codes("sh_dc", some, grid.step_sizes.colour(grid.step_sizes.dc), rows)[:, 0])
+    if sh_rest is None:
+        return replace(grid, dc=dc)
     degrees = range(1, grid.sh_degree + 1)
     colours = OrderedPlanes({"sh_rest": sh_rest}, None, storage)
     bands = tuple(

@@ -62,11 +62,12 @@ def refit_colours(
     Returns
     -------
     dict
-        The planes, with new `sh_dc` and `sh_rest`.
+        The planes, with new arrays of what has moved.
     """
     bench, cameras = original.bench, original.cameras
     renderer, storage = bench.renderer, bench.renderer.storage
-    planes = {**planes, "sh_dc": storage.copy(planes["sh_dc"]), "sh_rest": storage.copy(planes["sh_rest"])}
+    fields = ("sh_dc", "sh_rest") if bands else ("sh_dc",)
+    planes = {**planes, **{name: storage.copy(planes[name]) for name in fields}}
     thinned = max(len(cameras) // ROUND_VIEWS, 1)
     parts = []
     for turn in range(rounds):
@@ -74,10 +75,10 @@ def refit_colours(
         steps = max(min(subsets, len(seen)), 1)
         parts += [seen[first::steps] for first in range(steps)]
     source = MemorySource(planes, origin=original.origin)
-    sum_bytes_a_row = sum_bytes(4) + normal_bytes(source.sh_degree)
+    sum_bytes_a_row = sum_bytes(4) + normal_bytes(source.sh_degree if bands else 0)
     with renderer.load(source, sum_bytes_a_row, references=True, view_sums=4) as scene:
         for part in original.progress.track(parts, "refitting colours", len(parts)):
-            normal = ViewSums(bench, scene, [normal_sums(renderer)])
+            normal = ViewSums(bench, scene, [normal_sums(renderer, bands)])
             try:
                 for camera, view in zip(renderer.in_turn(scene, [cameras[view] for view in part]), part, strict=True):
                     normal.add_view(renderer.residual_sums(scene, camera, original.references[view]), camera)
@@ -85,7 +86,7 @@ def refit_colours(
                     step_colours(planes, degrees, rows, sums.values(), bands)
             finally:
                 normal.release()
-            scene.refresh("sh_dc", "sh_rest")
+            scene.refresh(*fields)
     return planes
 
 
@@ -94,27 +95,27 @@ def normal_bytes(sh_degree: int) -> int:
     return 16 * (sh_degree + 1) ** 2
 
 
-def normal_sums(renderer: Renderer) -> Maker:
-    """Maker of the sums over views for a step of the refit: back-projected residuals and weights, for every basis function.
+def normal_sums(renderer: Renderer, bands: bool = True) -> Maker:
+    """Maker of the sums over views for a step of the refit: back-projected residuals and weights.
 
-    Residual sums come first among a view's.
+    They are made for every basis function, or without `bands` for the constant alone. Residual sums come first among a view's.
     """
-    return partial(_ChunkNormal, renderer)
+    return partial(_ChunkNormal, renderer, bands)
 
 
 class _ChunkNormal:
     """The sums of `normal_sums` for one chunk."""
 
-    def __init__(self, renderer: Renderer, chunk: Chunk) -> None:
-        self._renderer, self._count = renderer, chunk.count
-        groups, functions = -(-chunk.stride // SUM_LANES), (chunk.degree + 1) ** 2
+    def __init__(self, renderer: Renderer, bands: bool, chunk: Chunk) -> None:
+        self._renderer, self._count, self._degree = renderer, chunk.count, chunk.degree if bands else 0
+        groups, functions = -(-chunk.stride // SUM_LANES), (self._degree + 1) ** 2
         self._array = renderer.backend.array((groups, functions, 4, SUM_LANES), np.float32)
         renderer.backend.fill(self._array, 0)
 
     def add(self, chunk: Chunk, sums: Any, part: ViewPart) -> None:
         renderer = self._renderer
         renderer.backend.launch(
-            "sh_residual", (padded(part.count),), part.count, chunk.stride, part.base, part.first, chunk.degree,
+            "sh_residual", (padded(part.count),), part.count, chunk.stride, part.base, part.first, self._degree,
             sums.shape[1], part.blocks, renderer.camera_array, chunk.means, sums, self._array,
         )  # fmt: skip
 
@@ -145,7 +146,7 @@ def step_colours(
     rows : slice
         The rows to change.
     normal : np.ndarray
-        [K + 1, 4, rows] f32, their sums (`normal_sums`).
+        [K + 1, 4, rows] f32, their sums (`normal_sums`). Without `bands` those of the constant are enough.
     bands : bool
         Change the SH above degree 0 too.
     """
