@@ -18,7 +18,8 @@ from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.grid_search import GridSearch
-from flexgs_edge.methods.best.rounds import Snapshot, take_rows
+from flexgs_edge.methods.best.rounds import take_rows
+from flexgs_edge.methods.best.snapshot import Snapshot
 from flexgs_edge.scene.fields import FIELD
 from synthetic import random_scene
 
@@ -56,6 +57,9 @@ class FakeRounds:
         costs = RemovalCosts(c.removal[keep], c.weight2[keep], c.sh[:, keep], c.sh_mean[:, :, keep])
         self.snapshots.append(Snapshot(last.rows[keep], take_rows(last.planes, keep), costs))
         return self.snapshots[-1]
+
+    def let_go(self) -> None:
+        """All lies in memory."""
 
     def renew(self, change: Callable[[], tuple[np.ndarray, dict[str, np.ndarray]]]) -> None:
         rows, planes = change()

@@ -28,7 +28,8 @@ from flexgs_edge.methods.best.layers import first_layer
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import LAST, Schedule, distil, structure_of
-from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
+from flexgs_edge.methods.best.rounds import PruneRounds
+from flexgs_edge.methods.best.snapshot import Snapshot
 from flexgs_edge.methods.best.view_weights import looking_more
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.source import MemorySource, Planes
@@ -141,6 +142,8 @@ class GridResults(MultiplierSearch[GridScene]):
         fine = replace(step_sizes, dc=step_sizes.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in step_sizes.sh))
         fine = holdable(fine, planes)
         grid, order = self._to_grid(planes, kept.degrees, fine, storage)
+        # Copies go as soon as they can: a large scene has no room for all of them.
+        kept.planes = planes = {}
         degrees = kept.degrees[order]
         moved = values_of(grid, storage)
         if self.refit:
@@ -148,8 +151,11 @@ class GridResults(MultiplierSearch[GridScene]):
                 moved = self._refit_colours(moved, degrees, self.effort.refit_rounds)
                 self._refitted = Refitted.of(kept.rows, kept.degrees, order, moved, storage)
             grid = replace(grid, step_sizes=replace(grid.step_sizes, sh=step_sizes.sh[: grid.sh_degree]))
-            coarse = values_of(recolour(grid, moved["sh_dc"], moved["sh_rest"], storage), storage)
-            moved = self._refit_colours(coarse, degrees, 1, bands=False)
+            grid = recolour(grid, moved["sh_dc"], moved["sh_rest"], storage)
+            del moved
+            moved = self._refit_colours(values_of(grid, storage), degrees, 1, bands=False)
+            final = replace(grid.step_sizes, dc=step_sizes.dc)
+            return recolour(replace(grid, step_sizes=final), moved["sh_dc"], storage=storage)
         final = replace(grid.step_sizes, dc=step_sizes.dc, sh=step_sizes.sh[: grid.sh_degree])
         return recolour(replace(grid, step_sizes=final), moved["sh_dc"], moved["sh_rest"], storage)
 
@@ -157,7 +163,7 @@ class GridResults(MultiplierSearch[GridScene]):
         """The grid with its constant colours refitted once."""
         storage = self.rounds.storage
         moved = self._refit_colours(values_of(grid, storage), grid.sh_degrees, 1, bands=False)
-        return recolour(grid, moved["sh_dc"], moved["sh_rest"], storage)
+        return recolour(grid, moved["sh_dc"], storage=storage)
 
     def _landed(self, grid: GridScene, size: int, limit: int) -> tuple[GridScene, int]:
         """`land`, and then the constant colours, which had been fitted to what is gone, once more."""

@@ -46,9 +46,7 @@ from flexgs_edge.run.made import Made
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings, settings_room
-from flexgs_edge.scene.check import alive, invisible
-from flexgs_edge.scene.curve import near_rows
-from flexgs_edge.scene.source import MemorySource, read_all
+from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_size
 from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.original import Original
@@ -303,26 +301,18 @@ def open_rounds(
     budget.require("a search by measured costs", size + least)
     budget.take("the scene and its search", size)
     try:
-        planes = read_all(source, storage)
         with References(storage.folder) as references:
             with run.clock.stage("search"):
-                rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
-                if not len(rows):
-                    raise invisible(source)
-                # Neighbours in space become neighbours in memory, so views are drawn faster.
-                rows = storage.take(rows, near_rows(storage.take(planes["means"], rows), storage))
                 between = poses_between(scored) if steps else ()
                 poses = [*scored, *between]
                 turns, nearest = (known.slopes(poses), known.nearest(poses)) if known and steps else (None, None)
                 rounds = make(
                     Original(bench, source.origin, scored, references, between, run.progress, steps, turns, nearest),
-                    planes,
-                    rows,
+                    source,
                     refit=options.refit,
                     unseen=options.unseen_share,
                     **({} if checkpoint is None else {"checkpoint": checkpoint}),
                 )
-            del planes  # the rounds have copies of their own
             yield rounds
     finally:
         budget.give(size)

@@ -25,7 +25,8 @@ from flexgs_edge.methods.best.candidates import Candidate, Product, RateResult, 
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.kept import Kept
-from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
+from flexgs_edge.methods.best.rounds import PruneRounds
+from flexgs_edge.methods.best.snapshot import Snapshot
 
 LOG = logging.getLogger("flexgs_edge")
 

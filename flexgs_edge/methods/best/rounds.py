@@ -7,7 +7,7 @@ the original's renders. Searches start from the snapshots that the rounds leave 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -25,10 +25,13 @@ from flexgs_edge.methods.best.costs import (
 )
 from flexgs_edge.methods.best.effort import LEAST_VIEWS
 from flexgs_edge.methods.best.refit.colour import normal_bytes, normal_sums, step_colours
+from flexgs_edge.methods.best.snapshot import Snapshot
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import sum_bytes
+from flexgs_edge.scene.check import alive, invisible
+from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.sums import ViewSums
 
@@ -36,6 +39,8 @@ PARTS = 2
 """Each pruning round measures one of this many interleaved sets of cameras and reuses the sums of the others. One set
 is slower, four make files larger: docs/results/tuning.md#parts"""
 MOST_PARTS = 4
+HELD = 2
+"""So many of the last snapshots never let their planes go."""
 PART_VIEWS = 48
 """Many cameras make up to `MOST_PARTS` sets, if each has this many: docs/results/tuning.md#part_views"""
 
@@ -45,50 +50,10 @@ def parts_of(views: int) -> int:
     return max(min(PARTS, views // LEAST_VIEWS), min(MOST_PARTS, views // PART_VIEWS), 1)
 
 
-@dataclass
-class Snapshot:
-    """The Gaussians that are kept after a round, with refitted colours and measured costs.
-
-    Attributes
-    ----------
-    rows : np.ndarray
-        [n] i64, places in the rows that the rounds began with (`PruneRounds.rows`), ascending.
-    planes : dict
-        Stored planes of these rows ([width, n] f32 by field).
-    costs : RemovalCosts
-        Costs of these rows.
-    """
-
-    rows: np.ndarray
-    planes: dict[str, np.ndarray]
-    costs: RemovalCosts
-
-    @property
-    def count(self) -> int:
-        """Gaussians kept."""
-        return len(self.rows)
-
-    def cheapest(self, count: int) -> np.ndarray:
-        """[n] bool: False for the `count` rows that are cheapest to remove. Rows that no pose sees stay; ties go by row."""
-        seen = self.costs.weight2 > 0
-        return ~lowest(np.where(seen, self.costs.removal, np.inf), min(count, int(np.count_nonzero(seen))))
-
-
-def lowest(values: np.ndarray, count: int) -> np.ndarray:
-    """[n] bool: True for the `count` smallest of `values` (all, if there are no more). Of equal values the first ones count."""
-    if count >= len(values):
-        return np.ones(len(values), bool)
-    if count <= 0:
-        return np.zeros(len(values), bool)
-    edge = np.partition(values, count - 1)[count - 1]
-    chosen: np.ndarray = values < edge
-    chosen[np.flatnonzero(values == edge)[: count - int(np.count_nonzero(chosen))]] = True
-    return chosen
-
-
 class PruneRounds:
     """Prunes the whole scene round by round; `snapshots` keeps the result of each round, the smallest set last.
 
+    Where arrays lie in files, snapshots that a search hardly needs again let their planes go: docs/results/tuning.md#let_go
     The attribute `unseen` counts the rows that no scored pose sees.
 
     Parameters
@@ -96,10 +61,8 @@ class PruneRounds:
     original : Original
         Scored poses and those between them. If colours are refitted, the original's renders are put into its references,
         which are empty at first.
-    planes : dict
-        Stored planes of the whole scene ([width, N] f32 by field).
-    rows : np.ndarray
-        [n] i64, rows of the scene to start from, without dead splats. The rounds keep their order.
+    source : SceneSource
+        The whole scene. Neighbours in space become neighbours in memory, so that views are drawn faster.
     refit : bool
         Refit colours in each round (default).
     unseen : float
@@ -107,34 +70,58 @@ class PruneRounds:
         stay first.
     checkpoint : Checkpoint, optional
         Keeps every round. Rounds that it holds already are read instead of computed.
+
+    Attributes
+    ----------
+    rows : np.ndarray
+        [n] i64, rows of the scene that the rounds begin with, without dead splats, in the order of the planes.
+    snapshots : list of Snapshot
+        The results.
+    unseen : int
+        How many rows no scored pose sees.
+
+    Raises
+    ------
+    InputError
+        If nothing is left of the scene.
     """
 
     def __init__(
         self,
         original: Original,
-        planes: dict[str, np.ndarray],
-        rows: np.ndarray,
+        source: SceneSource,
         refit: bool = True,
         unseen: float = 1.0,
         checkpoint: Checkpoint | None = None,
     ) -> None:
-        self.original, self.rows, self.refit, self.checkpoint = original, rows, refit, checkpoint
+        self.original, self.refit, self.checkpoint, self._source = original, refit, checkpoint, source
         self.storage = original.bench.renderer.storage
+        self.rows, start = self._read()
         cameras = original.cameras
         count = parts_of(len(cameras))
         self._views = [range(first, len(cameras), count) for first in range(count)]
         self._parts: list[CostParts] = []
         self.snapshots: list[Snapshot] = []
+        self._renewed: set[int] = set()
+        """Snapshots that a descent has made."""
         if not self._resumed():
-            self._begin(planes, unseen)
+            self._begin(start, unseen)
         first = self.snapshots[0]
         # Rows that the first snapshot lacks were seen by no pose.
-        self.unseen = len(rows) - int(np.count_nonzero(first.costs.weight2 > 0))
+        self.unseen = len(self.rows) - int(np.count_nonzero(first.costs.weight2 > 0))
 
-    def _begin(self, planes: dict[str, np.ndarray], unseen: float) -> None:
+    def _read(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Read the scene: rows that are alive, in near order, and their planes."""
+        planes, storage = read_all(self._source, self.storage), self.storage
+        rows = np.flatnonzero(alive(planes["opacity_logits"][0]))
+        if not len(rows):
+            raise invisible(self._source)
+        rows = storage.take(rows, near_rows(storage.take(planes["means"], rows), storage))
+        return rows, take_rows(planes, rows, storage)
+
+    def _begin(self, start: dict[str, np.ndarray], unseen: float) -> None:
         """Measure costs on the whole scene, and draw the references."""
         original, renderer, storage = self.original, self.original.bench.renderer, self.storage
-        start = take_rows(planes, self.rows, storage)
         source = MemorySource(start, origin=original.origin)
         sum_bytes_a_row = sum_bytes(2) + cost_bytes(source.sh_degree)
         with renderer.load(source, sum_bytes_a_row, view_sums=2) as scene:
@@ -171,16 +158,37 @@ class PruneRounds:
         last = self.snapshots[-1]
         keep = np.flatnonzero(last.cheapest(last.count - max(round(last.count * share), 1)))
         planes = take_rows(last.planes, keep, self.storage)
-        source = MemorySource(planes, origin=self.original.origin)
-        with self.original.bench.renderer.load(source, sum_row_bytes(source.sh_degree), references=self.refit) as scene:
-            turn = (len(self.snapshots) - 1) % len(self._parts)
-            views = self._views[turn]
-            measured = self._measure_and_refit(scene, planes, views) if self.refit else self._measure(scene, views)
-        self._parts = [
-            measured if part == turn else sums.take(keep, self.storage) for part, sums in enumerate(self._parts)
-        ]
+        turn = self._turn(len(self.snapshots))
+        others = {part: sums.take(keep, self.storage) for part, sums in enumerate(self._parts) if part != turn}
+        # What takes most room is not held while we measure. The whole scene can be read again.
+        self._parts = []
+        self.let_go(HELD - 1 if len(self.snapshots) > 1 else 0)
+        measured = self._round(planes, turn)
+        self._parts = [others.get(part, measured) for part in range(len(self._views))]
         costs = RemovalCosts.of(self._parts, self.storage)
         return self._add(Snapshot(self.storage.take(last.rows, keep), planes, costs))
+
+    def _turn(self, number: int) -> int:
+        """The part of the poses that the round for a snapshot looks at."""
+        return (number - 1) % len(self._views)
+
+    def _round(self, planes: dict[str, np.ndarray], turn: int) -> CostParts:
+        """Measure costs over a part of the poses, and refit the colours of `planes`, in place, by one step."""
+        source = MemorySource(planes, origin=self.original.origin)
+        with self.original.bench.renderer.load(source, sum_row_bytes(source.sh_degree), references=self.refit) as scene:
+            views = self._views[turn]
+            return self._measure_and_refit(scene, planes, views) if self.refit else self._measure(scene, views)
+
+    def _again(self, number: int) -> dict[str, np.ndarray]:
+        """The planes of a snapshot that let them go, by the same rounds from the last one before it that holds its own."""
+        held = max((before for before in range(number) if self.snapshots[before].held), default=0)
+        first = self.snapshots[held]
+        planes = first.planes if first.held else take_rows(self._read()[1], first.rows, self.storage)
+        for later in range(held + 1, number + 1):
+            rows = np.searchsorted(self.snapshots[later - 1].rows, self.snapshots[later].rows)
+            planes = take_rows(planes, rows, self.storage)
+            self._round(planes, self._turn(later))
+        return planes
 
     def renew(self, change: Callable[[], tuple[np.ndarray, dict[str, np.ndarray]]]) -> Snapshot:
         """Append rows and planes that a descent has moved, with costs measured anew over all poses.
@@ -190,6 +198,7 @@ class PruneRounds:
         change : callable
             Makes the rows ([n] i64, places in `rows`, ascending) and their planes. It is not called if a checkpoint has them.
         """
+        self._renewed.add(len(self.snapshots))
         if self._resumed():
             return self.snapshots[-1]
         rows, planes = change()
@@ -201,7 +210,7 @@ class PruneRounds:
 
     def _add(self, snapshot: Snapshot, keep_views: bool = False) -> Snapshot:
         """Append a snapshot, and save it if there is a checkpoint."""
-        self.snapshots.append(snapshot)
+        self._hold(snapshot)
         if self.checkpoint is not None:
             arrays = [("rows", snapshot.rows), *((f"plane-{name}", values) for name, values in snapshot.planes.items())]
             for number, part in enumerate(self._parts):
@@ -210,6 +219,18 @@ class PruneRounds:
                 arrays += [(f"view-{view}", self.original.references[view]) for view in range(len(self.original.poses))]
             self.checkpoint.save(len(self.snapshots) - 1, arrays)
         return snapshot
+
+    def _hold(self, snapshot: Snapshot) -> None:
+        """Append a snapshot, and let earlier ones go."""
+        self.snapshots.append(snapshot)
+        self.let_go(HELD)
+
+    def let_go(self, held: int = 0) -> None:
+        """Free the planes of all snapshots but the last `held`, and those of descents, where arrays lie in files."""
+        if self.storage.spills:
+            for number in range(len(self.snapshots) - held):
+                if number not in self._renewed:
+                    self.snapshots[number].let_go(partial(self._again, number))
 
     def _resumed(self) -> bool:
         """Read the next snapshot from the checkpoint of an earlier run; False if it holds none."""
@@ -221,7 +242,7 @@ class PruneRounds:
         self._parts = [
             CostParts(*(arrays[f"part-{part}-{name}"] for name in PART_NAMES)) for part in range(len(self._views))
         ]
-        self.snapshots.append(Snapshot(arrays["rows"], planes, RemovalCosts.of(self._parts, self.storage)))
+        self._hold(Snapshot(arrays["rows"], planes, RemovalCosts.of(self._parts, self.storage)))
         if number == 0 and self.refit:
             for view in range(len(self.original.poses)):
                 self.original.references.add(view, arrays[f"view-{view}"])

@@ -12,7 +12,8 @@ import numpy as np
 from flexgs_edge.methods.best.allocation import REMOVAL_FACTOR, SH_FACTOR, BitModel
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.grid_search import GridSearch
-from flexgs_edge.methods.best.rounds import PruneRounds, Snapshot
+from flexgs_edge.methods.best.rounds import PruneRounds
+from flexgs_edge.methods.best.snapshot import Snapshot
 from flexgs_edge.methods.paper.prune import ranks_from_order
 from flexgs_edge.studies.rate.descent_parts import DESCENT_PARTS
 
