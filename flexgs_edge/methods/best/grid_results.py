@@ -131,9 +131,14 @@ class GridResults(MultiplierSearch[GridScene]):
         return candidate, grid
 
     def _distilled(self, kept: Kept, step_sizes: StepSizes, schedule: Schedule) -> GridScene:
-        """Move all values towards the references, put them on the grid, and refit the constant colour."""
+        """Move all values towards the references, put them on the grid, and refit the constant colour.
+
+        As in `_finish`, copies go as soon as they can, those of `kept` as well: a large scene has no room for all of them.
+        """
         moved = self._distil(kept, schedule, step_sizes)
+        kept.planes = {}
         grid = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved), self.rounds.storage)[0]
+        del moved
         return self._with_constants(grid) if self.refit else grid
 
     def _finish(self, kept: Kept, step_sizes: StepSizes) -> GridScene:
@@ -142,7 +147,6 @@ class GridResults(MultiplierSearch[GridScene]):
         fine = replace(step_sizes, dc=step_sizes.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in step_sizes.sh))
         fine = holdable(fine, planes)
         grid, order = self._to_grid(planes, kept.degrees, fine, storage)
-        # Copies go as soon as they can: a large scene has no room for all of them.
         kept.planes = planes = {}
         degrees = kept.degrees[order]
         moved = values_of(grid, storage)

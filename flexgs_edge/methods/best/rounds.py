@@ -54,7 +54,6 @@ class PruneRounds:
     """Prunes the whole scene round by round; `snapshots` keeps the result of each round, the smallest set last.
 
     Where arrays lie in files, snapshots that a search hardly needs again let their planes go: docs/results/tuning.md#let_go
-    The attribute `unseen` counts the rows that no scored pose sees.
 
     Parameters
     ----------
