@@ -39,10 +39,10 @@ PARTS = 2
 """Each pruning round measures one of this many interleaved sets of cameras and reuses the sums of the others. One set
 is slower, four make files larger: docs/results/tuning.md#parts"""
 MOST_PARTS = 4
-HELD = 2
-"""So many of the last snapshots never let their planes go."""
 PART_VIEWS = 48
 """Many cameras make up to `MOST_PARTS` sets, if each has this many: docs/results/tuning.md#part_views"""
+HELD = 2
+"""So many of the last snapshots never let their planes go: docs/results/tuning.md#let_go"""
 
 
 def parts_of(views: int) -> int:
@@ -53,7 +53,7 @@ def parts_of(views: int) -> int:
 class PruneRounds:
     """Prunes the whole scene round by round; `snapshots` keeps the result of each round, the smallest set last.
 
-    Where arrays lie in files, snapshots that a search hardly needs again let their planes go: docs/results/tuning.md#let_go
+    Where arrays lie in files, snapshots that a search hardly needs again let their planes go.
 
     Parameters
     ----------
