@@ -36,7 +36,8 @@ def without_degrees(source: SceneSource, most: int | None) -> SceneSource:
     if most is None or source.sh_degree <= most:
         return source
     note = f"SH above degree {most} left out (the file has degree {source.sh_degree})"
-    return TrimmedSource(source, np.ones(source.count, bool), most, (note,))
+    # Nobody asks which rows keep their SH if none does.
+    return TrimmedSource(source, np.ones(source.count if most else 0, bool), most, (note,))
 
 
 def lower_degree(sh_rest: np.ndarray, degree: int) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.small_matrices import product
 
@@ -41,7 +42,7 @@ def visible_depths(renderer: Renderer, source: SceneSource, cameras: Sequence[Ca
     """
     means = source.read(slice(0, source.count), ["means"])["means"]
     depths = []
-    with renderer.load(source) as scene:
+    with renderer.load(without_degrees(source, 0)) as scene:
         for camera in map(middle_of, cameras):
             statistics = Statistics.zeros(source.count)
             renderer.add_statistics(scene, camera, statistics)

@@ -16,6 +16,7 @@ from flexgs_edge.methods.best.needed_poses import needed_poses, poses_beside
 from flexgs_edge.methods.best.view_weights import KnownErrors, base_errors, rareness, view_weights
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import DEFAULT_MAX_DROP, CompressOptions
+from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.source import SceneSource
 
 FINE_DROP, FINE_FIDELITY, FINE_RATIO = 0.3, 42.0, 30.0
@@ -129,7 +130,7 @@ def _coverage(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera]
     Of more than `COVERAGE_POSES` views, it looks at so many at least, evenly spread among them.
     """
     covered, pixels = 0.0, 0
-    with renderer.load(source) as scene:
+    with renderer.load(without_degrees(source, 0)) as scene:
         apart = max(len(cameras) // COVERAGE_POSES, 1)
         few = [camera.every(LARGEST_STEP) for camera in cameras[::apart]]
         for camera in renderer.in_turn(scene, few):
