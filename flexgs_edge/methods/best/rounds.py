@@ -7,7 +7,7 @@ the original's renders. Searches start from the snapshots that the rounds leave 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from weakref import WeakMethod
 
 import numpy as np
 
@@ -229,7 +229,18 @@ class PruneRounds:
         if self.storage.spills:
             for number in range(len(self.snapshots) - held):
                 if number not in self._renewed:
-                    self.snapshots[number].let_go(partial(self._again, number))
+                    self.snapshots[number].let_go(self._maker(number))
+
+    def _maker(self, number: int) -> Callable[[], dict[str, np.ndarray]]:
+        """Makes the planes of a snapshot. It holds on to nothing, or a search that has ended would keep its files."""
+        again = WeakMethod(self._again)
+
+        def make() -> dict[str, np.ndarray]:
+            method = again()
+            assert method is not None
+            return method(number)
+
+        return make
 
     def _resumed(self) -> bool:
         """Read the next snapshot from the checkpoint of an earlier run; False if it holds none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -69,6 +70,20 @@ def test_planes_in_files_are_let_go_and_made_again_with_the_same_bits(compact: N
             assert [snapshot.held for snapshot in found] == [number == 4 for number in range(len(held))]
             assert all(snapshot.held for snapshot in expected.snapshots)
             np.testing.assert_array_equal(found[3].planes["sh_dc"], expected.snapshots[3].planes["sh_dc"])
+
+
+def test_rounds_that_have_ended_keep_no_files(compact: None, tmp_path: Path) -> None:
+    storage = ScratchStorage(tmp_path, least=0)
+    gc.collect()
+    gc.disable()
+    try:
+        with open_rounds(storage) as rounds:
+            prune(rounds)
+            assert storage.used > 0
+            del rounds
+    finally:
+        gc.enable()
+    assert storage.used == 0
 
 
 def test_a_round_changes_colours_and_nothing_else() -> None:
