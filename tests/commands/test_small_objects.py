@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -199,7 +200,7 @@ def test_views_that_see_nothing(tmp_path: Path) -> None:
     seeing = views(40, 30).cameras
     assert seeing is not None
     mixed = [seeing[index] if index % 4 == 0 else camera for index, camera in enumerate(away)]
-    given = GivenViews([Camera(**{**vars(camera), "name": f"v{index}"}) for index, camera in enumerate(mixed)])
+    given = GivenViews([replace(camera, name=f"v{index}") for index, camera in enumerate(mixed)])
     with pytest.raises(InputError, match=r"none of 9 scored views sees any Gaussian, and --unseen 0 keeps none"):
         compress(path, tmp_path / "a.fgs", given=given, unseen="drop", **FAST)
     assert compress(path, tmp_path / "a.fgs", given=given, best_effort=True, **FAST).count == 10

@@ -14,7 +14,7 @@ from flexgs_edge.goals.line import LINE_STEPS, START, search_line
 from flexgs_edge.goals.steps import MAX_PRUNE, Step, better
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.methods.best.candidates import Candidate
+from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.effort import EFFORTS
 from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.paper.search import adapt
@@ -142,8 +142,12 @@ class _Pretended(GridSearch):
         step = Candidate(multiplier, COUNT, 0, size, found, target.excess(size, found), 0.0)
         return step, cast(GridScene, None)
 
+    # There are no Gaussians that could go.
     def _thinned(self, chosen: Candidate, grid: GridScene, *_: Any) -> tuple[Candidate, GridScene]:
-        return chosen, grid  # there are no Gaussians that could go
+        return chosen, grid
+
+    def _landed_on_quality(self, found: RateResult[GridScene], target: Target) -> RateResult[GridScene]:
+        return found
 
 
 @dataclass(frozen=True)
