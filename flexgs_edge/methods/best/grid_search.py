@@ -228,7 +228,7 @@ class GridSearch(GridResults):
 
     def _landed_on_quality(self, found: RateResult[GridScene], target: Target) -> RateResult[GridScene]:
         """The answer without the Gaussians that it could do without."""
-        self.rounds.let_go()
+        self.rounds.let_go()  # a landing goes back to none of them
         steps = list(found.steps)
         best = self._thinned(found.chosen, found.product, target, target, steps)
         return replace(found, product=best[1], chosen=best[0], steps=tuple(steps))

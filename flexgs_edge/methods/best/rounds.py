@@ -41,7 +41,7 @@ is slower, four make files larger: docs/results/tuning.md#parts"""
 MOST_PARTS = 4
 PART_VIEWS = 48
 """Many cameras make up to `MOST_PARTS` sets, if each has this many: docs/results/tuning.md#part_views"""
-HELD = 2
+SNAPSHOTS_HELD = 2
 """So many of the last snapshots never let their planes go: docs/results/tuning.md#let_go"""
 
 
@@ -161,7 +161,7 @@ class PruneRounds:
         others = {part: sums.take(keep, self.storage) for part, sums in enumerate(self._parts) if part != turn}
         # What takes most room is not held while we measure. The whole scene can be read again.
         self._parts = []
-        self.let_go(HELD - 1 if len(self.snapshots) > 1 else 0)
+        self.let_go(SNAPSHOTS_HELD - 1 if len(self.snapshots) > 1 else 0)
         measured = self._round(planes, turn)
         self._parts = [others.get(part, measured) for part in range(len(self._views))]
         costs = RemovalCosts.of(self._parts, self.storage)
@@ -222,7 +222,7 @@ class PruneRounds:
     def _hold(self, snapshot: Snapshot) -> None:
         """Append a snapshot, and let earlier ones go."""
         self.snapshots.append(snapshot)
-        self.let_go(HELD)
+        self.let_go(SNAPSHOTS_HELD)
 
     def let_go(self, held: int = 0) -> None:
         """Free the planes of all snapshots but the last `held`, and those of descents, where arrays lie in files."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
-from flexgs_edge.methods.best.rounds import HELD, PruneRounds
+from flexgs_edge.methods.best.rounds import SNAPSHOTS_HELD, PruneRounds
 from flexgs_edge.methods.best.snapshot import Snapshot
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
@@ -59,7 +59,7 @@ def test_planes_in_files_are_let_go_and_made_again_with_the_same_bits(compact: N
             found = prune(rounds)
             held = [snapshot.held for snapshot in found]
             # That of the descent, and the last ones.
-            assert held == [number == 4 or number >= len(held) - HELD for number in range(len(held))]
+            assert held == [number == 4 or number >= len(held) - SNAPSHOTS_HELD for number in range(len(held))]
             for number, (one, other) in enumerate(zip(found, prune(expected), strict=True)):
                 np.testing.assert_array_equal(one.rows, other.rows)
                 np.testing.assert_array_equal(one.costs.removal, other.costs.removal)
