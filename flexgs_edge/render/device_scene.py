@@ -173,6 +173,7 @@ class DeviceScene:
     def be_compact(self, shown: int) -> None:
         """Make views compact from now on, with room for `shown` rows at first; the scene is then streamed."""
         self.evict()
+        self._planes.bounds.clear()  # chunks that begin at the same rows were larger
         self.shown = shown
         self._least_rows = min(self.fit.compact_rows, max(self.count, 1))
         if self.give_way not in self._budget.reclaimers:

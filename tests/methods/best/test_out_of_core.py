@@ -112,6 +112,21 @@ def test_compact_views_give_the_same_bits(
         np.testing.assert_array_equal(spilled[name], values, err_msg=name)
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_views_that_become_compact_have_smaller_chunks(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A view that showed the blocks of larger chunks wrote beyond its arrays."""
+    use_fit(monkeypatch, resident=False, compact_rows=256)
+    drawer = Renderer(open_form(form), large_budget())
+    with drawer.load(SCENE) as scene:
+        whole = drawer.render(scene, cameras()[0])
+        larger = max(np.diff(scene.starts))
+        scene.be_compact(SCENE.count)
+        drawer.release()
+        np.testing.assert_array_equal(drawer.render(scene, cameras()[0]), whole)
+        assert max(np.diff(scene.starts)) < larger
+    drawer.release()
+
+
 def test_sums_of_a_chunk_take_the_place_of_a_view(
     compact: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
