@@ -55,6 +55,7 @@ More examples:
 \b
 Several scenes:
   A folder stands for the scenes directly in it: files, model folders, SOG folders.
+  A folder with a point_cloud.ply, and no other scene but .fgs, is one scene.
   Targets hold for each scene. A scene that fails does not stop the others.
   a.ply becomes OUT/a.fgs. Scenes of the same name keep their suffix (a.ply.fgs,
   a.spz.fgs), then get their folders' names in front (x-a.ply.fgs, y-a.ply.fgs).

@@ -181,7 +181,8 @@ def _check_folder(output: StrPath | None) -> str:
     names_file = name.lower().endswith((FGS, ".ply")) or format_of(name) is not None
     if names_file and not name.endswith(os.sep) and not os.path.isdir(name):
         raise InputError(
-            f"-o {name}: several scenes need a folder, and this is the name of a file; write {name}/ to mean a folder"
+            f"-o {name}: several scenes, or a folder of them, need a folder, and this is the name of a file; write {name}/ to "
+            "mean a folder, or give one scene"
         )
     check_folder(name, force=True)
     return name

@@ -16,16 +16,24 @@ _CFG_LIMIT = 1 << 16
 """Most bytes of cfg_args, which normally has a few hundred."""
 
 
+POINT_CLOUD = "point_cloud.ply"
+"""What INRIA's program calls the scene of an iteration."""
+
+
 def latest_iteration(folder: Path) -> Path:
-    """The `point_cloud.ply` of the highest iteration in a model folder."""
+    """The `point_cloud.ply` of the highest iteration in a model folder, or the one that lies in the folder itself."""
     found = {
         int(match.group(1)): ply
-        for ply in folder.glob("point_cloud/iteration_*/point_cloud.ply")
+        for ply in folder.glob(f"point_cloud/iteration_*/{POINT_CLOUD}")
         if (match := _ITERATION.fullmatch(ply.parent.name)) and ply.is_file()
     }
-    if not found:
-        raise InputError(f"{folder}: no point_cloud/iteration_*/point_cloud.ply in this folder; is it a model folder?")
-    return found[max(found)]
+    if found:
+        return found[max(found)]
+    if (folder / POINT_CLOUD).is_file():
+        return folder / POINT_CLOUD
+    raise InputError(
+        f"{folder}: no {POINT_CLOUD} and no point_cloud/iteration_*/{POINT_CLOUD} in this folder; is it a model folder?"
+    )
 
 
 @dataclass(frozen=True)

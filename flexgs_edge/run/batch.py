@@ -12,6 +12,7 @@ from pathlib import Path
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.formats import WRITTEN
 from flexgs_edge.io.gzipped import GZ
+from flexgs_edge.io.model_folder import POINT_CLOUD
 from flexgs_edge.run.open_scene import SUFFIXES, scene_file
 
 StrPath = str | os.PathLike[str]
@@ -68,13 +69,20 @@ def scenes_of(inputs: Sequence[StrPath], output: StrPath | None, suffix: str) ->
 
 
 def _is_collection(place: StrPath) -> bool:
-    """Whether this is a folder, but neither a model folder nor one of SOG pictures."""
+    """Whether this is a folder, but neither a model folder nor one of SOG pictures.
+
+    A folder with a `point_cloud.ply` is a model folder, unless other scenes than results of ours lie beside that file.
+    """
     if not os.path.isdir(place):
         return False
     try:
-        scene_file(place)
+        scene = scene_file(place)
     except InputError:
         return True
+    if scene != Path(place) / POINT_CLOUD:
+        return False
+    with suppress(InputError):
+        return len(_list(place, FGS)[0]) > 1
     return False
 
 
@@ -107,7 +115,7 @@ def check_place(scene: StrPath) -> None:
         _list(scene)
         raise InputError(
             f"{scene}: no scene to compress in this folder: expected files that end in {', '.join(_SUFFIXES)}, or folders "
-            "with point_cloud/iteration_*, meta.json or lod-meta.json"
+            f"with {POINT_CLOUD}, point_cloud/iteration_*, meta.json or lod-meta.json"
         )
 
 

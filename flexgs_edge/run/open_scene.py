@@ -52,6 +52,8 @@ class Opened:
 def open_scene(path: str | os.PathLike[str], reading: Reading = AS_WRITTEN) -> SceneSource:
     """Open a scene file by its suffix, the latest iteration of INRIA's model folder, or a folder of SOG pictures.
 
+    A folder that holds a `point_cloud.ply` stands for it.
+
     Parameters
     ----------
     path : path

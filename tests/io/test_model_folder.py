@@ -28,6 +28,12 @@ def test_a_model_folder_gives_its_latest_iteration_by_number(model: Path) -> Non
     assert source.count == 3 and "iteration_30000" in source.name
 
 
+def test_a_folder_with_a_point_cloud_gives_it(tmp_path: Path) -> None:
+    write_rows(tmp_path / "point_cloud.ply", random_rows(2))
+    (tmp_path / "point_cloud").mkdir()
+    assert open_scene(tmp_path).count == 2
+
+
 def test_companions_beside_a_ply(tmp_path: Path) -> None:
     found = find_companions(tmp_path / "a.ply")
     assert (found.cameras, found.images, found.white_background) == (None, None, None)

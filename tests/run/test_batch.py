@@ -41,6 +41,16 @@ def test_a_folder_stands_for_the_scenes_in_it(scans: Path, caplog: pytest.LogCap
     assert said == f"{scans}: skipped notes.txt, old, x-meta.json"
 
 
+def test_a_folder_with_a_point_cloud_is_a_scene(tmp_path: Path) -> None:
+    touch(tmp_path, "fox/point_cloud.ply", "fox/cameras.json", "fox/scene.fgs", "room/point_cloud.ply", "room/b.spz")
+    fox, room = tmp_path / "fox", tmp_path / "room"
+    assert not is_batch([fox], fox / "scene.fgs") and is_batch([room], "out")
+    assert scenes_of([tmp_path], "out", ".fgs") == [str(fox)]
+    assert scenes_of([room], "out", ".fgs") == [str(room / "b.spz"), str(room / "point_cloud.ply")]
+    assert output_names([str(fox)], ".fgs") == ["fox.fgs"]
+    check_place(fox)
+
+
 def test_many_skipped_files_are_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     touch(tmp_path, "a.ply", *(f"{k}.txt" for k in range(8)))
     with caplog.at_level(logging.INFO, "flexgs_edge"):
