@@ -29,7 +29,9 @@ def command(input: str, output: str, max_size: int, force: bool, json_path: str 
       flexgs-edge trim scene.fgs -o small.fgs --max-size 500kB
       flexgs-edge trim scene.fgs -o small.fgs --max-size 1MiB -f
 
-    Exit code 3: not even the first layer fits.
+    Where not even the first layer fits, the new file is the preview, if there is one.
+
+    Exit code 3: nothing fits.
     """
     talk.start(quiet, json_path, force)
     from flexgs_edge.commands.trim import trim

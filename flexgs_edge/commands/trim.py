@@ -18,7 +18,7 @@ from flexgs_edge.run.open_scene import check_fgs
 def trim(
     input: str | os.PathLike[str], output: str | os.PathLike[str], max_size: int, force: bool = False
 ) -> TrimResult:
-    """Copy as many whole layers of a `.fgs` file as fit into a size. Takes as long as copying the file.
+    """Copy as many whole layers of a `.fgs` file as fit into a size; its preview if none does. Takes as long as copying the file.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def trim(
     FormatError
         If the file is damaged.
     TargetError
-        If not even the first layer fits.
+        If neither the first layer nor the preview fits.
     """
     if max_size < 1:
         raise InputError(f"--max-size {max_size}: expected at least 1 byte")
@@ -70,6 +70,7 @@ def trim(
         count=kept.count,
         layers=_layers(kept),
         max_size=max_size,
+        is_preview=kept.count != header.count and isinstance(kept, GridHeader) and kept.cut_from is None,
     )
 
 

@@ -18,7 +18,9 @@ import numpy as np
 
 from flexgs_edge.codec.open_fgs import file_version, read_header
 from flexgs_edge.codec.v1.container import write_container
+from flexgs_edge.codec.v1.header import Header
 from flexgs_edge.codec.v2.boxes import BOXES
+from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.methods.paper.prune import nonzero_sh
@@ -30,7 +32,7 @@ from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_scene import is_fgs, scene_file
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import Run, open_run
-from flexgs_edge.viewer.assets import PAGE, web_files
+from flexgs_edge.viewer.assets import PAGE, PLAIN, PREVIEWED, SPATIAL, web_files
 from flexgs_edge.viewer.scene_page import page_config, viewer_page
 from flexgs_edge.viewer.server import Resource, SceneServer
 
@@ -92,15 +94,15 @@ def view(
     look = {"near": run.options.near, "background": run.options.background, "antialiased": run.options.antialiased}
     name = Path(os.fspath(input)).resolve().name
     with _coded(run, input) as scene:
-        spatial = BOXES in read_header(scene).settings
-        files = web_files(file_version(scene), spatial)
+        kind = _kind(read_header(scene))
+        files = web_files(file_version(scene), kind)
         size = os.stat(scene).st_size
         if output is not None:
-            page = viewer_page(files, page_config(name, cameras, look), scene.read_bytes(), spatial).text.encode()
+            page = viewer_page(files, page_config(name, cameras, look), scene.read_bytes(), kind).text.encode()
             with atomic_write(output, force) as file:
                 file.write(page)
             return ViewResult(scene_info(run.scene), size, len(cameras), os.fspath(output), len(page))
-        made = viewer_page(files, page_config(name, cameras, look, "scene.fgs"), spatial=spatial)
+        made = viewer_page(files, page_config(name, cameras, look, "scene.fgs"), kind=kind)
         text = made.text.encode()
         resources = {PAGE: Resource("text/html; charset=utf-8", text, gzip.compress(text), made.policy)}
         resources[_SCENE] = Resource("application/octet-stream", scene)
@@ -117,6 +119,13 @@ def view(
         except KeyboardInterrupt:
             LOG.info("stopped")
         return ViewResult(scene_info(run.scene), size, len(cameras), address, None)
+
+
+def _kind(header: Header | GridHeader) -> str:
+    """The kind of scene that a page shows."""
+    if BOXES in header.settings:
+        return SPATIAL
+    return PREVIEWED if isinstance(header, GridHeader) and header.preview_bytes else PLAIN
 
 
 def _open(address: str) -> None:

@@ -183,7 +183,7 @@ class VerifyResult:
 
 @dataclass(frozen=True)
 class TrimResult:
-    """Result of `trim`: layers, Gaussians and bytes before and after the cut."""
+    """Result of `trim`: layers, Gaussians and bytes before and after the cut; whether the new file is the preview of the old."""
 
     input: str
     input_size: int
@@ -194,6 +194,7 @@ class TrimResult:
     count: int
     layers: int
     max_size: int
+    is_preview: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
@@ -205,7 +206,9 @@ class TrimResult:
             f"{self.input}: {self.input_size} bytes ({format_size(self.input_size)}), "
             f"{self.input_count} Gaussians in {self.input_layers} layers",
             f"wrote {self.output}, {self.size} bytes ({format_size(self.size)}, {self.max_size} allowed)",
-            f"kept  {self.layers} of {self.input_layers} layers, {self.count} of {self.input_count} Gaussians",
+            f"kept  the preview, {self.count} Gaussians"
+            if self.is_preview
+            else f"kept  {self.layers} of {self.input_layers} layers, {self.count} of {self.input_count} Gaussians",
         ]
         return "\n".join(lines) + "\n"
 

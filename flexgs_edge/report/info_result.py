@@ -42,6 +42,8 @@ class InfoResult:
         Bytes of the coder's tables (version 2).
     layers : tuple of dict or None
         Rows and bytes of every layer (version 2).
+    preview : dict or None
+        Rows and bytes of the preview (version 2); None if there is none.
     cut_from : dict or None
         Size and rows of the file before `trim` (version 2).
     cameras, images : str or None
@@ -69,6 +71,7 @@ class InfoResult:
     chroma: float | None = None
     model_bytes: int | None = None
     layers: tuple[Mapping[str, int], ...] | None = None
+    preview: Mapping[str, int] | None = None
     cut_from: Mapping[str, int] | None = None
     cameras: str | None = None
     images: str | None = None
@@ -88,8 +91,9 @@ class InfoResult:
 
     @property
     def overhead_bytes(self) -> int:
-        """Bytes of the `.fgs` that belong to no channel."""
-        return self.size - sum(int(channel["bytes"]) for channel in self.channels.values())
+        """Bytes of the `.fgs` that belong to no channel, and not to its preview."""
+        preview = 0 if self.preview is None else self.preview["bytes"]
+        return self.size - sum(int(channel["bytes"]) for channel in self.channels.values()) - preview
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
@@ -129,6 +133,7 @@ class InfoResult:
                 "chroma": self.chroma,
                 "model_bytes": self.model_bytes,
                 "layers": [dict(layer) for layer in self.layers],
+                "preview": None if self.preview is None else dict(self.preview),
                 "cut_from": None if self.cut_from is None else dict(self.cut_from),
             }
         return record
@@ -157,6 +162,8 @@ class InfoResult:
         lines += [f"note:        {note}" for note in self.notes]
         if self.layers is not None:
             lines += _layer_lines(self.layers, self.cut_from)
+        if self.preview is not None:
+            lines.append(f"preview:     {self.preview['rows']} Gaussians in {self.preview['bytes']} bytes")
         if self.version is not None:
             lines += ["", *_channel_table(self.channels, self.version)]
             if self.chroma is not None:

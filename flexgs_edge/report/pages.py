@@ -154,6 +154,8 @@ def _channel_rows(contents: Mapping[str, Any]) -> list[tuple[str, int, list[obje
         more = [item["bits"], item["groups"]] if packed else [figure(item[k], ".4g") for k in ("step", "bits_per_row")]
         add(name, item["bytes"], count(item["rows"]), *more)
     if rows:
+        if contents.get("preview"):
+            add("preview", contents["preview"]["bytes"], "", "", "")
         add("headers and checksums", contents["overhead_bytes"], "", "", "")
     return rows
 

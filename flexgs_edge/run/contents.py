@@ -14,7 +14,7 @@ from flexgs_edge.codec.sections import ChunkEntry
 from flexgs_edge.codec.v1.header import Header
 from flexgs_edge.codec.v2.channels import Channels, channel_parts
 from flexgs_edge.codec.v2.chunk_plan import Chunk
-from flexgs_edge.codec.v2.container import GridContainer, channel_bytes
+from flexgs_edge.codec.v2.container import GridContainer, Preview, channel_bytes
 from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.codec.v2.walk import ChunkCodes
 from flexgs_edge.io.ply import inria_dtype
@@ -78,8 +78,15 @@ def _grid_info(path: Path) -> InfoResult:
         chroma=header.steps["chroma"],
         model_bytes=header.model.length,
         layers=tuple(layers),
+        preview=_preview(container),
         cut_from=header.cut_from,
     )
+
+
+def _preview(container: GridContainer) -> dict[str, int] | None:
+    if not container.header.preview.length:
+        return None
+    return {"rows": Preview(container).header.count, "bytes": container.header.preview.length}
 
 
 def _decoded_channels(path: Path, header: GridHeader) -> Channels:

@@ -10,14 +10,19 @@ PAGE = "viewer/index.html"
 STYLE = "viewer/style.css"
 ENTRIES = {"page": "viewer/src/page.js", "load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
 """The modules that are run: the page's, and those of the workers by the name that `startWorker` knows."""
-SPATIAL = {**ENTRIES, "load": "viewer/src/spatial-worker.js"}
-"""The same for a scene whose file tells where its chunks lie."""
 LIVE = {**ENTRIES, "page": "viewer/src/live.js"}
 """The same for the live scenes of a report."""
+PLAIN, SPATIAL, PREVIEWED = "plain", "spatial", "previewed"
+"""Kinds of scenes: all others, those whose file tells where its chunks lie, and those with a preview. Of a spatial one, the
+viewer asks for the chunks in sight first."""
+_KINDS = {
+    PLAIN: ("viewer/src/load-worker.js", "viewer/src/scene-viewer.js"),
+    SPATIAL: ("viewer/src/spatial-worker.js", "viewer/src/scene-viewer-spatial.js"),
+    PREVIEWED: ("viewer/src/preview-worker.js", "viewer/src/scene-viewer-preview.js"),
+}
+"""Of each kind, the worker that loads, and the module with the viewer."""
 _FORMATS = "decoder/src/formats.js"
 _FORMATS_2 = "decoder/src/formats2.js"
-_VIEWER = "viewer/src/scene-viewer.js"
-_VIEWER_SPATIAL = "viewer/src/scene-viewer-spatial.js"
 _PATTERNS = ("viewer/*.html", "viewer/*.css", "viewer/src/*.js", "decoder/src/*.js")
 
 
@@ -30,7 +35,12 @@ def web_folder() -> Path:
     raise InputError(f"the viewer: expected {PAGE} in {package / 'web'}, found none: install flexgs-edge again")
 
 
-def web_files(version: int = 1, spatial: bool = False) -> dict[str, str]:
+def entries_of(kind: str) -> dict[str, str]:
+    """`ENTRIES` for a kind of scene."""
+    return {**ENTRIES, "load": _KINDS[kind][0]}
+
+
+def web_files(version: int = 1, kind: str = PLAIN) -> dict[str, str]:
     """Texts of all files that the viewer needs, by their path below `web/`.
 
     Parameters
@@ -38,15 +48,15 @@ def web_files(version: int = 1, spatial: bool = False) -> dict[str, str]:
     version : int
         Container version of the scene. A page of a scene of version 2 reads no other files, so that it is short; one of a
         scene of version 1 reads both.
-    spatial : bool
-        The file tells where its chunks lie: with `SPATIAL`, the viewer then asks for those in sight first.
+    kind : str
+        Kind of the scene.
     """
     folder = web_folder()
     places = [place for pattern in _PATTERNS for place in sorted(folder.glob(pattern))]
     files = {place.relative_to(folder).as_posix(): place.read_text(encoding="utf-8") for place in places}
-    only_2, chunks_by_sight = files.pop(_FORMATS_2), files.pop(_VIEWER_SPATIAL)
+    only_2 = files.pop(_FORMATS_2)
     if version == 2:
         files[_FORMATS] = only_2
-    if spatial:
-        files[_VIEWER] = chunks_by_sight
+    viewers = {name: files.pop(viewer) for name, (_, viewer) in _KINDS.items()}
+    files[_KINDS[PLAIN][1]] = viewers[kind]
     return files

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.viewer.assets import ENTRIES, PAGE, SPATIAL, STYLE
+from flexgs_edge.viewer.assets import PAGE, PLAIN, STYLE, entries_of
 from flexgs_edge.viewer.join import join_modules
 from flexgs_edge.viewer.shorten import shorten_style
 
@@ -68,7 +68,7 @@ class Page:
 
 
 def viewer_page(
-    files: Mapping[str, str], config: Mapping[str, Any], scene: bytes | None = None, spatial: bool = False
+    files: Mapping[str, str], config: Mapping[str, Any], scene: bytes | None = None, kind: str = PLAIN
 ) -> Page:
     """The viewer and the decoder in one file.
 
@@ -83,10 +83,10 @@ def viewer_page(
         From `page_config`.
     scene : bytes, optional
         A `.fgs` to put into the page, which then opens from disk without a network.
-    spatial : bool
+    kind : str
         As for `web_files`.
     """
-    script = join_modules(files, SPATIAL if spatial else ENTRIES)
+    script = join_modules(files, entries_of(kind))
     if "</script" in script.lower() or "<!--" in script:
         raise AssertionError("a script that would end in the middle")
     style = shorten_style(files[STYLE])

@@ -336,6 +336,14 @@ def decode(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     at += 4
     model = read_model(model_data, degree)
 
+    # Preview
+    preview = header.get("preview_bytes", 0)
+    if preview:
+        small, _ = decode(data[at : at + preview])
+        assert "preview_bytes" not in small and small["origin"] == header["origin"]
+        assert small["sh_degree"] in (0, degree)
+    at += preview
+
     # Chunks and chunk table
     lengths = []
     for layer in header["layers"]:

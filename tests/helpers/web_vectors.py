@@ -125,6 +125,9 @@ KINDS: dict[str, tuple[Callable[[], GridScene], int]] = {
 }
 """The 18 kinds: the scene, and the most rows of a chunk."""
 
+PREVIEWED = "a preview before chunks of 256 rows"
+"""A further file; its preview is that of 255 rows."""
+
 PACKED: dict[str, tuple[int, int, BitSpec, int | None]] = {
     "version 1, no SH": (9, 0, BitSpec(xyz=16, dc=1, scale=5, rot=11, opacity=3, rest=2), None),
     "version 1, degree 4, many groups": (23, 4, BitSpec(xyz=13, dc=8, scale=7, rot=9, opacity=16, rest=2), 7),
@@ -139,6 +142,9 @@ def write_all(folder: Path) -> dict[str, Path]:
     for name, (make, chunk_rows) in KINDS.items():
         files[name] = folder / _file_name(name)
         write_grid(files[name], make(), SETTINGS, chunk_rows=chunk_rows, force=True)
+    files[PREVIEWED] = folder / _file_name(PREVIEWED)
+    small = files["255 rows"].read_bytes()
+    write_grid(files[PREVIEWED], random_grid(600, 1, 7, layers=2), SETTINGS, chunk_rows=256, preview=small, force=True)
     for name, (rows, degree, bits, groups) in PACKED.items():
         files[name] = folder / _file_name(name)
         scene = quantize_all(make_scene(rows, degree), bits, groups)

@@ -23,7 +23,7 @@ from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.commands.view import view
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import write_ply
-from flexgs_edge.viewer.assets import ENTRIES, web_files
+from flexgs_edge.viewer.assets import PLAIN, PREVIEWED, SPATIAL, entries_of, web_files
 from flexgs_edge.viewer.join import join_modules
 from flexgs_edge.viewer.scene_page import page_config, viewer_page
 from grid_scenes import make_grid
@@ -40,8 +40,8 @@ CAMERA = {
     "fy": 40,
 }
 
-MOST_SENT = {1: 26_400, 2: 25_000}
-"""Bytes of viewer and decoder with gzip, by the version of the scene."""
+MOST_SENT = {(1, PLAIN): 26_400, (2, PLAIN): 25_000, (2, PREVIEWED): 26_000, (2, SPATIAL): 28_400}
+"""Bytes of viewer and decoder with gzip, by the version and the kind of the scene."""
 
 
 @pytest.fixture
@@ -183,12 +183,12 @@ def test_our_modules_are_joined_into_a_script_that_parses(tmp_path: Path) -> Non
     if node is None:
         pytest.skip("no node to parse scripts with")
     place = tmp_path / "script.cjs"
-    for version in (1, 2):
-        place.write_text(join_modules(web_files(version), ENTRIES))
+    for version, kind in MOST_SENT:
+        place.write_text(join_modules(web_files(version, kind), entries_of(kind)))
         subprocess.run([node, "--check", str(place)], check=True, timeout=60)
 
 
 def test_what_a_browser_is_sent_stays_small() -> None:
-    for version, most in MOST_SENT.items():
-        page = viewer_page(web_files(version), page_config("", [], {}, "scene.fgs"))
+    for (version, kind), most in MOST_SENT.items():
+        page = viewer_page(web_files(version, kind), page_config("", [], {}, "scene.fgs"), kind=kind)
         assert len(gzip.compress(page.text.encode())) <= most

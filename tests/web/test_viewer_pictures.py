@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -21,8 +22,11 @@ from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.render import render_views
 from flexgs_edge.commands.trim import trim
 from flexgs_edge.commands.view import view
+from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.io.ply import write_ply
+from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.growth import GrownSource
+from flexgs_edge.viewer import server
 from viewer_tab import LOOK, POSES, Drawn, decibels, drag, faults, picture, requests, served, until
 from web_vectors import FOLDER
 
@@ -92,6 +96,68 @@ def test_what_is_there_of_a_cut_file_is_drawn_larger(
         go(tab, address)
         assert tab.run("viewer.growth") == 1
         assert tab.run("(() => { viewer.rows /= 2; return viewer.growth; })()") == pytest.approx(2**0.125)
+
+
+def previewed(scene: Path, folder: Path, chunk_rows: int) -> tuple[Path, Path]:
+    """The same scene behind a preview of every eighth row without SH, and that preview."""
+    source = open_fgs(scene)
+    assert isinstance(source, GridSource)
+    grid = source.grid()
+    some = grid.take(np.arange(0, grid.count, 8))
+    nothing = np.zeros_like(some.sh_degrees)
+    steps = replace(some.step_sizes, sh=())
+    flat = replace(some, sh_degree=0, sh_degrees=nothing, sh=(), step_sizes=steps, layer=nothing)
+    order = np.argsort(cells_of_one_layer(flat), kind="stable")
+    small, place = folder / "small.fgs", folder / "still_life.fgs"
+    write_grid(small, flat.take(order), {})
+    write_grid(place, grid, {}, chunk_rows=chunk_rows, preview=small.read_bytes())
+    return place, small
+
+
+def cells_of_one_layer(grid: GridScene) -> np.ndarray:
+    return morton(grid.position.astype(np.int64) - grid.position.min(axis=1)[:, None])
+
+
+@pytest.mark.parametrize("chunk_rows", [8192, 1024], ids=["stream", "spatial"])
+def test_a_preview_is_shown_until_the_first_layer_is_there(
+    tab: Browser,
+    scene: Path,
+    sample_dir: Path,
+    drawn: Drawn,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    chunk_rows: int,
+) -> None:
+    """The server stops in the second of the chunks that the first layer has; of a spatial page, behind some chunks in sight."""
+    scene, small = previewed(scene, tmp_path, chunk_rows)
+    cameras = str(sample_dir / "cameras.json")
+    second = GridContainer(scene).read_table()[1].section
+    stop = second.offset + second.length // 2 + 120_000 * (chunk_rows == 1024)
+    goes_on, write, sent = threading.Event(), server._Handler._write, []
+
+    def waiting(self: Any, data: bytes) -> None:
+        sent.append(len(data))
+        if sum(sent) > stop:
+            assert goes_on.wait(60)
+        write(self, data)
+
+    monkeypatch.setattr(server, "_PIECE", 1000)
+    monkeypatch.setattr(server._Handler, "_write", waiting)
+    (file,) = render_views(small, tmp_path / "small", views=[POSES[1]], cameras=cameras, device="numpy", **LOOK).files
+    wanted = np.asarray(Image.open(file), np.float64)
+    with served(scene, cameras, **LOOK) as address:
+        tab.events.clear()
+        tab.send("Page.navigate", url=address)
+        tab.wait("Page.loadEventFired")
+        until(tab, "globalThis.viewer && viewer.stats.firstMs > 0 && viewer.previewed?.waiting.length")
+        assert tab.run("viewer.growth") == 1 and tab.run("viewer.stats.wholeMs") == 0
+        assert decibels(picture(tab, POSES[1], wanted.shape[1], wanted.shape[0]), wanted) >= 50
+        goes_on.set()
+        until(tab, "viewer.stats.wholeMs > 0")
+        assert tab.run("viewer.rows") == tab.run("viewer.header.count") == GridContainer(scene).header.count
+        whole = np.asarray(Image.open(drawn(False)[1]), np.float64)
+        assert decibels(picture(tab, POSES[1], whole.shape[1], whole.shape[0]), whole) >= 50
+        assert faults(tab) == []
 
 
 @pytest.fixture(scope="module")

@@ -96,7 +96,10 @@ def test_the_vectors_are_read_as_they_say() -> None:
         assert expected(FOLDER / name) == wanted, name
 
 
-@pytest.mark.parametrize("name", ["degree_4_SH_beyond_the_limit_of_a_sum", "escapes", "chunks_of_one_row"])
+@pytest.mark.parametrize(
+    "name",
+    ["degree_4_SH_beyond_the_limit_of_a_sum", "escapes", "chunks_of_one_row", "a_preview_before_chunks_of_256_rows"],
+)
 def test_a_vector_is_read_from_the_page_alone(name: str) -> None:
     """By the decoder that follows docs/format.md and knows nothing of the package."""
     path = FOLDER / f"{name}.fgs"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import os
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
@@ -42,6 +44,7 @@ def write_grid(
     device: Device | None = None,
     encoded: Encoded | None = None,
     storage: Storage = IN_MEMORY,
+    preview: bytes = b"",
 ) -> int:
     """Encode a grid scene into a file, which gets its name only when it is complete.
 
@@ -64,6 +67,8 @@ def write_grid(
         The result of `encode_grid(grid, chunk_rows)`, if the caller has it already.
     storage : Storage, optional
         Holds the symbols until they are written.
+    preview : bytes, optional
+        A file of a much smaller scene, for viewers to show until the first layer is there. Default: none.
 
     Returns
     -------
@@ -72,11 +77,12 @@ def write_grid(
     """
     encoded = encoded or encode_grid(grid, chunk_rows, device, storage)
     model = encoded.model.to_bytes()
-    header = _header(grid, encoded, len(model), settings, chunk_rows)
+    header = _header(grid, encoded, len(model), settings, chunk_rows, len(preview))
     with atomic_write(path, force) as file:
         file.seek(PREAMBLE_BYTES)
         file.write(encode_header(header))
         file.write(checked(model))
+        file.write(preview)
         entries = []
         for stream in encoded.streams():
             entries.append((len(stream), zlib.crc32(stream)))
@@ -91,22 +97,25 @@ def coded_size(
     device: Device | None = None,
     encoded: Encoded | None = None,
     storage: Storage = IN_MEMORY,
+    preview: bytes = b"",
 ) -> int:
     """Exact bytes of the file that `write_grid` makes of these arguments; as slow as writing it."""
     encoded = encoded or encode_grid(grid, chunk_rows, device, storage)
-    header = _header(grid, encoded, len(encoded.model.to_bytes()), settings, chunk_rows)
-    return header.model.offset + header.model.length + sum(map(len, encoded.streams())) + header.table_bytes
+    header = _header(grid, encoded, len(encoded.model.to_bytes()), settings, chunk_rows, len(preview))
+    return header.chunks_offset + sum(map(len, encoded.streams())) + header.table_bytes
 
 
 def trim_container(
     source: str | os.PathLike[str], path: str | os.PathLike[str], max_size: int, force: bool = False
 ) -> int:
-    """Copy as many whole layers as fit into `max_size` bytes, and return the bytes of the new file.
+    """Copy as many whole layers as fit into `max_size` bytes, with the preview; return the bytes of the new file.
+
+    If not even the first layer fits, the new file is the preview.
 
     Raises
     ------
     TargetError
-        If not even the first layer fits.
+        If nothing fits.
     """
     container = GridContainer(source)
     if os.path.realpath(source) == os.path.realpath(path):
@@ -118,27 +127,38 @@ def trim_container(
         if layers < len(header.layers):
             header = header.cut(layers, container.size)
         payload = sum(entry.section.length for entry in kept)
-        size = header.model.offset + header.model.length + payload + header.table_bytes
+        size = header.chunks_offset + payload + header.table_bytes
         if size <= max_size:
             break
     else:
-        raise TargetError(f"{source}: its first layer needs {size} bytes, {max_size} are allowed")
+        if not 0 < container.header.preview.length <= max_size:
+            raise TargetError(f"{source}: its first layer needs {size} bytes, {max_size} are allowed")
+        with atomic_write(path, force) as file:
+            return file.write(Preview(container).data)
     with container.open() as old, atomic_write(path, force) as file:
         file.seek(PREAMBLE_BYTES)
         file.write(encode_header(header))
         file.write(checked(container.read_section(old, container.header.model)))
+        file.write(container.read_preview())
         for entry in kept:
             container.copy_chunk(old, entry, file)
         return _finish(file, header, [(entry.section.length, entry.checksum) for entry in kept])
 
 
 def _header(
-    grid: GridScene, encoded: Encoded, model_bytes: int, settings: Mapping[str, Any], chunk_rows: int
+    grid: GridScene,
+    encoded: Encoded,
+    model_bytes: int,
+    settings: Mapping[str, Any],
+    chunk_rows: int,
+    preview_bytes: int,
 ) -> GridHeader:
     low = encoded.low.tolist()
     channels = Channels.of(_by_alphabet(encoded.model, encoded.bits), [band.shape[1] for band in grid.sh])
     told = with_boxes(settings, grid, encoded.chunks)
-    return GridHeader.of_grid(grid, encoded.layers, low, encoded.model.depth, chunk_rows, model_bytes, told, channels)
+    return GridHeader.of_grid(
+        grid, encoded.layers, low, encoded.model.depth, chunk_rows, model_bytes, told, channels, preview_bytes or None
+    )
 
 
 def _by_alphabet(model: Model, bits: np.ndarray) -> dict[str, float]:
@@ -178,7 +198,8 @@ class GridContainer(SectionFile):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__(path)
         with self.open() as file:
-            size = self.size = os.fstat(file.fileno()).st_size
+            size = self.size = file.seek(0, os.SEEK_END)
+            file.seek(0)
 
             def wrong_size(header: GridHeader) -> str:
                 least = header.least_size
@@ -196,13 +217,20 @@ class GridContainer(SectionFile):
         except StreamError as error:
             raise format_error(self.path, header.model.offset, f"model: {error}") from None
 
+    def read_preview(self) -> bytes:
+        """Read the preview, which has not been checked; no bytes if there is none."""
+        section = self.header.preview
+        with self.open() as file:
+            file.seek(section.offset)
+            return self._read(file, section.length, section.name)
+
     def read_table(self) -> list[ChunkEntry]:
         """Read the place and checksum of every chunk, and check that the chunks fill the file."""
         section = self.header.table(self.size)
         with self.open() as file:
             table = np.frombuffer(self.read_section(file, section), "<u4").reshape(-1, 2)
         entries = []
-        offset = self.header.model.offset + self.header.model.length
+        offset = self.header.chunks_offset
         for i, (chunk, (length, checksum)) in enumerate(zip(self.header.chunks(), table.tolist(), strict=True)):
             least = least_bytes(chunk.stop - chunk.start)
             if length < least or length % 2:
@@ -255,16 +283,56 @@ class GridContainer(SectionFile):
             raise format_error(self.path, section.offset, f"{section.name}: {error}") from None
 
 
+class Preview(GridContainer):
+    """The preview of a file, which is held in memory: a file of its own.
+
+    Parameters
+    ----------
+    whole : GridContainer
+        The file.
+
+    Raises
+    ------
+    FormatError
+        If anything differs from the format. Bytes count from where the preview begins.
+    """
+
+    def __init__(self, whole: GridContainer) -> None:
+        self.data = whole.read_preview()
+        super().__init__(f"{whole.path} (preview)")
+        if self.header.preview_bytes is not None:
+            raise self._error(PREAMBLE_BYTES, "header: preview_bytes: wanted none in a preview")
+        own, others = self.header, whole.header
+        if own.origin != others.origin:
+            raise self._error(PREAMBLE_BYTES, f"header: origin: wanted {others.origin}, got {own.origin}")
+        if own.sh_degree not in (0, others.sh_degree):
+            raise self._error(
+                PREAMBLE_BYTES, f"header: sh_degree: wanted 0 or {others.sh_degree} in a preview, got {own.sh_degree}"
+            )
+
+    @contextmanager
+    def open(self) -> Iterator[BinaryIO]:
+        """Open the bytes for reading."""
+        yield io.BytesIO(self.data)
+
+    def verify(self) -> None:
+        """Check every byte; raises `FormatError`."""
+        self.read_model()
+        for entry in self.read_table():
+            self.check_chunk(entry)
+
+
 def verify_grid(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Section]:
     """Check every byte of a version 2 file, which is read in pieces; see `flexgs_edge.codec.v1.container.verify`."""
     container = GridContainer(path)
     header = container.header
     found = Verification(header.block, raise_errors)
     found.check(header.model, container.read_model)
+    if header.preview.length:
+        found.check(header.preview, lambda: Preview(container).verify())
     # The end of a chunk stands only in the table.
     table = header.table(container.size)
-    start = header.model.offset + header.model.length
-    chunks = [Section("chunks", start, table.offset - start)]
+    chunks = [Section("chunks", header.chunks_offset, table.offset - header.chunks_offset)]
     return found.check_chunks(container, table, container.read_table, chunks)
 
 
@@ -292,12 +360,14 @@ def channel_bytes(
     payload = sum(entry.section.length for entry in entries)
     table["lanes"] = payload - float(cost.sum()) / 8
     table["model"] = float(container.header.model.length)
-    table["header"] = float(container.size - payload) - table["model"]
+    table["preview"] = float(container.header.preview.length)
+    table["header"] = float(container.size - payload) - table["model"] - table["preview"]
     return table
 
 
 __all__ = [
     "GridContainer",
+    "Preview",
     "channel_bytes",
     "coded_size",
     "trim_container",

@@ -29,6 +29,8 @@ HEADER_MOST = 1 << 20
 MODEL_MOST = 1 << 20
 """Most bytes of the model; 59 alphabets of 256 symbols and 64 tables need less."""
 LAYERS_MOST = 256
+PREVIEW_MOST = 1 << 24
+"""Most bytes of a preview."""
 
 _KEYS = (
     "chunk_rows",
@@ -43,7 +45,7 @@ _KEYS = (
     "sh_degree",
     "steps",
 )
-_OPTIONAL = "channels"
+_OPTIONAL = "channels", "preview_bytes"
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,8 @@ class GridHeader:
         `bytes`, `count` and `layers` of the file that this one was cut from.
     channels : Channels or None
         Sizes that readers need not decode chunks for; None in files that were cut, and in files of early writers.
+    preview_bytes : int or None
+        Bytes of the preview, a small file of the same scene; None if there is none.
     """
 
     count: int
@@ -88,6 +92,7 @@ class GridHeader:
     settings: dict[str, Any]
     cut_from: dict[str, int] | None = None
     channels: Channels | None = None
+    preview_bytes: int | None = None
     block: int = 0
     version: int = 2
 
@@ -102,6 +107,7 @@ class GridHeader:
         model_bytes: int,
         settings: Mapping[str, Any],
         channels: Channels | None = None,
+        preview_bytes: int | None = None,
     ) -> GridHeader:
         """Make the header of a scene; raises `InputError` for settings that JSON cannot hold."""
         x, y, z = (float(value) for value in grid.origin)
@@ -118,6 +124,7 @@ class GridHeader:
             model_bytes,
             dict(settings),
             channels=channels,
+            preview_bytes=preview_bytes,
         )
         return header.sealed()
 
@@ -154,6 +161,16 @@ class GridHeader:
         return Section("model", PREAMBLE_BYTES + self.block, self.model_bytes + 4)
 
     @property
+    def preview(self) -> Section:
+        """Section of the preview, which checks itself; of no bytes if there is none."""
+        return Section("preview", self.model.offset + self.model.length, self.preview_bytes or 0)
+
+    @property
+    def chunks_offset(self) -> int:
+        """Where the first chunk begins."""
+        return self.preview.offset + self.preview.length
+
+    @property
     def table_bytes(self) -> int:
         """Bytes of the chunk table, with its checksum."""
         return 8 * self.chunk_count + 4
@@ -165,24 +182,25 @@ class GridHeader:
     @property
     def least_size(self) -> int:
         """Bytes of the smallest file with this header; a chunk has at least a bit a row."""
-        return self.model.offset + self.model.length + self.table_bytes + self.count // 8
+        return self.chunks_offset + self.table_bytes + self.count // 8
 
 
 def encode_header(header: GridHeader) -> bytes:
     """The bytes of a header."""
     record = asdict(header)
     del record["block"], record["version"]  # known from the preamble
-    if header.channels is None:
-        del record[_OPTIONAL]
+    for name in _OPTIONAL:
+        if record[name] is None:
+            del record[name]
     return canonical_json(record)
 
 
 def decode_header(block: bytes) -> GridHeader:
     """Read and check a header; raises `HeaderError` for everything that `encode_header` does not write."""
     record = parse_json(block)
-    if not isinstance(record, dict) or tuple(sorted(record.keys() - {_OPTIONAL})) != _KEYS:
+    if not isinstance(record, dict) or tuple(sorted(record.keys() - set(_OPTIONAL))) != _KEYS:
         raise HeaderError(
-            f"wanted an object with the keys {', '.join(_KEYS)} and perhaps {_OPTIONAL}, got {shown(record)}"
+            f"wanted an object with the keys {', '.join(_KEYS)} and perhaps {', '.join(_OPTIONAL)}, got {shown(record)}"
         )
     count = checked_integer("count", record["count"], 0, MAX_COUNT)
     layers = _integers("layers", record["layers"], 0, MAX_COUNT)
@@ -206,7 +224,10 @@ def decode_header(block: bytes) -> GridHeader:
         checked_integer("model_bytes", record["model_bytes"], 0, MODEL_MOST),
         record["settings"],
         _cut_from(record["cut_from"]),
-        _channels(record[_OPTIONAL], count, sh_degree) if _OPTIONAL in record else None,
+        _channels(record["channels"], count, sh_degree) if "channels" in record else None,
+        checked_integer("preview_bytes", record["preview_bytes"], 1, PREVIEW_MOST)
+        if "preview_bytes" in record
+        else None,
         len(block),
     )
 

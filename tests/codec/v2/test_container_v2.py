@@ -6,6 +6,7 @@ import importlib.util
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +18,12 @@ from fgs_damage import away
 from flexgs_edge.codec.open_fgs import file_version, open_fgs, read_header, verify
 from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v1.packed_source import FgsSource
-from flexgs_edge.codec.v2.container import GridContainer, channel_bytes, coded_size, trim_container, write_grid
+from flexgs_edge.codec.v2.container import GridContainer, Preview, channel_bytes, coded_size, trim_container, write_grid
 from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.decompress import decompress
-from flexgs_edge.errors import InputError, TargetError
+from flexgs_edge.errors import FormatError, InputError, TargetError
+from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.run.open_scene import open_scene
@@ -102,6 +104,67 @@ def test_a_file_of_many_chunks_tells_where_they_lie(tmp_path: Path) -> None:
         assert with_sh == np.count_nonzero(grid.sh_degrees[chunk.start : chunk.stop])
     write_grid(path, grid, {"a": 1}, chunk_rows=200, force=True)
     assert GridContainer(path).header.settings == {"a": 1}
+
+
+def with_preview(folder: Path, small: GridScene, **words: Any) -> Path:
+    """A file of 900 rows in two layers, with a file of `small` as its preview."""
+    path, inner = folder / "a.fgs", folder / "small.fgs"
+    write_grid(inner, small, {"small": True}, force=True, **words)
+    size = write_grid(path, make_grid(900, 2, layers=2), {"a": 1}, force=True, preview=inner.read_bytes())
+    assert size == path.stat().st_size
+    return path
+
+
+def test_a_preview_is_a_file_in_the_file(tmp_path: Path) -> None:
+    grid, small = make_grid(900, 2, layers=2), make_grid(40)
+    path = with_preview(tmp_path, small)
+    plain = tmp_path / "plain.fgs"
+    size = write_grid(plain, grid, {"a": 1})
+    inner = (tmp_path / "small.fgs").read_bytes()
+    assert coded_size(grid, {"a": 1}, preview=inner) == path.stat().st_size > size + len(inner)
+    container = GridContainer(path)
+    assert container.read_preview() == inner and Preview(container).header.settings == {"small": True}
+    assert_same_grid(GridSource(path).grid(), GridSource(plain).grid())
+    header, planes = educational_decoder2.decode(path.read_bytes())
+    assert header["preview_bytes"] == len(inner)
+    np.testing.assert_array_equal(planes["means"], educational_decoder2.decode(plain.read_bytes())[1]["means"])
+    assert [section.name for section in verify(path)] == [
+        "preamble", "header", "model", "preview", "chunk 0", "chunk 1", "chunk table",
+    ]  # fmt: skip
+    assert channel_bytes(path)["preview"] == len(inner) and channel_bytes(plain)["preview"] == 0
+
+
+def test_a_file_that_is_cut_keeps_its_preview_or_is_it(tmp_path: Path) -> None:
+    path, cut = with_preview(tmp_path, make_grid(40)), tmp_path / "cut.fgs"
+    inner = (tmp_path / "small.fgs").read_bytes()
+    layers = [entry.section for entry in GridContainer(path).read_table()]
+    first = path.stat().st_size - layers[1].length + 60  # the header grows by what it was cut from
+    assert trim_container(path, cut, first) == cut.stat().st_size
+    assert GridContainer(cut).header.layers == GridContainer(path).header.layers[:1]
+    assert GridContainer(cut).read_preview() == inner
+    verify(cut)
+    assert trim_container(path, cut, len(inner), force=True) == len(inner) and cut.read_bytes() == inner
+    with pytest.raises(TargetError, match="its first layer needs"):
+        trim_container(path, cut, len(inner) - 1, force=True)
+
+
+def test_damage_and_faults_of_a_preview_are_found(tmp_path: Path) -> None:
+    path = with_preview(tmp_path, make_grid(40))
+    section = GridContainer(path).header.preview
+    data = path.read_bytes()
+    for at in range(section.offset, section.offset + section.length, 37):
+        path.write_bytes(data[:at] + bytes([data[at] ^ 16]) + data[at + 1 :])
+        with pytest.raises(FormatError, match=r"\(preview\): byte \d+: "):
+            verify(path)
+        assert [each.name for each in verify(path, raise_errors=False) if not each.ok] == ["preview"]
+    moved = replace(make_grid(40), origin=np.array([1.0, 2.0, 3.0]))
+    with pytest.raises(FormatError, match="origin: wanted"):
+        verify(with_preview(tmp_path, moved))
+    with pytest.raises(FormatError, match="sh_degree: wanted 0 or 2 in a preview, got 1"):
+        verify(with_preview(tmp_path, make_grid(40, 1)))
+    small = tmp_path / "small.fgs"
+    with pytest.raises(FormatError, match="preview_bytes: wanted none in a preview"):
+        verify(with_preview(tmp_path, make_grid(40), preview=small.read_bytes()))
 
 
 def test_only_touched_chunks_are_decoded(tmp_path: Path) -> None:

@@ -6,9 +6,11 @@ export class FgsFile {
   /**
    * @param {{header: object, size: number}} frame
    * @param {(options: object) => AsyncIterable<object>} decode gives the chunks
+   * @param {() => Promise<Uint8Array>} previewBytes
    * @param {() => Promise<void>} [close]
    */
-  constructor({ header, size }, decode, close = async () => {}) {
+  constructor({ header, size }, decode, previewBytes, close = async () => {}) {
+    this.previewBytes = previewBytes;
     this.#decode = decode;
     this.#close = close;
     this.version = header.version;

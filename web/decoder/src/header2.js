@@ -10,6 +10,7 @@ import {
   LAYERS_MOST,
   MODEL_MOST,
   PREAMBLE_BYTES,
+  PREVIEW_MOST,
 } from './limits.js';
 import { shown } from './shown.js';
 
@@ -26,6 +27,7 @@ const HEADER_KEYS = [
   'sh_degree',
   'steps',
 ];
+const OPTIONAL_KEYS = ['channels', 'preview_bytes'];
 const STEP_KEYS = ['chroma', 'dc', 'opacity', 'position', 'rotation', 'scale', 'sh'];
 /** As the program words it: the order in which it looks at them. */
 const STEP_ORDER = ['position', 'scale', 'rotation', 'opacity', 'dc', 'sh', 'chroma'];
@@ -33,10 +35,10 @@ const STEP_ORDER = ['position', 'scale', 'rotation', 'opacity', 'dc', 'sh', 'chr
 /** Read and check the header of a version 2 file; throws `HeaderError`. */
 export function decodeHeader2(bytes) {
   const record = parseJson(bytes);
-  const wanted = record instanceof Map && record.has('channels') ? [...HEADER_KEYS, 'channels'].sort() : HEADER_KEYS;
-  if (!hasKeys(record, wanted)) {
-    const keys = HEADER_KEYS.join(', ');
-    throw new HeaderError(`wanted an object with the keys ${keys} and perhaps channels, got ${shown(record)}`);
+  const known = record instanceof Map ? OPTIONAL_KEYS.filter((key) => record.has(key)) : [];
+  if (!hasKeys(record, [...HEADER_KEYS, ...known].sort())) {
+    const [keys, others] = [HEADER_KEYS, OPTIONAL_KEYS].map((some) => some.join(', '));
+    throw new HeaderError(`wanted an object with the keys ${keys} and perhaps ${others}, got ${shown(record)}`);
   }
   const count = checkedInteger('count', record.get('count'), 0, COUNT_MOST);
   const layers = checkedIntegers('layers', record.get('layers'), 0, COUNT_MOST);
@@ -56,6 +58,9 @@ export function decodeHeader2(bytes) {
   const modelBytes = checkedInteger('model_bytes', record.get('model_bytes'), 0, MODEL_MOST);
   const cutFrom = checkedCut(record.get('cut_from'));
   const channels = record.has('channels') ? checkedChannels(record.get('channels'), count, shDegree) : null;
+  const previewBytes = known.includes('preview_bytes')
+    ? checkedInteger('preview_bytes', record.get('preview_bytes'), 1, PREVIEW_MOST)
+    : 0;
   const chunkCount = layers.reduce((sum, rows) => sum + Math.ceil(rows / chunkRows), 0);
   const modelOffset = PREAMBLE_BYTES + bytes.length;
   return {
@@ -74,7 +79,8 @@ export function decodeHeader2(bytes) {
     chunkCount,
     modelOffset,
     modelBytes,
-    chunksOffset: modelOffset + modelBytes + 4,
+    previewBytes,
+    chunksOffset: modelOffset + modelBytes + 4 + previewBytes,
     tableBytes: 8 * chunkCount + 4,
   };
 }

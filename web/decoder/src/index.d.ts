@@ -113,6 +113,8 @@ export interface Header {
   chunkRows?: number;
   cutFrom?: { bytes: number; count: number; layers: number } | null;
   channels?: { bytes: number[]; rows: number[] } | null;
+  /** Bytes of the preview; 0 if there is none. */
+  previewBytes?: number;
 }
 
 export class FgsFile {
@@ -133,12 +135,17 @@ export class FgsFile {
   chunks(options?: ChunkOptions): AsyncGenerator<Chunk, void, void>;
   /** One chunk; only of a source of which any part can be had: not of a stream, or of a server that does not know ranges. */
   chunk?(index: number, options?: { sh?: boolean }): Promise<Chunk>;
+  /** The bytes of the preview, which is a file of its own; none if there is none. */
+  previewBytes(): Promise<Uint8Array>;
   /** Stop reading a stream. */
   close(): Promise<void>;
 }
 
 /** Open a file: read and check its header and its model. Throws `FgsError` for a file that breaks the format. */
 export function open(source: Source, options?: OpenOptions): Promise<FgsFile>;
+
+/** Open the preview of a file: the same scene in far fewer Gaussians, to show until the first layer is there. Null if there is none. */
+export function openPreview(file: FgsFile, name?: string): Promise<FgsFile | null>;
 
 /** Whether bytes begin like a `.fgs` file of any version. */
 export function looksLikeFgs(bytes: Uint8Array): boolean;

@@ -7,6 +7,7 @@ import { openStreamed } from './streamed.js';
 export { FgsError } from './errors.js';
 export { FgsFile } from './file.js';
 export { prefetch } from './http.js';
+export { openPreview } from './preview.js';
 
 /**
  * Open a `.fgs` file of version 1 or 2: read and check its header and its model. See `index.d.ts`.

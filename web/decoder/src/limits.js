@@ -5,6 +5,7 @@ export const COUNT_MOST = 2 ** 32 - 1;
 export const DEGREE_MOST = 4;
 export const HEADER_MOST = 1 << 20;
 export const MODEL_MOST = 1 << 20;
+export const PREVIEW_MOST = 1 << 24;
 export const LAYERS_MOST = 256;
 export const CHUNK_ROWS = 65536;
 export const DEPTH_MOST = 21;

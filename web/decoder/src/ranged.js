@@ -21,7 +21,12 @@ class RangedFile extends FgsFile {
   #parts = null;
 
   constructor(source, name, frame) {
-    super(frame, (options) => this.#inOrder(options));
+    const { chunksOffset, previewBytes = 0 } = frame.header;
+    super(
+      frame,
+      (options) => this.#inOrder(options),
+      () => source.read(chunksOffset - previewBytes, previewBytes),
+    );
     this.#source = source;
     this.#name = name;
     this.#frame = frame;

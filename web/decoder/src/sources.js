@@ -1,18 +1,7 @@
 // Where bytes come from. Ranged sources give any part of a file; streamed ones give all bytes once.
 import { bodyOf, prefetch, prefetched } from './http.js';
 import { StreamSource } from './incoming.js';
-
-/** A whole file in memory. */
-export class MemorySource {
-  constructor(bytes) {
-    this.bytes = bytes;
-    this.size = bytes.length;
-  }
-
-  async read(offset, length) {
-    return this.bytes.subarray(offset, offset + length);
-  }
-}
+import { MemorySource } from './memory.js';
 
 /** A `Blob` or a `File`, which is read part by part. */
 export class BlobSource {

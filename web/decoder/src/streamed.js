@@ -5,7 +5,7 @@ import { readFrame, readHeader, sharedPart } from './frame.js';
 import { leastBytes } from './header2.js';
 import { PREAMBLE_BYTES } from './limits.js';
 import { checkedChunk, chunkError, decodePlace, readTable } from './parts.js';
-import { compareCrc, readPreamble, wrongSize } from './preamble.js';
+import { compareCrc, readPreamble, truncated, wrongSize } from './preamble.js';
 
 /** Bytes that a first try waits for, as a share of those that a chunk will likely have. */
 const LIKELY = 1.1;
@@ -20,13 +20,19 @@ const LIKELY = 1.1;
 export async function openStreamed(source, name, size = null) {
   try {
     const frame = await streamedFrame(source, name, size);
+    const preview = await nextPreview(source, name, frame.header);
     let used = false;
     const chunks = (options) => {
       if (used) throw new Error('a stream can be read once: open the file again');
       used = true;
       return streamedChunks(source, name, frame, options);
     };
-    return new FgsFile(frame, chunks, () => source.cancel());
+    return new FgsFile(
+      frame,
+      chunks,
+      async () => preview,
+      () => source.cancel(),
+    );
   } catch (error) {
     await source.cancel();
     throw error;
@@ -38,6 +44,14 @@ async function streamedFrame(source, name, size) {
   const preamble = readPreamble(name, await next(source, PREAMBLE_BYTES), size);
   const header = readHeader(name, await next(source, preamble.headerBytes), preamble);
   return readFrame(name, header, preamble.size, await next(source, sharedPart(header).length));
+}
+
+/** The bytes of the preview, which lie before the chunks. */
+async function nextPreview(source, name, { previewBytes = 0 }) {
+  const offset = source.position;
+  const bytes = await next(source, previewBytes);
+  if (bytes.length < previewBytes) throw truncated(name, offset, 'preview', previewBytes, bytes.length);
+  return bytes;
 }
 
 async function next(source, count) {
@@ -136,4 +150,3 @@ async function wholeLength(source, start) {
   }
   return start + length;
 }
-

@@ -38,6 +38,11 @@ class WorkerFile {
     }
   }
 
+  /** See `FgsFile`. */
+  async previewBytes() {
+    return (await this.#remote.ask({ preview: true })).preview;
+  }
+
   /** Stop decoding, and end the worker. */
   async close() {
     this.#remote.end();

@@ -3,7 +3,8 @@ import { FgsError, open } from './index.js';
 /**
  * Serve one file over a port: `self` in a worker, or one end of a `MessageChannel`.
  *
- * Messages in: { open, options }, { start, values }, { next }, { close }. Out: { opened }, { chunk }, { done }, { error }.
+ * Messages in: { open, options }, { start, values }, { next }, { preview }, { close }. Out: { opened }, { chunk },
+ * { done }, { preview }, { error }.
  */
 export function serve(port) {
   let file = null;
@@ -31,6 +32,8 @@ export function serve(port) {
       // The next one is decoded while this one is drawn. Its fault is reported when it is asked for.
       ahead = chunks.next();
       ahead.catch(() => {});
+    } else if (message.preview) {
+      port.postMessage({ preview: await file.previewBytes() });
     } else if (message.close) {
       await chunks?.return();
       await file?.close();

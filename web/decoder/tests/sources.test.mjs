@@ -2,7 +2,7 @@ import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
 import { createServer } from 'node:http';
 import { test } from 'node:test';
-import { FgsError, looksLikeFgs, open, prefetch } from '../src/index.js';
+import { FgsError, looksLikeFgs, open, openPreview, prefetch } from '../src/index.js';
 import { readAll, streamOf } from './read.mjs';
 
 const NAME = 'three_chunks_of_512_rows_in_two_layers.fgs';
@@ -184,4 +184,29 @@ test('what is no source is a TypeError', async () => {
   await assert.rejects(open(5), TypeError);
   assert.ok(looksLikeFgs(bytes));
   assert.ok(!looksLikeFgs(bytes.subarray(1)));
+});
+
+test('a preview comes before the chunks, and can be opened', async () => {
+  const previewed = new Uint8Array(readFileSync(new URL('a_preview_before_chunks_of_256_rows.fgs', FOLDER)));
+  const small = new Uint8Array(readFileSync(new URL('255_rows.fgs', FOLDER)));
+  for (const given of [previewed, streamOf(previewed, 100)]) {
+    const file = await open(given, { name: 'a.fgs' });
+    assert.deepEqual(await file.previewBytes(), small);
+    const preview = await openPreview(file, 'a.fgs');
+    assert.equal(preview.count, 255);
+    for await (const chunk of preview.chunks()) assert.ok(chunk.verified);
+    let rows = 0;
+    for await (const chunk of file.chunks()) rows += chunk.rows;
+    assert.equal(rows, file.count);
+  }
+  assert.equal(await openPreview(await open(bytes)), null);
+
+  const { chunksOffset } = (await open(previewed)).header;
+  await assert.rejects(open(streamOf(previewed.subarray(0, chunksOffset - 5), 100)), /preview: wanted .* truncated/);
+  previewed[chunksOffset - 3] ^= 1;
+  const file = await open(previewed);
+  const preview = await openPreview(file, 'a.fgs');
+  await assert.rejects(async () => {
+    for await (const chunk of preview.chunks()) assert.ok(chunk);
+  }, /a\.fgs \(preview\): byte \d+: /);
 });

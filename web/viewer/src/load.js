@@ -25,6 +25,13 @@ export function sendChunk(chunk, degree, start, shStart, shEnd) {
   return packed.shRows;
 }
 
+/** Send the chunks of a preview; its rows begin at `start`, those with SH at `shStart`. `degree` is that of the scene. */
+export async function sendPreview(preview, degree, start, shStart) {
+  const shEnd = shStart + headerOf(preview).shRows;
+  let shBefore = shStart;
+  for await (const chunk of preview.chunks()) shBefore += sendChunk(chunk, degree, start + chunk.start, shBefore, shEnd);
+}
+
 /** Send chunk after chunk. */
 export async function sendAll(file) {
   const { shRows } = headerOf(file);

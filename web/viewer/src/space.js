@@ -82,6 +82,11 @@ export class Space {
     return this.parts.every(({ here }) => here);
   }
 
+  /** Whether of the first layer all that is in sight is there; also if nothing is. */
+  get sightIsHere() {
+    return this.parts.every(({ inSight, layer, here }) => here || !inSight || layer > 0);
+  }
+
   /** Rows of the chunks in sight over those of them that are there; 1 if none is. */
   get missing() {
     const sum = (parts) => parts.reduce((total, { rows }) => total + rows, 0);

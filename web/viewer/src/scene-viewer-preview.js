@@ -1,0 +1,3 @@
+import { PreviewViewer } from './preview-viewer.js';
+
+export const SceneViewer = PreviewViewer;
