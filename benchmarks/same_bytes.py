@@ -61,6 +61,8 @@ COMMANDS = {
     "scratch": compress("--effort fast --memory-limit 220MiB"),
     "cluster": compress("--effort fast --cluster local:1"),
     "layers": compress("--effort fast --layers 4 --promise mean"),
+    "preview": compress("--effort fast --preview 6kB"),
+    "preview-scratch": compress("--effort fast --preview 6kB --memory-limit 220MiB"),
     "spz": compress("--effort fast", "out.spz"),
     "sog": compress("--effort fast", "out.sog"),
     "compressed": compress("--effort fast", "out.compressed.ply"),

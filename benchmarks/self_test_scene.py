@@ -219,7 +219,7 @@ def edges(backend: Any) -> None:
             *extra,
         )  # fmt: skip
 
-    call(backend, "residual", rows, rows, 0.25, (some / 16).astype(np.float16), some[::-1].astype(f32), ones[0])
+    call(backend, "residual", rows, rows, (some / 16).astype(np.float16), some[::-1].astype(f32), ones[0])
     # Who reads behind the window's taps finds no zeros.
     moments = np.stack([some % 5, some % 3, some % 7, some % 4, some % 6]).astype(f32) / 8
     call(

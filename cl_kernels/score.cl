@@ -1,19 +1,18 @@
 // Reductions after a blend: residual images, costs of removal and of dropping SH degrees, and SH terms of the colour refit.
 // Twins: flexgs_edge.kernels.twins.score
 
-// target - image, times `factor`, pixel by pixel.
+// target - image, pixel by pixel.
 __kernel void residual(
     const uint count,
-    const float factor,
     __global const half *target,      // [count]
     __global const float *image,      // [count]
     __global float *out)              // [count]
 {
   const size_t i = get_global_id(0) * W;
 #if W == 1
-  out[i] = factor * (vload_half(i, target) - image[i]);
+  out[i] = vload_half(i, target) - image[i];
 #else
-  STOREF((FW)factor * (CAT(vload_half, W)(0, target + i) - LOADF(image, i)), out, i);
+  STOREF(CAT(vload_half, W)(0, target + i) - LOADF(image, i), out, i);
 #endif
 }
 

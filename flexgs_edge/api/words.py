@@ -76,6 +76,7 @@ class CompressWords(TypedDict, total=False):
     distil: int | None
     spz_version: int
     layers: int | None
+    preview: int | None
     scratch: str | None
     resume: bool
     cluster: str | None

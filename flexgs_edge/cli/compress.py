@@ -31,6 +31,7 @@ USUAL = (
     "device",
     "output",
     "layers",
+    "preview",
     "report",
     "json_path",
     "dry_run",
@@ -166,9 +167,14 @@ Several scenes:
     metavar="N",
     type=int,
     default=None,
-    help="Layers, up to 4, that `flexgs-edge trim` can cut and viewers show one by one. Descents make the first of them "
-    "look better, for some more bytes. Default: 2 plain ones for 1 MB or more, if they cost at most 2 %, and if at most "
-    "262144 Gaussians or three fifths of the scene are left.",
+    help="Layers, up to 4, that `trim` can cut and viewers show one by one.",
+)
+@option(
+    OUTPUT,
+    "--preview",
+    type=value_types.SIZE,
+    help="Most bytes of a small scene that viewers show at once; 0: none. Default: 2 % of a file of "
+    "1 MB or more, if at most 262144 Gaussians or three fifths of the scene are left.",
 )
 @shared_options.report_option
 @option(OUTPUT, "--dry-run", is_flag=True, help="Write nothing (no -o needed). The size shown is exact.")

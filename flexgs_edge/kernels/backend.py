@@ -62,7 +62,7 @@ KERNELS: dict[str, KernelSpec] = {
     "blend_residual": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", stats=3),
     "blend_both": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", stats=4),
     "blend_backward": KernelSpec("blend_{form}.cl", _BLEND + "bbb", "tile", stats=5),
-    "residual": KernelSpec("score.cl", "ufbbb", "rows"),
+    "residual": KernelSpec("score.cl", "ubbb", "rows"),
     "add_costs": KernelSpec("score.cl", "uuuuuuubbbbbb", "rows"),
     "sh_residual": KernelSpec("score.cl", "uuuuuubbbbb", "rows"),
     "ssim_columns": KernelSpec("similarity.cl", "uuubbbb", "rows"),

@@ -286,12 +286,10 @@ class Renderer:
         self._blend(view, "blend_both", (hits, sums, residual), again=True)
         return sums
 
-    def gradient_sums(
-        self, scene: DeviceScene, camera: Camera, target: np.ndarray, structure: float = 0.0, weight: float = 1.0
-    ) -> Any:
+    def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray, structure: float = 0.0) -> Any:
         """Gradients of the loss of one view against `target`, for each splat, summed over pixels.
 
-        The loss is the squared error, plus `structure` times 1 - SSIM (`add_structure`), all times `weight`. Let r be
+        The loss is the squared error, plus `structure` times 1 - SSIM (`add_structure`). Let r be
         minus half of its gradient by the view: target minus view, without structure. Let e be the light that a splat
         adds when its alpha grows by its own size. The sums are sum(alpha T r) for red, green, blue, then sum(r e), then
         its moments about the splat's centre: x, y, xx, xy, yy.
@@ -306,9 +304,9 @@ class Renderer:
         view = self._prepare(scene, camera, whole=True)
         self._blend(view, "blend")
         hits, sums = self._sum_arrays(scene, view, GRADIENT_SUMS)
-        residual = target_residual(self.backend, view.buffers, target, weight)
+        residual = target_residual(self.backend, view.buffers, target)
         if structure:
-            add_structure(self.backend, view.buffers, camera, weight * structure)
+            add_structure(self.backend, view.buffers, camera, structure)
         self._blend(view, "blend_backward", (hits, sums, residual), again=True)
         return sums
 

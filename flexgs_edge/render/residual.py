@@ -14,15 +14,15 @@ from flexgs_edge.kernels.window import window
 from flexgs_edge.render.view_buffers import ViewBuffers
 
 
-def target_residual(backend: Backend, buffers: ViewBuffers, target: np.ndarray, factor: float = 1.0) -> Any:
-    """What the drawn view lacks of `target` ([3, H, W] f16, laid out as by `Renderer.render_planes`), times `factor`.
+def target_residual(backend: Backend, buffers: ViewBuffers, target: np.ndarray) -> Any:
+    """What the drawn view lacks of `target` ([3, H, W] f16, laid out as by `Renderer.render_planes`).
 
-    The result is an array of the backend, [3 H W] f32: `factor` (`target` - view).
+    The result is an array of the backend, [3 H W] f32: `target` - view.
     The target must not change afterwards, since the device may read it later.
     """
     half, residual = buffers.reference_arrays()
     backend.write(half, target.reshape(-1), stays=True)
-    backend.launch("residual", (residual.shape[0],), residual.shape[0], factor, half, buffers.image, residual)
+    backend.launch("residual", (residual.shape[0],), residual.shape[0], half, buffers.image, residual)
     return residual
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from flexgs_edge.cameras.camera import split_views
+from flexgs_edge.codec.v2.header import PREVIEW_MOST
 from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, MAX_VIEW_WIDTH
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.choice import Choice
@@ -51,6 +52,7 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "refit": ("best", True),
     "distil": ("best", None),
     "layers": ("best", None),
+    "preview": ("best", None),
     "scratch": ("best", None),
     "resume": ("best", False),
     "cluster": ("best", None),
@@ -206,9 +208,11 @@ class CompressOptions(ViewOptions):
     spz_version : {3, 4}
         Version of a `.spz` that is written. Older programs read only 3. Default: 3.
     layers : int, optional
-        Write the file in 1 to 4 layers, between which `trim` can cut it (`best`). Descents make the first of them look better,
-        for some more bytes. Default: 2 plain ones for a file of a megabyte or more, if the first layer costs at most 2 %
-        more bytes, no target forbids them, and at most 262 144 Gaussians or three fifths of the scene are left; else 1.
+        Write the file in 1 to 4 layers, between which `trim` can cut it (`best`). Default: 1.
+    preview : int, optional
+        Most bytes of a preview: the same scene in far fewer Gaussians, which viewers show until the first layer is there
+        (`best`); 0 for none. Default: 2 % of a file of a megabyte or more, if no target forbids them, and at most 262 144
+        Gaussians or three fifths of the scene are left; else 0.
     scratch : str, optional
         Folder for scratch files of scenes that do not fit into memory (`best`). Default: the folder of the output.
     resume : bool
@@ -250,6 +254,7 @@ class CompressOptions(ViewOptions):
     distil: int | None = None
     spz_version: int = 3
     layers: int | None = None
+    preview: int | None = None
     scratch: str | None = None
     resume: bool = False
     cluster: str | None = None
@@ -287,6 +292,8 @@ class CompressOptions(ViewOptions):
             raise InputError(f"--distil {self.distil}: expected 0 (none) to {DISTIL_MOST} steps")
         if self.layers is not None and not 1 <= self.layers <= LAYERS_MOST:
             raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
+        if self.preview is not None and not 0 <= self.preview <= PREVIEW_MOST:
+            raise InputError(f"--preview {self.preview}: expected 0 (none) to {PREVIEW_MOST} bytes")
         if self.score_cache is not None and self.score not in ("gs", "meson"):
             raise InputError(f"--score-cache keeps scores that are computed: leave it out with --score {self.score}")
         _ = self.writing

@@ -68,6 +68,8 @@ def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOpti
         )
     if options.layers is not None and options.layers > 1:
         raise InputError(f"--layers {options.layers}: {format.suffix} has no layers; leave it out, or write a .fgs")
+    if options.preview:
+        raise InputError(f"--preview {options.preview}: {format.suffix} has no preview; leave it out, or write a .fgs")
     if options.resume or options.scratch is not None:
         raise InputError(
             f"--{'resume' if options.resume else 'scratch'} works on .fgs files alone: the search for a "

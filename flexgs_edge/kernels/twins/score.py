@@ -9,11 +9,9 @@ from flexgs_edge.kernels.twins.arithmetic import dot3, f32, fma
 from flexgs_edge.kernels.twins.project import block_rows, sh_basis
 
 
-def residual(
-    size: tuple[int, ...], count: int, factor: float, target: np.ndarray, image: np.ndarray, out: np.ndarray
-) -> None:
-    """`target` (f16) minus `image` (f32), times `factor`, pixel by pixel."""
-    out[:] = f32(factor) * (target.astype(f32) - image.reshape(-1))
+def residual(size: tuple[int, ...], count: int, target: np.ndarray, image: np.ndarray, out: np.ndarray) -> None:
+    """`target` (f16) minus `image` (f32), pixel by pixel."""
+    out[:] = target.astype(f32) - image.reshape(-1)
 
 
 def _sum_values(sums: np.ndarray, unit: float) -> np.ndarray:

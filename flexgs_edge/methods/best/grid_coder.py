@@ -51,20 +51,23 @@ class GridCoder:
 
     def bits(self, grid: GridScene) -> BitModel:
         """Bits of its Gaussians. No stream is written for this."""
-        return bit_model(grid, self._encode(grid))
+        known = self._last is not None and self._last[0] is grid
+        return bit_model(grid, self.encoded(grid) if known else self._encode(grid))
 
-    def size(self, grid: GridScene, settings: Mapping[str, Any] | None = None) -> int:
+    def size(self, grid: GridScene, settings: Mapping[str, Any] | None = None, preview: bytes = b"") -> int:
         """Bytes of the file that `write` makes. A search does not know the `settings` yet: without them it is an upper bound."""
         encoded = self.encoded(grid)
         self._trim()
-        size = coded_size(grid, settings or {}, encoded=encoded)
+        size = coded_size(grid, settings or {}, encoded=encoded, preview=preview)
         return size + self._settings_room if settings is None else size
 
-    def write(self, path: str | os.PathLike[str], grid: GridScene, settings: Mapping[str, Any]) -> int:
+    def write(
+        self, path: str | os.PathLike[str], grid: GridScene, settings: Mapping[str, Any], preview: bytes = b""
+    ) -> int:
         """See `write_grid`."""
         encoded = self.encoded(grid)
         self._trim()
-        return write_grid(path, grid, settings, encoded=encoded)
+        return write_grid(path, grid, settings, encoded=encoded, preview=preview)
 
     def _trim(self) -> None:
         """Return the holes that drawing and counting left in the heap, where memory is short."""

@@ -24,7 +24,6 @@ from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.kept import Kept, Refitted
 from flexgs_edge.methods.best.landing import REACH, land
-from flexgs_edge.methods.best.layers import first_layer
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import LAST, Schedule, distil, structure_of
@@ -58,8 +57,6 @@ class GridResults(MultiplierSearch[GridScene]):
         Called with each candidate.
     steps : int
         Views that the descent to a candidate looks at. 0 (default): colours are refitted instead.
-    first : float
-        Share of the bits that a first layer gets. Descents to candidates draw it alone, too. 0 (default): there is none.
     """
 
     def __init__(
@@ -71,10 +68,9 @@ class GridResults(MultiplierSearch[GridScene]):
         refit: bool = True,
         on_step: Callable[[Candidate], None] | None = None,
         steps: int = 0,
-        first: float = 0.0,
     ) -> None:
         super().__init__(rounds, measure, effort, on_step)
-        self.size_of, self.refit, self.steps, self.first = size_of, refit, steps, first
+        self.size_of, self.refit, self.steps = size_of, refit, steps
         if steps:
             self.pruned_part, self.keeps_best = descents.PRUNED_DISTILLED, True
         self._forget()
@@ -209,10 +205,8 @@ class GridResults(MultiplierSearch[GridScene]):
         return descents.Descents(self.steps, len(self.rounds.original.cameras), self._lead)
 
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
-        original, layered = self._looking or self.rounds.original, self.first and step_sizes is not None
-        first = first_layer(kept.planes, kept.degrees, self.first, self.bits, original) if layered else None
-        weight = structure_of(self._lead)
-        return distil(kept.planes, kept.degrees, original, schedule, step_sizes, structure=weight, first=first)
+        original, weight = self._looking or self.rounds.original, structure_of(self._lead)
+        return distil(kept.planes, kept.degrees, original, schedule, step_sizes, structure=weight)
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
         subsets = self.effort.subsets_of(len(self.rounds.original.cameras))

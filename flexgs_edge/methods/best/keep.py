@@ -32,9 +32,13 @@ KEPT_COPIES = 4
 """Copies of a scene's planes that looking for its grid holds: as read, in order, decoded, and codes."""
 
 
-def layers_cost(layers: int | None) -> float:
-    """What a search reckons for the layers asked for, as a factor on bytes. Layers by default come only where they fit."""
-    return 1.0 if layers in (None, 1) else LAYERS_COST
+def reckoned(options: CompressOptions, size: int) -> int:
+    """Bytes that a search reckons with for a file of `size` bytes, with the layers and the preview that were asked for.
+
+    A preview by default comes only where it fits.
+    """
+    cost = 1.0 if options.layers in (None, 1) else LAYERS_COST
+    return round(cost * size) + (options.preview or 0)
 
 
 def kept_as_it_is(
@@ -74,9 +78,8 @@ def kept_as_it_is(
     grid = on_grid(source.read(slice(0, source.count), list(FIELD)), steps, source.origin)
     if grid is None:
         return None
-    reckoned = layers_cost(run.options.layers)
     size = coder.size(grid, {})  # without settings: they hold the measurement, which is not there yet
-    if round(reckoned * size) > limit:
+    if reckoned(run.options, size) > limit:
         return None
     with bench.renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
         measurement = measurement_of(judge.compare(scene, with_ssim=True))
@@ -85,7 +88,7 @@ def kept_as_it_is(
     step = Step(Choice(0, without), size, measurement, target.excess(size, measurement), "multiplier", seconds)
     settings = make_settings(run, SearchResult(step, True, (step,))) if settings_known else None
     size = coder.size(grid, settings)
-    if round(reckoned * size) > limit:
+    if reckoned(run.options, size) > limit:
         return None
     LOG.info("the scene was compressed before and fits: it stays as it is")
     step = replace(step, size=size, excess=target.excess(size, measurement))

@@ -16,7 +16,6 @@ from flexgs_edge.grid.values import values_of
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
-from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.rounds import take_rows
 from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES
 from flexgs_edge.progress import SILENT, Progress
@@ -24,19 +23,14 @@ from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.growth import growth
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
-from flexgs_edge.views.original import Original
 
 HALF = 0.485
 """Share of the bits that stays when the last layer is cut off. It is below .5, so that half of a file's bytes hold the other
 layers and the header."""
-LEAST_LAYERED, FIRST_LAYER, MOST_COST, LAYER_POSES = 1_000_000, 0.125, 1.02, 32
-"""Where nothing is said, files from so many bytes on get two layers. A smaller file comes within a second over 10 Mbit/s. The
-first layer has this share of the bits. Most bytes of a layered file over those of one without, and most poses that decide:
-docs/results/web.md#layers"""
 MOST_LAYERED = 1 << 18
 """So many rows may always be sorted. Of more, see `can_sort`."""
 SORTED_ROW_BYTES = 41
-"""Bytes of memory that sorting takes for each row, even if the scene lies in scratch files: see `_worthiest`."""
+"""Bytes of memory that sorting takes for each row, even if the scene lies in scratch files: see `worthiest`."""
 ROUND, LARGE_ROUND = 0.8, 0.5
 """Share of the bits that stays before costs are measured again; of more than `MOST_LAYERED` rows, the second. Removed Gaussians
 interact, so costs go out of date: docs/results/web.md#layers"""
@@ -48,35 +42,6 @@ def can_sort(rows: int, original: int) -> bool:
     The answer must not depend on the memory limit, as the same command makes the same bytes under each.
     """
     return rows <= MOST_LAYERED or rows * SORTED_ROW_BYTES <= original * SPILLED_ROW_BYTES
-
-
-def layered_where_cheap(
-    grid: GridScene,
-    coder: GridCoder,
-    bench: Bench,
-    cameras: Sequence[Camera],
-    limit: int | None,
-    progress: Progress = SILENT,
-) -> GridScene:
-    """The grid in two layers if these cost little, else as it is.
-
-    Parameters
-    ----------
-    grid : GridScene
-        The scene to sort.
-    coder : GridCoder
-        Tells what the file takes.
-    bench, cameras, progress
-        As for `assign_layers`; a part of the poses decides.
-    limit : int, optional
-        Most bytes of the file.
-    """
-    plain = coder.size(grid)
-    some = cameras[:: -(-len(cameras) // LAYER_POSES)]
-    layered = assign_layers(grid, (FIRST_LAYER,), coder.bits(grid), bench, some, progress)
-    size = coder.size(layered)
-    cheap = size <= MOST_COST * plain and (limit is None or size <= limit)
-    return layered if cheap else grid
 
 
 def assign_layers(
@@ -118,40 +83,13 @@ def assign_layers(
     planes, left, layer = values_of(grid, storage), np.arange(grid.count), np.zeros(grid.count, np.uint8)
     for level, part in zip(range(len(parts), 0, -1), parts, strict=True):
         layer[left] = level
-        left = _worthiest(planes, grid.sh_degrees, left, part, bits, bench, cameras, grid.origin, progress)
+        left = worthiest(planes, grid.sh_degrees, left, part, bits, bench, cameras, grid.origin, progress)
         layer[left] = 0
     order = np.argsort(layer, kind="stable")
     return replace(grid.take(order, storage), layer=layer[order])
 
 
-def first_layer(
-    planes: dict[str, np.ndarray], degrees: np.ndarray, share: float, bits: BitModel, original: Original
-) -> np.ndarray:
-    """[n] bool, the rows that a first layer of `share` of the bits should have, before a descent.
-
-    A part of the poses decides.
-
-    Parameters
-    ----------
-    planes : dict
-        Stored planes ([width, n] f32 by field).
-    degrees : np.ndarray
-        [n] u8, SH degrees.
-    share : float
-        Above 0, at most 1.
-    bits : BitModel
-        Bits of a row of each SH degree.
-    original : Original
-        Its renderer has nothing loaded.
-    """
-    some = original.cameras[:: -(-len(original.cameras) // LAYER_POSES)]
-    rows = np.arange(len(degrees))
-    inside = np.zeros(len(degrees), bool)
-    inside[_worthiest(planes, degrees, rows, share, bits, original.bench, some, original.origin)] = True
-    return inside
-
-
-def _worthiest(
+def worthiest(
     planes: dict[str, np.ndarray],
     degrees: np.ndarray,
     left: np.ndarray,
@@ -161,8 +99,29 @@ def _worthiest(
     cameras: Sequence[Camera],
     origin: np.ndarray,
     progress: Progress = SILENT,
+    keep: float | None = None,
 ) -> np.ndarray:
-    """What stays of the rows `left` when all but `part` of their bits are gone, a part at a time. It is never empty."""
+    """What stays of the rows `left` when all but `part` of their bits are gone, a part at a time. It is never empty.
+
+    Parameters
+    ----------
+    planes : dict
+        Stored planes ([width, n] f32 by field).
+    degrees : np.ndarray
+        [n] u8, SH degrees.
+    left : np.ndarray
+        [k] i64, rows to choose from.
+    part : float
+        Above 0, at most 1.
+    bits : BitModel
+        Bits of a row of each SH degree.
+    bench, cameras, progress
+        As for `assign_layers`.
+    origin : np.ndarray
+        [3] f64, as in `SceneSource`.
+    keep : float, optional
+        Share of the bits that stays before costs are measured again. Default: by the number of rows.
+    """
     renderer, storage = bench.renderer, bench.renderer.storage
     cost = np.array([bits.of_degree(degree) for degree in range(int(degrees.max(initial=0)) + 1)])
     spent = cost[degrees[left]]
@@ -180,7 +139,8 @@ def _worthiest(
         del costs, worth
         spent = spent[order]
         gone = np.cumsum(spent, out=spent)
-        goal = gone[-1] - max(end, (LARGE_ROUND if len(left) > MOST_LAYERED else ROUND) * gone[-1])
+        stays = keep or (LARGE_ROUND if len(left) > MOST_LAYERED else ROUND)
+        goal = gone[-1] - max(end, stays * gone[-1])
         left = np.delete(left, order[: min(int(np.searchsorted(gone, goal)) + 1, len(left) - 1)])
         del order, gone
         spent = cost[degrees[left]]

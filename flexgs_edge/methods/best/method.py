@@ -31,10 +31,11 @@ from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
 from flexgs_edge.methods.best.effort import distil_steps, effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.grid_search import GridSearch
-from flexgs_edge.methods.best.keep import kept_as_it_is, layers_cost
-from flexgs_edge.methods.best.layers import HALF, LEAST_LAYERED, assign_layers, can_sort, layered_where_cheap
+from flexgs_edge.methods.best.keep import kept_as_it_is, reckoned
+from flexgs_edge.methods.best.layers import HALF, assign_layers, can_sort
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch, PosesLacking
 from flexgs_edge.methods.best.poses import ScoredPoses, is_fine, scored_poses
+from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, choose_storage, least_spilled, needed_bytes
 from flexgs_edge.methods.best.view_weights import KnownErrors
@@ -96,15 +97,18 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
             grid_search(run.options, coder), run, bench, poses, judges.decide, checkpoint=kept
         )
         judges.decided()
-        if run.options.layers != 1:
-            grid = _layered(run, coder, bench, poses.cameras, grid)
+        if run.options.layers is not None and run.options.layers > 1:
+            with run.clock.stage("layers"):
+                parts = (HALF,) * (run.options.layers - 1)
+                grid = assign_layers(grid, parts, coder.bits(grid), bench, poses.cameras, run.progress)
         settings = make_settings(run, search)
+        preview = _preview(run, coder, bench, poses.cameras, grid, settings)
         if output is None:
-            size, quality = _tried(run, coder, grid, settings, judges)
+            size, quality = _tried(run, coder, grid, settings, preview, judges)
         else:
             with temporary_name(output, run.options.force, None if kept is None else kept.key) as place:
                 with run.clock.stage("write"):
-                    size = coder.write(place, grid, settings)
+                    size = coder.write(place, grid, settings, preview)
                 limit = run.target.limit_bytes
                 if search.reached and limit is not None and size > limit:
                     raise TargetError(
@@ -129,27 +133,44 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
         )
 
 
-def _layered(
-    run: Run[CompressOptions], coder: GridCoder, bench: Bench, cameras: Sequence[Camera], grid: GridScene
-) -> GridScene:
-    """The grid in as many layers as asked for, or in as many as pay."""
-    if run.options.layers is not None:
-        with run.clock.stage("layers"):
-            parts = (HALF,) * (run.options.layers - 1)
-            return assign_layers(grid, parts, coder.bits(grid), bench, cameras, run.progress)
-    if not can_sort(grid.count, run.source.count) or coder.size(grid) < LEAST_LAYERED:
-        return grid
-    with run.clock.stage("layers"):
-        return layered_where_cheap(grid, coder, bench, cameras, run.target.limit_bytes, run.progress)
+def _preview(
+    run: Run[CompressOptions],
+    coder: GridCoder,
+    bench: Bench,
+    cameras: Sequence[Camera],
+    grid: GridScene,
+    settings: dict[str, Any],
+) -> bytes:
+    """The preview that was asked for, or the one that a large file has by default."""
+    most, limit, size = run.options.preview, run.target.limit_bytes, coder.size(grid, settings)
+    if most is None:
+        large = size >= LEAST_PREVIEWED and can_sort(grid.count, run.source.count)
+        most = int(PREVIEW_SHARE * size) if large else 0
+        if limit is not None and size + most > limit:
+            return b""
+    if not most:
+        return b""
+    with run.clock.stage("preview"):
+        preview = make_preview(grid, most, coder.bits(grid), bench, cameras, settings, run.progress)
+    if preview:
+        LOG.info("a preview of %s comes first", format_size(len(preview)))
+    else:
+        LOG.warning("no preview fits into %s: the file has none", format_size(most))
+    return preview
 
 
 def _tried(
-    run: Run[CompressOptions], coder: GridCoder, grid: GridScene, settings: dict[str, Any], judges: Judges
+    run: Run[CompressOptions],
+    coder: GridCoder,
+    grid: GridScene,
+    settings: dict[str, Any],
+    preview: bytes,
+    judges: Judges,
 ) -> tuple[int, Quality]:
     """Bytes and quality of the file in a dry run. A report reads the contents from a file that is removed afterwards."""
     if run.reporter is not None:
-        run.reporter.read_contents_of(lambda place: coder.write(place, grid, settings))
-    size = coder.size(grid, settings)
+        run.reporter.read_contents_of(lambda place: coder.write(place, grid, settings, preview))
+    size = coder.size(grid, settings, preview)
     return size, judges.measure(MemorySource(values_of(grid, judges.storage), origin=grid.origin))
 
 
@@ -159,13 +180,12 @@ def grid_search(
     """Make searches for the grid of a `.fgs`."""
 
     def size_of(grid: GridScene) -> int:
-        return round(layers_cost(options.layers) * coder.size(grid))
+        return reckoned(options, coder.size(grid))
 
     plan = effort_of(options)
 
     def make(rounds: PruneRounds, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
-        first = HALF ** (options.layers - 1) if options.layers and options.layers > 1 else 0.0
-        return search(rounds, size_of, measure, plan, options.refit, report, rounds.original.steps, first)
+        return search(rounds, size_of, measure, plan, options.refit, report, rounds.original.steps)
 
     return make
 

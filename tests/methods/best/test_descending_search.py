@@ -236,7 +236,7 @@ def between(
     def moved(
         planes: dict[str, np.ndarray], degrees: np.ndarray, original: Any, schedule: Schedule, steps: Any, **words: Any
     ) -> Any:
-        assert steps is None and words == {"first": None, "structure": STRUCTURE}  # the mean alone is asked for
+        assert steps is None and words == {"structure": STRUCTURE}  # the mean alone is asked for
         assert schedule.last == INTERLEAVED_LAST and schedule.iterations == 50
         counts.append(len(degrees))
         return {**planes, "opacity_logits": np.full_like(planes["opacity_logits"], MARK)}

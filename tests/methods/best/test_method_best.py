@@ -31,6 +31,7 @@ from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.check import alive
 from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.growth import GrownSource
 from flexgs_edge.scene.source import MemorySource
 from grid_scenes import make_grid
 from kernel_fixtures import large_budget, open_form
@@ -280,35 +281,75 @@ def test_layers_are_the_same_scene_and_worth_most_first(project: Path, tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("least", "most", "cost", "limit", "layers"),
-    [(10**9, 10**9, 2.0, 0, 1), (0, 10**9, 2.0, 0, 2), (0, 10**9, 0.9, 0, 1), (0, 10**9, 2.0, 1, 1), (0, 9, 2.0, 0, 1)],
+    ("least", "most", "limit", "there"),
+    [(10**9, 10**9, 0, False), (0, 10**9, 0, True), (0, 10**9, 1, False), (0, 9, 0, False)],
 )
-def test_large_files_have_two_layers_where_they_cost_little(
+def test_large_files_have_a_preview_where_it_fits(
     tiny: tuple[Path, CompressResult],
     project: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     least: int,
     most: int,
-    cost: float,
     limit: int,
-    layers: int,
+    there: bool,
 ) -> None:
-    monkeypatch.setattr("flexgs_edge.methods.best.method.LEAST_LAYERED", least)
+    monkeypatch.setattr("flexgs_edge.methods.best.method.LEAST_PREVIEWED", least)
+    monkeypatch.setattr("flexgs_edge.methods.best.method.PREVIEW_SHARE", 0.4)  # of a file this small, 2 % hold nothing
     monkeypatch.setattr("flexgs_edge.methods.best.layers.MOST_LAYERED", most)
     monkeypatch.setattr("flexgs_edge.methods.best.layers.SORTED_ROW_BYTES", 10**3)
-    monkeypatch.setattr("flexgs_edge.methods.best.layers.MOST_COST", cost)
-    # As it is, the file fits by a few bytes, which a second layer would not.
+    # As it is, the file fits by a few bytes, which a preview would not.
     target = {"max_size": tiny[1].size + 20} if limit else {"max_drop": 1.0}
     result = compress(
         tiny[0] if limit else project / "point_cloud.ply",
         tmp_path / "a.fgs",
         **{**TINY, **target, "cameras": str(project / "cameras.json"), "images": str(project / "images")},
     )
-    rows = [layer["rows"] for layer in info(tmp_path / "a.fgs").layers or ()]
-    assert len(rows) == layers and sum(rows) == result.count
-    if layers == 2:
-        assert 0 < rows[0] < 0.3 * result.count
+    preview = info(tmp_path / "a.fgs").preview
+    assert (preview is not None) is there
+    if preview is not None:
+        assert 0 < preview["rows"] < result.count and preview["bytes"] <= 0.4 * result.size
+
+
+def test_a_preview_that_is_asked_for(project: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """It stays in its bytes, and a size target counts it; what is behind it is the file without one."""
+    words = {**TINY, "cameras": str(project / "cameras.json"), "min_fidelity": 40.0}
+    plain = compress(project / "point_cloud.ply", tmp_path / "plain.fgs", **words)
+    result = compress(project / "point_cloud.ply", tmp_path / "a.fgs", preview=2500, **words)
+    found = info(tmp_path / "a.fgs")
+    assert found.preview is not None and 1000 < found.preview["bytes"] <= 2500
+    assert found.overhead_bytes < info(tmp_path / "plain.fgs").overhead_bytes + 40
+    assert result.size == plain.size + found.preview["bytes"] + len(',"preview_bytes":1234')
+    dry = compress(project / "point_cloud.ply", None, preview=2500, dry_run=True, **words)
+    assert dry.size == result.size
+    cut = trim(tmp_path / "a.fgs", tmp_path / "small.fgs", 2500)
+    assert cut.is_preview and "kept  the preview" in cut.summary() and cut.count == found.preview["rows"]
+    small, whole = open_scene(tmp_path / "small.fgs"), open_scene(tmp_path / "a.fgs")
+    assert small.sh_degree == 0 and small.count < whole.count / 2
+    drawn = ("near", "background", "extent", "antialiased")
+    assert small.settings == {name: whole.settings[name] for name in drawn}
+    # Beside as many rows, as large as these would have to be, it looks better.
+    views: dict[str, Any] = {"device": "numpy", "cameras": words["cameras"], "images": "none"}
+    rows = np.arange(0, whole.count, whole.count // small.count)[: small.count]
+    write_ply(tmp_path / "rows.ply", GrownSource(whole.select(rows), whole.count))
+    made, grown = (
+        evaluate(tmp_path / name, tmp_path / "plain.fgs", **views).quality for name in ("small.fgs", "rows.ply")
+    )
+    assert made.fidelity > grown.fidelity + 3
+    assert not trim(tmp_path / "a.fgs", tmp_path / "copy.fgs", result.size).is_preview
+
+    target = {**TINY, "cameras": words["cameras"], "max_size": plain.size}
+    both = compress(project / "point_cloud.ply", tmp_path / "b.fgs", preview=2500, **target)
+    assert both.size <= plain.size and info(tmp_path / "b.fgs").preview is not None
+    with caplog.at_level("WARNING"):
+        compress(project / "point_cloud.ply", tmp_path / "c.fgs", preview=300, **words)
+    assert "no preview fits into 300" in caplog.text and info(tmp_path / "c.fgs").preview is None
+    with pytest.raises(InputError, match="--preview -1: expected 0"):
+        CompressOptions(preview=-1)
+    with pytest.raises(InputError, match="--preview belongs to --method best"):
+        CompressOptions(method="paper", preview=5000)
+    with pytest.raises(InputError, match=r"--preview 5000: \.spz has no preview"):
+        compress(project / "point_cloud.ply", tmp_path / "a.spz", preview=5000, **words)
 
 
 def test_rows_are_sorted_where_their_lists_fit() -> None:

@@ -14,7 +14,6 @@ from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
-from flexgs_edge.methods.best.refit.first_layer import FirstLayer
 from flexgs_edge.methods.best.refit.prices import bit_prices
 from flexgs_edge.methods.best.refit.streamed_descent import StreamedDescent
 from flexgs_edge.render.renderer import Renderer
@@ -42,11 +41,8 @@ def scene(degree: int = 2) -> tuple[dict[str, np.ndarray], np.ndarray]:
     return planes, degrees
 
 
-LAYER = FirstLayer(np.arange(COUNT) % 5 == 1)
-
-
 def course(descent: Any) -> dict[str, np.ndarray]:
-    """Free steps, then steps on a grid with prices, a mean and a first layer, then steps that hold geometry."""
+    """Free steps, then steps on a grid with prices and a mean, then steps that hold geometry."""
     rng = np.random.default_rng(5)
     cameras = [view(seed) for seed in range(4)]
     targets = [rng.random((3, 48, 48)).astype(np.float16) for _ in cameras]
@@ -61,10 +57,8 @@ def course(descent: Any) -> dict[str, np.ndarray]:
                 descent.settle()
             descent.put_on(STEPS)
             for k in range(7):
-                shares = [0.0] * (k % 3) + [max(1 / (k + 1), 0.4)]
-                descent.step(cameras[k * k % 4], targets[k * k % 4], rates, share=shares[0])
-                for share in shares[1:]:
-                    descent.step(cameras[k % 4], targets[k % 4], rates, alone=True, share=share)
+                for share in [0.0] * (k % 3) + [max(1 / (k + 1), 0.4)]:
+                    descent.step(cameras[k * k % 4], targets[k * k % 4], rates, share)
         descent.settle()
         moved: dict[str, np.ndarray] = descent.planes()
     return moved
@@ -80,10 +74,10 @@ def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_same_bits_as_in_memory(form: str, tmp_path: Path) -> None:
     planes, degrees = scene()
     renderer = Renderer(open_form(form), large_budget(), antialiased=form == "w16")
-    whole = course(Descent(renderer, planes, degrees, ORIGIN, view(0), 0.01, LAYER))
+    whole = course(Descent(renderer, planes, degrees, ORIGIN, view(0), 0.01))
     storage = renderer.storage = ScratchStorage(tmp_path, 1 << 30, least=256)
     before, used = renderer.budget.used, storage.used
-    parts = course(StreamedDescent(renderer, planes, degrees, ORIGIN, 0.01, LAYER))
+    parts = course(StreamedDescent(renderer, planes, degrees, ORIGIN, 0.01))
     for name, values in whole.items():
         assert not same_bits(values, planes[name]) and same_bits(np.asarray(parts[name]), values), name
     del parts, values

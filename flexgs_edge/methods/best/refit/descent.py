@@ -11,7 +11,6 @@ from flexgs_edge.constants import LANES
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.methods.best.refit.chunk_state import PLANE_SETS, ChunkState, fields_of, widths
-from flexgs_edge.methods.best.refit.first_layer import WEIGHT, FirstLayer
 from flexgs_edge.methods.best.refit.prices import PRICES
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.fit import GRADIENT_SUMS, sum_bytes
@@ -52,8 +51,6 @@ class Descent:
         The largest view, from which memory is planned.
     structure : float
         Weight of the structural term of the loss (`Renderer.gradient_sums`).
-    first : FirstLayer, optional
-        Drawn alone by steps that ask for it.
 
     Raises
     ------
@@ -69,9 +66,8 @@ class Descent:
         origin: np.ndarray,
         camera: Camera,
         structure: float = 0.0,
-        first: FirstLayer | None = None,
     ) -> None:
-        self.renderer, self.backend, self.structure, self.first = renderer, renderer.backend, structure, first
+        self.renderer, self.backend, self.structure = renderer, renderer.backend, structure
         source = MemorySource(planes, origin=origin, sh_count=int(np.flatnonzero(degrees).max(initial=-1)) + 1)
         self.count, self.widths = source.count, widths(source.sh_degree)
         self._parts: list[ChunkState] = []
@@ -126,38 +122,21 @@ class Descent:
         self.backend.write(self._prices, prices)
         self._priced = True
 
-    def differentiate(self, camera: Camera, target: np.ndarray, alone: bool = False) -> None:
-        """Compute gradients of the loss of a view against `target` ([3, H, W] f16, as for `Renderer.residual_sums`).
-
-        With `alone`, the view shows the first layer alone, and its loss counts less.
-        """
-        if alone:
-            assert self.first is not None
-            for part in self._parts:
-                self.first.draw(self.backend, part.chunk.base, part.chunk.count, part.stored[0], part.stored[2])
-                part.activate()
-        weight = WEIGHT if alone else 1.0
-        sums = self.renderer.gradient_sums(self._scene, camera, target, self.structure, weight)
+    def differentiate(self, camera: Camera, target: np.ndarray) -> None:
+        """Compute gradients of the loss of a view against `target` ([3, H, W] f16, as for `Renderer.residual_sums`)."""
+        sums = self.renderer.gradient_sums(self._scene, camera, target, self.structure)
         for part in self._parts:
             part.differentiate(self.renderer.camera_array, self.renderer.records_array, sums, part.chunk.base)
 
-    def step(
-        self,
-        camera: Camera,
-        target: np.ndarray,
-        rates: dict[str, float],
-        alone: bool = False,
-        share: float = 0.0,
-    ) -> None:
+    def step(self, camera: Camera, target: np.ndarray, rates: dict[str, float], share: float = 0.0) -> None:
         """Take one step of Adam down the loss of a view; `rates` are the largest changes of each field's values.
 
-        With `alone`, that is the first layer's, in which bits cost nothing. Then the running mean of the values moves towards
-        them by `share`; 1 begins it anew.
+        Then the running mean of the values moves towards them by `share`; 1 begins it anew.
         """
-        self.differentiate(camera, target, alone)
+        self.differentiate(camera, target)
         self.backend.write(self._rates, rate_record(rates, self.widths))
         for part in self._parts:
-            part.step(self._rates, self._steps, self._prices if self._priced and not alone else None, share)
+            part.step(self._rates, self._steps, self._prices if self._priced else None, share)
 
     def settle(self) -> None:
         """Take the running mean as the values."""

@@ -14,7 +14,6 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.memory.storage import Storage
-from flexgs_edge.methods.best.refit.first_layer import EVERY, FirstLayer
 from flexgs_edge.methods.best.refit.prices import bit_prices
 from flexgs_edge.methods.best.refit.streamed_descent import open_descent
 from flexgs_edge.scene.rotations import canonical_axes
@@ -147,7 +146,6 @@ def distil(
     step_sizes: StepSizes | None = None,
     rates: dict[str, float] | None = None,
     structure: float = STRUCTURE,
-    first: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """Move all values of a scene towards the original's renders.
 
@@ -167,8 +165,6 @@ def distil(
         Rates by field, in place of those of `rates_for`.
     structure : float
         Weight of 1 - SSIM in the loss, beside the squared error.
-    first : np.ndarray, optional
-        [n] bool, rows of a first layer. Further steps move them so that the layer alone looks well, too (`FirstLayer`).
 
     Returns
     -------
@@ -187,8 +183,7 @@ def distil(
     # Rows with SH come first, so that the other chunks are drawn without SH.
     rows = np.argsort(degrees == 0, kind="stable")
     ordered, degrees = _canonical(planes, rows, storage), degrees[rows]
-    layer = None if first is None or not first.any() else FirstLayer(first[rows])
-    with open_descent(renderer, ordered, degrees, original.origin, largest, structure, layer) as descent:
+    with open_descent(renderer, ordered, degrees, original.origin, largest, structure) as descent:
         if step_sizes is not None and schedule.multiplier > 0 and len(degrees):
             worth = course.bit_weight * schedule.multiplier / len(original.cameras)
             descent.price(bit_prices(ordered, degrees, step_sizes, worth))
@@ -209,10 +204,7 @@ def distil(
                 share = (
                     max(1.0 / (k - part.start + 1), 1.0 / max(course.mean_views * len(cameras), 1.0)) if place else 0.0
                 )
-                both = layer is not None and k % EVERY == EVERY - 1
-                descent.step(cameras[order[k]], original.references[order[k]], moving, share=0.0 if both else share)
-                if both:
-                    descent.step(cameras[order[k]], original.references[order[k]], moving, alone=True, share=share)
+                descent.step(cameras[order[k]], original.references[order[k]], moving, share)
         if len(parts[1]) or len(parts[2]):
             descent.settle()
         moved = descent.planes()

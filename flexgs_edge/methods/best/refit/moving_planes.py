@@ -12,7 +12,6 @@ from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.rows import copy_rows
 from flexgs_edge.methods.best.refit.chunk_state import ORDER, widths
 from flexgs_edge.methods.best.refit.descent import GRID_VALUES
-from flexgs_edge.methods.best.refit.first_layer import FirstLayer
 from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.fit import padded
 from flexgs_edge.scene.source import SceneSource
@@ -60,17 +59,13 @@ class Part:
 
 
 class MovingPlanes:
-    """Fills the chunks that views are drawn from (`ChunkPlanes`): values put on their grids.
-
-    While `alone` is set, only this layer is drawn.
-    """
+    """Fills the chunks that views are drawn from (`ChunkPlanes`): values put on their grids."""
 
     def __init__(self, backend: Backend, source: SceneSource) -> None:
         self.backend, self.origin = backend, source.origin
         self.count, self.sh_count, self.sh_degree = source.count, source.sh_count, source.sh_degree
         self.bounds: dict[int, ChunkBounds] = {}
         self.parts: dict[int, Part] = {}
-        self.alone: FirstLayer | None = None
         self.values = np.zeros(0, np.float32)
         self.steps = backend.array((GRID_VALUES,), np.float32)
         self._room: Any = None
@@ -88,8 +83,6 @@ class MovingPlanes:
             copy_rows(self.values, part.span, host.reshape(-1))
         stored = [planes[name] for name in ORDER]
         self.backend.launch("snap", (stride,), stride, part.degree, self.steps, self._room, *stored)
-        if self.alone is not None:
-            self.alone.draw(self.backend, start, stop - start, stored[1], stored[3])
         self._drawn = self.backend.mark()
         if start not in self.bounds:
             self.bounds[start] = bounds_of(self.backend, stored[0], stored[1], stop - start)

@@ -16,7 +16,6 @@ from flexgs_edge.memory.rows import put_rows, read_rows
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.methods.best.refit.chunk_state import PLANE_SETS, ChunkState, fields_of, widths
 from flexgs_edge.methods.best.refit.descent import Descent, descent_bytes, rate_record, step_record
-from flexgs_edge.methods.best.refit.first_layer import WEIGHT, FirstLayer
 from flexgs_edge.methods.best.refit.moving_planes import MovingPlanes, Part, bounds_of, parts_of
 from flexgs_edge.methods.best.refit.prices import PRICES
 from flexgs_edge.render.chunks import ChunkArrays
@@ -38,7 +37,6 @@ def open_descent(
     origin: np.ndarray,
     camera: Camera,
     structure: float = 0.0,
-    first: FirstLayer | None = None,
 ) -> Descent | StreamedDescent:
     """A descent in memory, or in scratch files if the renderer's storage has them and memory has no room.
 
@@ -48,8 +46,8 @@ def open_descent(
         source = MemorySource(planes, origin=origin)
         with renderer.load(source, descent_bytes(source.sh_degree), references=True, structure=structure > 0) as scene:
             if not renderer.fits(scene, camera):
-                return StreamedDescent(renderer, planes, degrees, origin, structure, first)
-    return Descent(renderer, planes, degrees, origin, camera, structure, first)
+                return StreamedDescent(renderer, planes, degrees, origin, structure)
+    return Descent(renderer, planes, degrees, origin, camera, structure)
 
 
 def streamed_rows(fit: Fit, count: int) -> int:
@@ -78,7 +76,7 @@ class StreamedDescent:
     ----------
     renderer : Renderer
         With nothing loaded. Its storage holds the state.
-    planes, degrees, origin, structure, first
+    planes, degrees, origin, structure
         As for `Descent`.
     """
 
@@ -89,9 +87,8 @@ class StreamedDescent:
         degrees: np.ndarray,
         origin: np.ndarray,
         structure: float = 0.0,
-        first: FirstLayer | None = None,
     ) -> None:
-        self.renderer, self.backend, self.structure, self.first = renderer, renderer.backend, structure, first
+        self.renderer, self.backend, self.structure = renderer, renderer.backend, structure
         self.storage: Storage = renderer.storage
         source = MemorySource(planes, origin=origin, sh_count=int(np.flatnonzero(degrees).max(initial=-1)) + 1)
         self.count, self.widths, fit = source.count, widths(source.sh_degree), renderer.fit
@@ -150,21 +147,9 @@ class StreamedDescent:
         self.backend.write(self._prices, prices)
         self._priced = True
 
-    def step(
-        self,
-        camera: Camera,
-        target: np.ndarray,
-        rates: dict[str, float],
-        alone: bool = False,
-        share: float = 0.0,
-    ) -> None:
+    def step(self, camera: Camera, target: np.ndarray, rates: dict[str, float], share: float = 0.0) -> None:
         """As `Descent.step`."""
-        assert self.first is not None or not alone
-        if alone != (self._planes.alone is not None):
-            self._planes.alone = self.first if alone else None
-            self._planes.bounds.clear()
-        weight = WEIGHT if alone else 1.0
-        sums = self.renderer.gradient_sums(self._scene, camera, target, self.structure, weight)
+        sums = self.renderer.gradient_sums(self._scene, camera, target, self.structure)
         records, shown = self.renderer.records_array, self.renderer.view_rows
         assert shown is not None
         self.backend.write(self._rates, rate_record(rates, self.widths))
@@ -192,16 +177,10 @@ class StreamedDescent:
         self.backend.write(place_records, wide_records)
         self.backend.write(place_sums, wide_sums)
         state.snap(self._planes.steps)
-        if self._planes.alone is not None:
-            self._planes.alone.draw(self.backend, part.base, part.count, state.stored[0], state.stored[2])
         state.differentiate(self.renderer.camera_array, place_records, place_sums, 0)
-        priced = self._priced and self._planes.alone is None
-        state.step(self._rates, self._planes.steps, self._prices if priced else None)
+        state.step(self._rates, self._planes.steps, self._prices if self._priced else None)
         part.stepped = True
-        if self._planes.alone is None:
-            self._planes.bounds[part.base] = bounds_of(self.backend, state.chunk.means, state.stored[0], part.count)
-        else:  # the next view may show the layer alone again, larger than this
-            self._planes.bounds.pop(part.base, None)
+        self._planes.bounds[part.base] = bounds_of(self.backend, state.chunk.means, state.stored[0], part.count)
         for file, array in (
             (self._planes.values, state.values),
             (self._first, state.first),

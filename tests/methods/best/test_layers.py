@@ -1,4 +1,4 @@
-"""First layers in descents: which rows they have, and that these look well alone."""
+"""Which rows are worth most, and what sorting them takes."""
 
 from __future__ import annotations
 
@@ -15,14 +15,9 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.methods.best.costs import RemovalCosts
-from flexgs_edge.methods.best.grid_coder import GridCoder
-from flexgs_edge.methods.best.layers import SORTED_ROW_BYTES, _worthiest, first_layer
-from flexgs_edge.methods.best.method import grid_search
-from flexgs_edge.methods.best.refit.descent import Descent
-from flexgs_edge.methods.best.refit.distil import FIELD_RATES, Schedule, distil
-from flexgs_edge.methods.best.refit.first_layer import WEIGHT, FirstLayer
+from flexgs_edge.methods.best.layers import SORTED_ROW_BYTES, worthiest
+from flexgs_edge.methods.best.refit.distil import FIELD_RATES
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.growth import growth
 from flexgs_edge.scene.source import MemorySource, Planes
@@ -85,11 +80,17 @@ def test_rows_of_a_first_layer(original: Original) -> None:
     """It has the share that was asked for, none that no pose sees, and better rows than chance."""
     planes, bits = scene(), BitModel()
     spent = np.array([bits.of_degree(degree) for degree in range(3)])[DEGREES]
-    inside = first_layer(planes, DEGREES, 0.3, bits, original)
+
+    def layer(share: float) -> np.ndarray:
+        found = np.zeros(COUNT, bool)
+        found[worthiest(planes, DEGREES, np.arange(COUNT), share, bits, original.bench, CAMERAS, np.zeros(3))] = True
+        return found
+
+    inside = layer(0.3)
     assert 0.28 * spent.sum() < spent[inside].sum() <= 0.3 * spent.sum() and not inside[-9:].any()
     others = np.random.default_rng(3).permutation(inside)
     assert error(alone(planes, inside), original) < 0.8 * error(alone(planes, others), original)
-    assert first_layer(planes, DEGREES, 1e-6, bits, original).sum() == 1
+    assert layer(1e-6).sum() == 1
 
 
 def test_sorting_takes_as_much_memory_as_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,58 +112,9 @@ def test_sorting_takes_as_much_memory_as_it_says(tmp_path: Path, monkeypatch: py
     bench = cast(Bench, SimpleNamespace(renderer=renderer))
     tracemalloc.start()
     try:
-        left = _worthiest(planes, degrees, np.arange(count), 0.1, BitModel(), bench, [], np.zeros(3))
+        left = worthiest(planes, degrees, np.arange(count), 0.1, BitModel(), bench, [], np.zeros(3))
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
     assert drawn[0] == count and len(drawn) > 8 and 0 < len(left) < 0.2 * count
     assert peak < SORTED_ROW_BYTES * count, peak / count
-
-
-def test_gradients_of_a_layer_alone(original: Original) -> None:
-    """Those of a scene that has nothing but the layer, grown, times the weight; none for other rows."""
-    planes, inside = scene(), np.arange(COUNT) % 4 == 0
-    renderer, target = original.bench.renderer, np.random.default_rng(5).random((3, 48, 48)).astype(np.float16)
-    order = np.argsort(DEGREES == 0, kind="stable")
-    whole = {name: np.ascontiguousarray(values[..., order]) for name, values in planes.items()}
-    degrees, layer = DEGREES[order], inside[order]
-    with Descent(renderer, whole, degrees, np.zeros(3), CAMERAS[0], 0.02, FirstLayer(layer)) as descent:
-        descent.differentiate(CAMERAS[0], target, alone=True)
-        found = descent.gradients()
-        descent.put_on(None)
-        descent.differentiate(CAMERAS[0], target)
-        after = descent.gradients()
-    with Descent(renderer, alone(whole, layer), degrees[layer], np.zeros(3), CAMERAS[0], 0.02) as descent:
-        descent.differentiate(CAMERAS[0], target)
-        wanted = descent.gradients()
-    with Descent(renderer, whole, degrees, np.zeros(3), CAMERAS[0], 0.02) as descent:
-        descent.differentiate(CAMERAS[0], target)
-        plain = descent.gradients()
-    for name, values in wanted.items():
-        assert not found[name][..., ~layer].any(), name
-        scale = abs(values).max()
-        np.testing.assert_allclose(found[name][..., layer], WEIGHT * values, rtol=1e-3, atol=1e-4 * scale, err_msg=name)
-        np.testing.assert_array_equal(after[name], plain[name], err_msg=name)
-
-
-def test_a_descent_that_knows_its_first_layer(original: Original) -> None:
-    """Alone, the layer is nearer to the original; the whole loses little by it."""
-    planes = scene()
-    inside = first_layer(planes, DEGREES, 0.3, BitModel(), original)
-
-    def moved(first: np.ndarray | None) -> Planes:
-        return distil(planes, DEGREES, original, Schedule(120), None, RATES, first=first)
-
-    without, knowing = moved(None), moved(inside)
-    assert error(alone(knowing, inside), original) < 0.75 * error(alone(without, inside), original)
-    assert error(knowing, original) < 0.2 * error(alone(knowing, inside), original)
-
-
-@pytest.mark.parametrize(("layers", "share"), [(None, 0.0), (1, 0.0), (2, 0.485), (4, 0.485**3)])
-def test_searches_know_the_first_layer_that_is_asked_for(layers: int | None, share: float) -> None:
-    options = CompressOptions(layers=layers)
-    rounds = SimpleNamespace(original=SimpleNamespace(steps=7))
-    made: Any = grid_search(options, cast(GridCoder, None), cast(Any, lambda *words: words))(
-        cast(Any, rounds), cast(Any, None), cast(Any, None)
-    )
-    assert made[-2:] == (7, pytest.approx(share))

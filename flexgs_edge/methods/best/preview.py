@@ -1,0 +1,179 @@
+"""The preview of a file: the same scene in far fewer Gaussians, which viewers show until the first layer is there.
+
+Gaussians are taken away in stages. After each stage, a descent moves those that are left towards pictures of the whole scene.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.codec.v2.container import GridContainer, write_grid
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.grid.values import values_of
+from flexgs_edge.memory.storage import Storage
+from flexgs_edge.methods.best.allocation import BitModel
+from flexgs_edge.methods.best.choose_steps import holdable
+from flexgs_edge.methods.best.effort import STEP_UNIT
+from flexgs_edge.methods.best.layers import worthiest
+from flexgs_edge.methods.best.refit.distil import SHORT, Schedule, distil
+from flexgs_edge.methods.best.rounds import take_rows
+from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.scene.growth import growth
+from flexgs_edge.scene.source import MemorySource, Planes
+from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.original import Original
+from flexgs_edge.views.references import References
+
+LEAST_PREVIEWED, PREVIEW_SHARE = 1_000_000, 0.02
+"""Where nothing is said, files from so many bytes on get a preview, of this share of their bytes. A smaller file comes within a
+second over 10 Mbit/s: docs/results/web.md#preview"""
+DRAWING = "near", "background", "extent", "antialiased"
+"""Settings that say how a file is drawn."""
+STAGES = 8, 4, 2
+"""How many times as many Gaussians each stage leaves as the last one, which comes behind: docs/results/web.md#preview"""
+STEPS, LAST_STEPS, RATE = 150, 400, 2.0
+"""Steps of a descent, and of the last one; factor on the rates, since there is a long way to go."""
+KEPT = 0.5
+"""Share of the bits that stays in a stage before costs are measured again."""
+COARSE = 2.0
+"""Step sizes of the grid in those of the whole scene."""
+POSES, POINTS = 128, 1 << 14
+"""Most poses, and about the most points that are looked at in each of them."""
+TRIES, LESS = 3, 0.97
+"""How often the last stage is made, each time with fewer Gaussians, until the size holds; and a margin for that."""
+
+
+def make_preview(
+    grid: GridScene,
+    most: int,
+    bits: BitModel,
+    bench: Bench,
+    cameras: Sequence[Camera],
+    settings: Mapping[str, Any],
+    progress: Progress = SILENT,
+) -> bytes:
+    """A file of at most `most` bytes, without SH; no bytes if there is no room for one.
+
+    Parameters
+    ----------
+    grid : GridScene
+        The whole scene.
+    most : int
+        Bytes of the preview.
+    bits : BitModel
+        Bits of the scene's Gaussians.
+    bench : Bench
+        Draws the views. Its renderer has nothing loaded.
+    cameras : sequence of Camera
+        The scored poses; a part of them decides.
+    settings : mapping
+        Those of the scene's file; the preview is drawn like it.
+    progress : Progress
+        Told of each view.
+    """
+    if grid.count == 0:
+        return b""
+    storage = bench.renderer.storage
+    drawn = {name: settings[name] for name in DRAWING}
+    planes = values_of(grid, storage)
+    with References(storage.folder) as references:
+        original = _original(planes, grid.origin, references, bench, cameras, progress)
+        small = {**planes, "sh_rest": planes["sh_rest"][:0]}
+        del planes
+        rows = 8 * most / bits.of_degree(0)
+        for times in STAGES:
+            small = _stage(small, times * rows, original, Schedule(STEPS, rate=RATE, course=SHORT))
+        coded = _Coded(small, grid, drawn, storage)
+        for _ in range(TRIES):
+            rows = coded.rows_in(most)
+            if rows < 1:
+                break
+            made = _stage(small, rows, original, Schedule(LAST_STEPS, rate=RATE, course=SHORT), grid.step_sizes)
+            coded = _Coded(made, grid, drawn, storage)
+            if len(coded.file) <= most:
+                return coded.file
+    return b""
+
+
+class _Coded:
+    """A file of some planes without SH, on a coarser grid than that of the whole scene.
+
+    Parameters
+    ----------
+    planes : dict
+        Stored planes ([width, n] f32 by field).
+    whole : GridScene
+        The whole scene.
+    settings : mapping
+        Of the file.
+    storage : Storage
+        Holds the grid.
+    """
+
+    def __init__(self, planes: Planes, whole: GridScene, settings: Mapping[str, Any], storage: Storage) -> None:
+        self.count = planes["means"].shape[1]
+        steps = holdable(_coarse(whole.step_sizes), planes)
+        grid = to_grid(planes, np.zeros(self.count, np.uint8), steps, whole.origin, storage=storage)[0]
+        with tempfile.TemporaryDirectory() as folder:
+            place = Path(folder) / "preview.fgs"
+            write_grid(place, grid, settings)
+            self.file = place.read_bytes()
+            header = GridContainer(place).header
+        self.overhead = header.chunks_offset + header.table_bytes
+
+    def rows_in(self, size: int) -> float:
+        """About how many rows fit into a file of `size` bytes."""
+        share = (size - self.overhead) / (len(self.file) - self.overhead)
+        return float(LESS * share * self.count)
+
+
+def _original(
+    planes: Planes,
+    origin: np.ndarray,
+    references: References,
+    bench: Bench,
+    cameras: Sequence[Camera],
+    progress: Progress,
+) -> Original:
+    """The whole scene from a part of the poses, at a part of their points."""
+    some = [_coarser(camera) for camera in cameras[:: -(-len(cameras) // POSES)]]
+    renderer = bench.renderer
+    with renderer.load(MemorySource(planes, origin=origin)) as scene:
+        for view, camera in enumerate(renderer.in_turn(scene, some)):
+            references.add(view, renderer.render_planes(scene, camera))
+    return Original(bench, origin, some, references, progress=progress)
+
+
+def _coarser(camera: Camera) -> Camera:
+    step = math.floor(math.sqrt(camera.width * camera.height / POINTS) / STEP_UNIT) * STEP_UNIT
+    return camera.every(step) if step > 1 else camera
+
+
+def _stage(
+    planes: Planes, rows: float, original: Original, schedule: Schedule, step_sizes: StepSizes | None = None
+) -> Planes:
+    """About `rows` rows of the planes, which have no SH, as large as they have to be, and moved by a descent."""
+    bench, count = original.bench, planes["means"].shape[1]
+    degrees = np.zeros(count, np.uint8)
+    part, cameras = min(rows / count, 1.0), original.cameras
+    left = worthiest(planes, degrees, np.arange(count), part, BitModel(), bench, cameras, original.origin, keep=KEPT)
+    kept = take_rows(planes, np.sort(left), bench.renderer.storage)
+    kept["log_scales"] += growth(len(left), count)
+    steps = None if step_sizes is None else holdable(_coarse(step_sizes), kept)
+    return distil(kept, degrees[left], original, schedule, steps)
+
+
+def _coarse(steps: StepSizes) -> StepSizes:
+    """Step sizes of a preview: coarser, and none of SH."""
+    geometry = {name: COARSE * getattr(steps, name) for name in ("position", "scale", "rotation", "opacity", "dc")}
+    return replace(steps, **geometry, sh=())
