@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from flexgs_edge.codec.open_fgs import read_header
+from flexgs_edge.codec.v2.container import GridContainer, Preview
+from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_folder, check_writable
@@ -23,6 +25,7 @@ from flexgs_edge.run.decoding import ahead, decoder
 from flexgs_edge.run.inputs import CheckedScene, ScenePlace, load_scene, scene_info
 from flexgs_edge.run.open_bench import run_info
 from flexgs_edge.run.open_scene import is_fgs, scene_file
+from flexgs_edge.scene.source import SceneSource
 
 WRITE_COPIES = 3
 """Copies of a chunk's rows in memory while decoding and writing: codes, planes, rows of the PLY."""
@@ -94,8 +97,9 @@ def decompress(
             budget.require(f"writing a {format.suffix}", format.memory * scene.source.count)
             writing = replace(writing, antialiased=antialiased)
             if streamed:
+                layers, preview = _layers(input, scene.source.count, reading)
                 notes = write_streamed(
-                    Path(output).parent, scene.source, _layers(input, scene.source.count), force=force, writing=writing
+                    Path(output).parent, scene.source, layers, preview=preview, force=force, writing=writing
                 )
             else:
                 notes = write_foreign(output, scene.source, force=force, writing=writing)
@@ -110,14 +114,19 @@ def decompress(
     return DecompressResult(scene_info(scene), os.fspath(output), size, run_info(budget, clock, backend), notes)
 
 
-def _layers(input: ScenePlace, count: int) -> tuple[int, ...]:
-    """Gaussians of each layer of a layered `.fgs`; other scenes have one."""
+def _layers(input: ScenePlace, count: int, reading: Reading) -> tuple[tuple[int, ...], SceneSource | None]:
+    """Gaussians of each layer of a layered `.fgs`, and its preview, if there is one; other scenes have one layer.
+
+    Where the scene is turned, its preview is left out.
+    """
     if not isinstance(input, CheckedScene):
         place = scene_file(input)
         header = read_header(place) if is_fgs(place) else None
         if isinstance(header, GridHeader) and sum(header.layers) == count:
-            return tuple(header.layers)
-    return (count,)
+            wanted = header.preview.length and reading.frame is None
+            preview = GridSource(place, Preview(GridContainer(place))) if wanted else None
+            return tuple(header.layers), preview
+    return (count,), None
 
 
 def _written_bytes(output: Path) -> int:

@@ -89,16 +89,21 @@ def write_streamed(
     source: SceneSource,
     layers: Sequence[int],
     *,
+    preview: SceneSource | None = None,
     force: bool = False,
     writing: Writing = PLAIN,
 ) -> tuple[str, ...]:
-    """Write a scene as streamed SOG; `layers` counts the rows of each layer, in their order. Otherwise as `write_foreign`."""
+    """Write a scene as streamed SOG; `layers` counts the rows of each layer, in their order. Otherwise as `write_foreign`.
+
+    A preview is the coarsest level.
+    """
     format = FORMATS[".sog"]
     if source.count == 0:
         raise InputError(f"{source.name}: the scene is empty: nothing to write to {folder}")
     world = _WorldSource(without_degrees(source, format.max_degree))
     with atomic_folder(folder, force) as place:
-        write_streamed_sog(place, in_frame(world, format.frame), layers, writing)
+        small = None if preview is None else in_frame(_WorldSource(preview), format.frame)
+        write_streamed_sog(place, in_frame(world, format.frame), layers, writing, small)
     return _notes(source, format)
 
 

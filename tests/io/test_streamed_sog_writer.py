@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,13 @@ import numpy as np
 import pytest
 
 from flexgs_edge.codec.v2.container import write_grid
+from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.io import streamed_sog_writer
 from flexgs_edge.io.exchange import read_foreign
+from flexgs_edge.io.frames import Frame
 from flexgs_edge.io.ply import PlySource, write_ply
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.run.open_scene import open_scene
@@ -100,6 +103,36 @@ def test_parts_lie_in_their_boxes(scene: Path, tmp_path: Path, monkeypatch: pyte
     assert at == ROWS
     for end, pick in (("min", np.min), ("max", np.max)):
         assert tree["bound"][end] == pytest.approx(pick([leaf["bound"][end] for leaf in found], axis=0))
+
+
+def test_a_preview_is_the_coarsest_level(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its Gaussians are in the part of the tree where they lie, and as large as they are."""
+    monkeypatch.setattr(streamed_sog_writer, "LEAF_ROWS", 90)
+    planes = {name: np.ascontiguousarray(values[..., ::7]) for name, values in make_planes(ROWS, 2, 0).items()}
+    rows = np.zeros(planes["means"].shape[1], np.uint8)
+    small = to_grid({**planes, "sh_rest": planes["sh_rest"][:0]}, rows, replace(STEPS, sh=()), (5.0, -2.0, 0.0))[0]
+    write_grid(tmp_path / "small.fgs", small, {})
+    write_grid(tmp_path / "both.fgs", GridSource(scene).grid(), {}, preview=(tmp_path / "small.fgs").read_bytes())
+    decompress(tmp_path / "both.fgs", tmp_path / "out" / "lod-meta.json")
+    meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
+    assert (meta["lodLevels"], meta["counts"]) == (3, [ROWS, 150, len(rows)])
+    found = [leaf for leaf in leaves(meta["tree"]) if "2" in leaf["lods"]]
+    assert sum(leaf["lods"]["2"]["count"] for leaf in found) == len(rows) and len(found) > 1
+    last, whole, at = level(tmp_path / "out", 2), open_scene(tmp_path / "small.fgs"), 0
+    for leaf in found:
+        count = leaf["lods"]["2"]["count"]
+        here = means(last, slice(at, at + count))
+        low, high = (np.array(leaf["bound"][end])[:, None] for end in ("min", "max"))
+        assert (here > low).all() and (here < high).all()
+        at += count
+    every = slice(0, len(rows))
+    tolerance = np.abs(means(whole, every)).max() / 2000
+    np.testing.assert_allclose(np.sort(means(last, every)), np.sort(means(whole, every)), atol=tolerance)
+    # The format may exchange a Gaussian's axes.
+    scales = [np.sort(source.read(every, ["log_scales"])["log_scales"], axis=None) for source in (last, whole)]
+    np.testing.assert_allclose(*scales, atol=0.05)
+    decompress(tmp_path / "both.fgs", tmp_path / "turned" / "lod-meta.json", reading=Reading(frame=Frame("RUB")))
+    assert json.loads((tmp_path / "turned" / "lod-meta.json").read_text())["lodLevels"] == 2
 
 
 def test_a_scene_without_layers_has_one_level(tmp_path: Path) -> None:

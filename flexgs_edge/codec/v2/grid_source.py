@@ -34,6 +34,8 @@ class GridSource(SceneSource):
     ----------
     path : path
         The file.
+    container : GridContainer, optional
+        The file, if it is open, or its `Preview`.
 
     Attributes
     ----------
@@ -46,8 +48,8 @@ class GridSource(SceneSource):
         If the file differs from the format; a damaged chunk raises it when it is read.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.container = GridContainer(path)
+    def __init__(self, path: str | os.PathLike[str], container: GridContainer | None = None) -> None:
+        self.container = container or GridContainer(path)
         header = self.container.header
         self.name, self.notes = str(path), ()
         self.count, self.sh_degree = header.count, header.sh_degree

@@ -27,12 +27,12 @@ from flexgs_edge.views.bench import Bench
 HALF = 0.485
 """Share of the bits that stays when the last layer is cut off. It is below .5, so that half of a file's bytes hold the other
 layers and the header."""
-MOST_LAYERED = 1 << 18
+MOST_SORTED = 1 << 18
 """So many rows may always be sorted. Of more, see `can_sort`."""
 SORTED_ROW_BYTES = 41
 """Bytes of memory that sorting takes for each row, even if the scene lies in scratch files: see `worthiest`."""
 ROUND, LARGE_ROUND = 0.8, 0.5
-"""Share of the bits that stays before costs are measured again; of more than `MOST_LAYERED` rows, the second. Removed Gaussians
+"""Share of the bits that stays before costs are measured again; of more than `MOST_SORTED` rows, the second. Removed Gaussians
 interact, so costs go out of date: docs/results/web.md#layers"""
 
 
@@ -41,7 +41,7 @@ def can_sort(rows: int, original: int) -> bool:
 
     The answer must not depend on the memory limit, as the same command makes the same bytes under each.
     """
-    return rows <= MOST_LAYERED or rows * SORTED_ROW_BYTES <= original * SPILLED_ROW_BYTES
+    return rows <= MOST_SORTED or rows * SORTED_ROW_BYTES <= original * SPILLED_ROW_BYTES
 
 
 def assign_layers(
@@ -139,7 +139,7 @@ def worthiest(
         del costs, worth
         spent = spent[order]
         gone = np.cumsum(spent, out=spent)
-        stays = keep or (LARGE_ROUND if len(left) > MOST_LAYERED else ROUND)
+        stays = keep or (LARGE_ROUND if len(left) > MOST_SORTED else ROUND)
         goal = gone[-1] - max(end, stays * gone[-1])
         left = np.delete(left, order[: min(int(np.searchsorted(gone, goal)) + 1, len(left) - 1)])
         del order, gone

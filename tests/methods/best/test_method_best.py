@@ -296,7 +296,7 @@ def test_large_files_have_a_preview_where_it_fits(
 ) -> None:
     monkeypatch.setattr("flexgs_edge.methods.best.method.LEAST_PREVIEWED", least)
     monkeypatch.setattr("flexgs_edge.methods.best.method.PREVIEW_SHARE", 0.4)  # of a file this small, 2 % hold nothing
-    monkeypatch.setattr("flexgs_edge.methods.best.layers.MOST_LAYERED", most)
+    monkeypatch.setattr("flexgs_edge.methods.best.layers.MOST_SORTED", most)
     monkeypatch.setattr("flexgs_edge.methods.best.layers.SORTED_ROW_BYTES", 10**3)
     # As it is, the file fits by a few bytes, which a preview would not.
     target = {"max_size": tiny[1].size + 20} if limit else {"max_drop": 1.0}
