@@ -30,7 +30,8 @@ MODEL_MOST = 1 << 20
 """Most bytes of the model; 59 alphabets of 256 symbols and 64 tables need less."""
 LAYERS_MOST = 256
 PREVIEW_MOST = 1 << 24
-"""Most bytes of a preview."""
+PREVIEW_KEY = len(',"preview_bytes":16777216')
+"""Most bytes of a preview, and most bytes by which it makes the header longer."""
 
 _KEYS = (
     "chunk_rows",

@@ -9,6 +9,7 @@ import logging
 import time
 from dataclasses import replace
 
+from flexgs_edge.codec.v2.header import PREVIEW_KEY
 from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.steps import SearchResult, Step
 from flexgs_edge.grid.grid_scene import GridScene
@@ -38,7 +39,12 @@ def reckoned(options: CompressOptions, size: int) -> int:
     A preview by default comes only where it fits.
     """
     cost = 1.0 if options.layers in (None, 1) else LAYERS_COST
-    return round(cost * size) + (options.preview or 0)
+    return round(cost * size) + with_preview(options.preview or 0)
+
+
+def with_preview(size: int) -> int:
+    """Most bytes by which a preview of `size` bytes makes a file longer; 0 if there is none."""
+    return size + PREVIEW_KEY if size else 0
 
 
 def kept_as_it_is(

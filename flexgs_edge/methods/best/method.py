@@ -31,7 +31,7 @@ from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
 from flexgs_edge.methods.best.effort import distil_steps, effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder
 from flexgs_edge.methods.best.grid_search import GridSearch
-from flexgs_edge.methods.best.keep import kept_as_it_is, reckoned
+from flexgs_edge.methods.best.keep import kept_as_it_is, reckoned, with_preview
 from flexgs_edge.methods.best.layers import HALF, assign_layers, can_sort
 from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch, PosesLacking
 from flexgs_edge.methods.best.poses import ScoredPoses, is_fine, scored_poses
@@ -146,7 +146,7 @@ def _preview(
     if most is None:
         large = size >= LEAST_PREVIEWED and can_sort(grid.count, run.source.count)
         most = int(PREVIEW_SHARE * size) if large else 0
-        if limit is not None and size + most > limit:
+        if limit is not None and size + with_preview(most) > limit:
             return b""
     if not most:
         return b""
