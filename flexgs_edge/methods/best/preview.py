@@ -44,9 +44,9 @@ STAGES = 8, 4, 2
 STEPS, LAST_STEPS, RATE = 150, 400, 2.0
 """Steps of a descent, and of the last one; factor on the rates, since there is a long way to go."""
 KEPT = 0.5
-"""Share of the bits that stays in a stage before costs are measured again."""
+"""Share of the bits that stays in a stage before costs are measured again: docs/results/web.md#preview"""
 COARSE = 2.0
-"""Step sizes of the grid in those of the whole scene."""
+"""Step sizes of the preview's grid, as multiples of those of the whole scene's."""
 POSES, POINTS = 128, 1 << 14
 """Most poses, and about the most points that are looked at in each of them."""
 TRIES, LESS = 3, 0.97
