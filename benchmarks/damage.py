@@ -5,12 +5,14 @@ Every function draws its choices from a given `random.Random`, so that the same 
 
 from __future__ import annotations
 
+import functools
 import gzip
 import io
 import json
 import random
 import re
 import struct
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
@@ -18,6 +20,7 @@ from collections.abc import Callable, Sequence
 import zstandard
 
 from flexgs_edge.codec.header import Section
+from flexgs_edge.codec.open_fgs import verify
 from flexgs_edge.codec.v1.header import HEADER_STEP
 
 NUMBERS = (0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x100, 0x7FFF, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
@@ -217,6 +220,30 @@ def mutate_sealed(draw: random.Random, data: bytes, sections: Sequence[Section])
         made[section.offset : section.offset + len(body)] = body
         _sum_behind(made, section)
     return bytes(made)
+
+
+def mutate_preview(draw: random.Random, data: bytes, sections: Sequence[Section]) -> bytes:
+    """Change the preview of a container, which is a container too, and correct all checksums.
+
+    `sections` are those of `data`.
+    """
+    header, part = (next(each for each in sections if each.name == name) for name in ("header", "preview"))
+    inner = data[part.offset : part.offset + part.length]
+    changed = mutate_sealed(draw, inner, _sections_of(inner))
+    key = b'"preview_bytes":'
+    text = data[header.offset : header.offset + header.length].replace(
+        key + b"%d" % part.length, key + b"%d" % len(changed)
+    )
+    behind = data[header.offset + header.length : part.offset]
+    return _seal(data[: header.offset] + text + behind + changed + data[part.offset + part.length :], len(text))
+
+
+@functools.cache
+def _sections_of(container: bytes) -> tuple[Section, ...]:
+    with tempfile.NamedTemporaryFile(suffix=".fgs") as file:
+        file.write(container)
+        file.flush()
+        return tuple(verify(file.name))
 
 
 def _same_size(draw: random.Random, body: bytes) -> bytes:

@@ -33,6 +33,7 @@ from benchmarks.damage import (
     mutate_bytes,
     mutate_glb,
     mutate_json,
+    mutate_preview,
     mutate_sealed,
     mutate_sparse,
     mutate_spz,
@@ -43,6 +44,8 @@ from benchmarks.damage import (
 from benchmarks.harness import ROOT
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.codec.open_fgs import open_fgs, read_header, verify
+from flexgs_edge.codec.v2.container import GridContainer, Preview
+from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.errors import FlexGSError, FormatError
 from flexgs_edge.io.exchange import read_foreign
 from flexgs_edge.io.ply import PlySource
@@ -80,6 +83,14 @@ def read_container(place: Path) -> str:
     outcome = read_all(source)
     if outcome != "read":
         raise AssertionError("a .fgs gave values that are not finite")
+    return outcome
+
+
+def read_preview(place: Path) -> str:
+    """Decode the preview of a `.fgs`, and check that its values are finite."""
+    outcome = read_all(GridSource(place, Preview(GridContainer(place))))
+    if outcome != "read":
+        raise AssertionError("a preview gave values that are not finite")
     return outcome
 
 
@@ -147,6 +158,8 @@ KINDS = (
     Kind("v2 plain", ("v2.fgs",), mutate_bytes, find, 440_000),
     Kind("v1 sealed", ("v1.fgs",), mutate_sealed, read_container, 16_000, sealed=True),
     Kind("v2 sealed", ("v2.fgs",), mutate_sealed, read_container, 4_000, sealed=True),
+    Kind("v2 plain, with a preview", ("v2_preview.fgs",), mutate_bytes, find, 40_000),
+    Kind("v2 sealed, its preview", ("v2_preview.fgs",), mutate_preview, read_preview, 4_000, sealed=True),
     Kind("PLY", ("binary.ply", "ascii.ply", "big.ply"), mutate_text, read_ply, 20_000),
     Kind("cameras.json, transforms.json", ("cameras.json", "transforms.json"), mutate_json, read_views, 10_000),
     Kind("COLMAP", ("text/cameras.txt", "text/images.txt", "binary/cameras.bin", "binary/images.bin"), mutate_text, read_views,

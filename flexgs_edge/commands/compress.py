@@ -143,6 +143,7 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
         run=bench_info(run, bench),
         format=run.output.format.suffix[1:] if run.output.format else "fgs",
         file_sh_degree=made.sh_degree,
+        preview_bytes=made.preview_bytes,
         scored=scored,
         training_fidelity=made.trained,
         warnings=(*run.doubts, *warnings),

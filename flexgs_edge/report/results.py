@@ -92,6 +92,8 @@ class CompressResult:
         Reasons to trust the figures less. Each names a number and what to do.
     promise : KeptPromise or None
         How the bounds beside the target stand on the deciding views; `None` without such bounds.
+    preview_bytes : int
+        Bytes of the file that are its preview (`best`); 0 if it has none.
     """
 
     scene: SceneInfo
@@ -126,6 +128,7 @@ class CompressResult:
     training_fidelity: float | None = None
     warnings: tuple[str, ...] = ()
     promise: KeptPromise | None = None
+    preview_bytes: int = 0
 
     @property
     def ratio(self) -> float:
@@ -153,6 +156,7 @@ class CompressResult:
             "format": self.format,
             "file_sh_degree": self.file_sh_degree,
             "size": self.size,
+            "preview_bytes": self.preview_bytes,
             "ratio": round(self.ratio, 4),
             "ratio_without_normals": round(self.ratio_without_normals, 4),
             "ratio_of_input": rounded(self.ratio_of_input),
@@ -192,6 +196,9 @@ class CompressResult:
             lines.append(line("would write", f"{size}; nothing was written (--dry-run)"))
         else:
             lines.append(line("wrote", f"{self.output}, {size}"))
+        if self.preview_bytes:
+            share = f"{100 * self.preview_bytes / self.size:.2g} % of it"
+            lines.append(line("preview", f"{format_size(self.preview_bytes)}, {share}"))
         lines += ratio_lines(self.scene, self.size)
         share = f"{self.count} of {self.scene.count} Gaussians, {self.sh_count} of them with SH"
         lines.append(line("kept", f"{share} (prune rate {self.prune_rate:g}, SH rate {self.sh_rate:g})"))

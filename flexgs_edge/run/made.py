@@ -41,6 +41,8 @@ class Made:
         Loss per attribute and bit width, as `--bits auto` measured it.
     scores_reused : bool
         Whether the scores came from the cache.
+    preview_bytes : int
+        Bytes of the file that are its preview (`best`); 0 if it has none.
     """
 
     size: int
@@ -56,3 +58,4 @@ class Made:
     step_sizes: StepSizes | None = None
     sensitivity: tuple[Sensitivity, ...] = ()
     scores_reused: bool = False
+    preview_bytes: int = 0

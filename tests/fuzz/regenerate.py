@@ -48,6 +48,10 @@ def write_seeds() -> None:
     spec = BitSpec(9, 4, 4, 5, 3, 2)
     write_container(SEEDS / "v1.fgs", quantize_all(make_scene(9), spec), {"near": 0.2}, force=True)
     write_grid(SEEDS / "v2.fgs", make_grid(9, 1, layers=2), {"near": 0.2}, force=True)
+    write_grid(SEEDS / "small.fgs", make_grid(3, 0), {}, force=True)
+    preview = (SEEDS / "small.fgs").read_bytes()
+    (SEEDS / "small.fgs").unlink()
+    write_grid(SEEDS / "v2_preview.fgs", make_grid(9, 1), {"near": 0.2}, force=True, preview=preview)
     rows = random_rows(3, 1)
     write_rows(SEEDS / "binary.ply", rows)
     write_rows(SEEDS / "big.ply", random_rows(3, 0, order=">"))
@@ -149,6 +153,15 @@ def claim(**values: Any) -> Change:
     return lambda path: edit_header(path, lambda record: record.update(values))
 
 
+def _less(key: str) -> Callable[[dict[str, Any]], None]:
+    """A number of the header made one smaller."""
+
+    def change(record: dict[str, Any]) -> None:
+        record[key] -= 1
+
+    return change
+
+
 def sealed(section: str, change: Callable[[bytearray], object]) -> Change:
     """A change of a section, under a checksum that is right again."""
     return lambda path: reseal_section(path, section, change)
@@ -186,6 +199,9 @@ HOSTILE: dict[str, tuple[str, Change]] = {
         "v2.fgs",
         sealed("chunk table", lambda body: struct.pack_into("<I", body, 0, 2**32 - 2)),
     ),
+    "v2-preview-of-no-bytes.fgs": ("v2_preview.fgs", claim(preview_bytes=0)),
+    "v2-preview-beyond-the-end.fgs": ("v2_preview.fgs", claim(preview_bytes=2**31 - 1)),
+    "v2-preview-cut.fgs": ("v2_preview.fgs", lambda path: edit_header(path, _less("preview_bytes"))),
     "count-1e18.ply": ("binary.ply", words("element vertex 3", "element vertex 1000000000000000000")),
     "count-of-many-digits.ply": ("binary.ply", words("element vertex 3", f"element vertex {'9' * 5000}")),
     "cut.ply": ("binary.ply", cut(900)),

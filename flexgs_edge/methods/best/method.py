@@ -112,8 +112,8 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
                 limit = run.target.limit_bytes
                 if search.reached and limit is not None and size > limit:
                     raise TargetError(
-                        f"{run.target.describe()}: {run.options.layers} layers make the file {size} bytes; "
-                        "ask for fewer layers"
+                        f"{run.target.describe()}: with its layers and its preview the file has {size} bytes; "
+                        "ask for fewer layers (--layers) or a smaller preview (--preview)"
                     )
                 quality = judges.measure(decoded(open_fgs(place), bench.renderer))
             LOG.info("wrote %s, %s", output, format_size(size))
@@ -130,6 +130,7 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
             quality=quality,
             trained=judges.trained,
             step_sizes=grid.step_sizes,
+            preview_bytes=len(preview),
         )
 
 

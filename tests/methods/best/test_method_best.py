@@ -320,6 +320,10 @@ def test_a_preview_that_is_asked_for(project: Path, tmp_path: Path, caplog: pyte
     assert found.preview is not None and 1000 < found.preview["bytes"] <= 2500
     assert found.overhead_bytes < info(tmp_path / "plain.fgs").overhead_bytes + 40
     assert result.size == plain.size + found.preview["bytes"] + len(',"preview_bytes":1234')
+    assert (
+        result.preview_bytes == result.to_json()["preview_bytes"] == found.preview["bytes"] and plain.preview_bytes == 0
+    )
+    assert "preview:" in result.summary() and "preview:" not in plain.summary()
     dry = compress(project / "point_cloud.ply", None, preview=2500, dry_run=True, **words)
     assert dry.size == result.size
     cut = trim(tmp_path / "a.fgs", tmp_path / "small.fgs", 2500)
