@@ -78,7 +78,8 @@ def compact(monkeypatch: pytest.MonkeyPatch) -> None:
 def short_searches() -> Iterator[None]:
     """The first whole result that holds is the answer: on tiny scenes one takes a second, nearly all of it the coder's tables."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(EFFORTS, "fast", replace(EFFORTS["fast"], steps=1, close=1.0))
+        for name in ("fast", "max"):
+            patch.setitem(EFFORTS, name, replace(EFFORTS[name], steps=1, close=1.0, far=1.0))
         yield
 
 

@@ -1,9 +1,8 @@
-"""One OpenCL session: context, queue, built programs, kernels, and buffers counted in the budget."""
+"""One OpenCL session: context, queue, kernels, and buffers counted in the budget."""
 
 from __future__ import annotations
 
 import time
-import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ import pyopencl as cl
 
 from flexgs_edge.errors import BudgetError, DeviceError
 from flexgs_edge.kernels.choose_device import DeviceInfo
+from flexgs_edge.kernels.programs import built_program, context_of
 from flexgs_edge.memory.budget import MemoryBudget
 
 SCALARS = {"u": np.uint32, "i": np.int32, "f": np.float32, "b": None}
@@ -58,7 +58,7 @@ class DeviceArray:
 
 
 class Session:
-    """Context, in-order queue, programs, kernels and buffers of one device.
+    """Context, in-order queue, kernels and buffers of one device.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Session:
         self.budget = budget
         assert info.handle is not None
         try:
-            self.context = info.context or cl.Context([info.handle])
+            self.context = info.context or context_of(info.handle)
             self.queue = cl.CommandQueue(self.context)
             # A queue of its own: writing to an array that no kernel uses must not wait for other kernels.
             self._maps = cl.CommandQueue(self.context)
@@ -84,7 +84,6 @@ class Session:
             ) from error
         self.compile_seconds = 0.0
         self.profile: defaultdict[str, float] | None = None
-        self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
 
     def kernel(self, source: str, name: str, options: tuple[str, ...], signature: str) -> cl.Kernel:
         """The kernel `name` of `source`, built with `options`; `signature` has one letter (u i f b) for each argument.
@@ -94,21 +93,13 @@ class Session:
         DeviceError
             If the program does not build; the message has the device, the options and the compiler's words.
         """
-        key = (source, options)
-        if key not in self._programs:
-            start = time.perf_counter()
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # CompilerWarning on any build log, such as PoCL's remarks
-                try:
-                    built = cl.Program(self.context, source).build(options=["-cl-std=CL1.2", *options], cache_dir=False)  # type: ignore[arg-type]
-                except cl.Error as error:
-                    device = f"{self.info.name} ({self.info.platform})"
-                    raise DeviceError(
-                        f"kernel {name} does not build on {device} with {' '.join(options)}:\n{error}"
-                    ) from error
-            self._programs[key] = built
-            self.compile_seconds += time.perf_counter() - start
-        kernel = cl.Kernel(self._programs[key], name)
+        try:
+            program, seconds = built_program(self.context, source, options)
+        except cl.Error as error:
+            device = f"{self.info.name} ({self.info.platform})"
+            raise DeviceError(f"kernel {name} does not build on {device} with {' '.join(options)}:\n{error}") from error
+        self.compile_seconds += seconds
+        kernel = cl.Kernel(program, name)
         kernel.set_scalar_arg_dtypes([SCALARS[kind] for kind in signature])
         return kernel
 

@@ -20,8 +20,8 @@ from flexgs_edge.codec.v2.container import write_grid
 from grid_scenes import make_grid
 from tiny_project import COUNT, HEIGHT, WIDTH, make_project
 
-PAPER: dict[str, Any] = {"method": "paper", "device": "numpy", "effort": "fast", "holdout": 4, "max_drop": 2.0}
-BEST: dict[str, Any] = {"device": "numpy", "effort": "fast", "holdout": 4, "max_drop": 1.5}
+PAPER: dict[str, Any] = {"method": "paper", "effort": "fast", "holdout": 4, "max_drop": 2.0}
+BEST: dict[str, Any] = {"effort": "fast", "holdout": 4, "max_drop": 1.5}
 
 
 @pytest.fixture(scope="module")
@@ -103,8 +103,8 @@ def test_decode_gives_what_decompress_writes(
             np.testing.assert_array_equal(values, plain[name], err_msg=name)  # type: ignore[literal-required]
     decoded.save(tmp_path / "b.ply")
     assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
-    image = decoded.render(cameras[0], device="numpy")
-    flexgs_edge.render_views(path, tmp_path / "views", views=[0], cameras=cameras.path, device="numpy")
+    image = decoded.render(cameras[0])
+    flexgs_edge.render_views(path, tmp_path / "views", views=[0], cameras=cameras.path)
     drawn = np.asarray(Image.open(tmp_path / "views" / "v00.png"))
     assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.float32 and image.flags.c_contiguous
     np.testing.assert_array_equal(np.rint(image.clip(0, 1) * 255), drawn)
@@ -149,8 +149,8 @@ def test_far_positions_keep_their_digits(scene: Scene, tmp_path: Path) -> None:
 def test_drawn_antialiased_as_told(scene: Scene, cameras: Cameras) -> None:
     told = Scene.from_arrays(**scene.arrays(), antialiased=True)
     assert told.antialiased and not scene.antialiased
-    image = told.render(cameras[0], device="numpy")
-    assert not np.array_equal(image, scene.render(cameras[0], device="numpy"))
+    image = told.render(cameras[0])
+    assert not np.array_equal(image, scene.render(cameras[0]))
     data, _ = flexgs_edge.encode(told, method="paper", prune_rate=0.0, sh_rate=0.0, cameras="none")
     assert flexgs_edge.decode(data).antialiased
 
@@ -260,7 +260,7 @@ def test_layers_of_a_file(tmp_path: Path, cameras: Cameras) -> None:
     np.testing.assert_array_equal(
         flexgs_edge.decode(tmp_path / "b.fgs").arrays()["means"], file.scene(2).arrays()["means"]
     )
-    assert file.layer(0).render(cameras[0], device="numpy").shape == (HEIGHT, WIDTH, 3)
+    assert file.layer(0).render(cameras[0]).shape == (HEIGHT, WIDTH, 3)
     for wrong in (-1, 3):
         with pytest.raises(InputError, match="layer: expected 0 to 2"):
             file.layer(wrong)

@@ -86,7 +86,7 @@ def blocked(source: SceneSource, camera: Camera, near: float) -> float:
     white["sh_dc"] = np.full((3, int(close.sum())), 0.5 / 0.28209479177387814, np.float32)
     if not close.any():
         return 0.0
-    return float(draw(open_form("numpy"), MemorySource(white), camera.scaled(32, 24), near=0.01).mean())
+    return float(draw(open_form("w16"), MemorySource(white), camera.scaled(32, 24), near=0.01).mean())
 
 
 def test_an_object_is_seen_from_outside() -> None:

@@ -37,7 +37,7 @@ def white(source: SceneSource, count: int | None = None) -> MemorySource:
 
 def covered(source: SceneSource, rig: Rig) -> np.ndarray:
     """[V] f64, the share of pixels of each view that Gaussians cover by 4 % or more."""
-    near, scene, form = min(rig.near, DEFAULT_NEAR), white(source), open_form("numpy")
+    near, scene, form = min(rig.near, DEFAULT_NEAR), white(source), open_form("w16")
     images = [draw(form, scene, camera.scaled(40, 30), near=near)[..., 0] for camera in rig.cameras]
     return np.array([(image > 0.04).mean() for image in images])
 

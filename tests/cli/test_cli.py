@@ -28,7 +28,7 @@ from interruptible import running
 from tiny_project import COUNT, make_project
 
 COMMANDS = list(app.COMMANDS)
-NUMPY = ["--method", "paper", "--device", "numpy", "--effort", "fast", "--holdout", "4"]
+PAPER = ["--method", "paper", "--effort", "fast", "--holdout", "4"]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def packed(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("packed") / "a.fgs"
     with pytest.raises(SystemExit) as left:
-        app.main(["compress", str(project / "point_cloud.ply"), "-o", str(path), "--max-drop", "2", "-q", *NUMPY])
+        app.main(["compress", str(project / "point_cloud.ply"), "-o", str(path), "--max-drop", "2", "-q", *PAPER])
     assert left.value.code == 0
     return path
 
@@ -118,7 +118,7 @@ def test_the_examples_of_help_and_readme_make_sense() -> None:
 def test_a_whole_way_in_processes_of_its_own(project: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.fgs"
     made = spawn(
-        "compress", project / "point_cloud.ply", "-o", out, "--max-drop", 2, *NUMPY, "--json", tmp_path / "a.json"
+        "compress", project / "point_cloud.ply", "-o", out, "--max-drop", 2, *PAPER, "--json", tmp_path / "a.json"
     )
     assert made.returncode == 0, made.stderr
     assert "decided by" in made.stdout and "flexgs-edge: searching for drop <= 2 dB" in made.stderr
@@ -187,12 +187,12 @@ def test_nothing_is_overwritten_without_force(
         (tmp_path / name).write_text("precious")
     scene, poses = project / "point_cloud.ply", project / "cameras.json"
     cases = [
-        ("compress", scene, "-o", tmp_path / "a.fgs", *NUMPY),
-        ("compress", scene, "-o", tmp_path / "n.fgs", "--save-scores", tmp_path / "s.npy", *NUMPY),
-        ("compress", scene, "-o", tmp_path / "n.fgs", "--json", tmp_path / "a.json", *NUMPY),
+        ("compress", scene, "-o", tmp_path / "a.fgs", *PAPER),
+        ("compress", scene, "-o", tmp_path / "n.fgs", "--save-scores", tmp_path / "s.npy", *PAPER),
+        ("compress", scene, "-o", tmp_path / "n.fgs", "--json", tmp_path / "a.json", *PAPER),
         ("decompress", packed, "-o", tmp_path / "a.ply"),
-        ("score", scene, "-o", tmp_path / "s.npy", "--device", "numpy"),
-        ("render", packed, "-o", tmp_path, "--cameras", poses, "--views", "0", "--device", "numpy"),
+        ("score", scene, "-o", tmp_path / "s.npy"),
+        ("render", packed, "-o", tmp_path, "--cameras", poses, "--views", "0"),
         ("info", packed, "--json", tmp_path / "a.json"),
         ("devices", "--json", tmp_path / "a.json"),
     ]
@@ -245,7 +245,7 @@ def test_misuse_ends_with_2_and_no_traceback(
 def test_a_target_that_cannot_be_met_ends_with_3(
     project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["compress", project / "point_cloud.ply", "-o", tmp_path / "a.fgs", "--max-drop", "0.0001", *NUMPY]
+    command = ["compress", project / "point_cloud.ply", "-o", tmp_path / "a.fgs", "--max-drop", "0.0001", *PAPER]
     code, out, err = run(*command, capsys=capsys)
     assert code == 3 and out == "" and "closest point is drop" in err and list(tmp_path.iterdir()) == []
     code, out, _ = run(*command, "--best-effort", capsys=capsys)
@@ -265,7 +265,7 @@ def test_too_little_memory_ends_with_5(project: Path, tmp_path: Path, capsys: py
         project / "point_cloud.ply",
         "-o",
         tmp_path / "a.fgs",
-        *NUMPY,
+        *PAPER,
         "--memory-limit",
         "1MiB",
         capsys=capsys,
@@ -325,7 +325,7 @@ def test_ctrl_c_leaves_nothing_behind(sample_dir: Path, tmp_path: Path) -> None:
     # Ten poses on the twins: scoring starts soon and lasts for seconds, so that the interrupt comes in its middle.
     poses = tmp_path / "poses.json"
     poses.write_text(json.dumps(json.loads((sample_dir / "cameras.json").read_text())[:10]))
-    words = ["--cameras", "poses.json", "--images", "none", "--method", "paper", "--device", "numpy"]
+    words = ["--cameras", "poses.json", "--images", "none", "--method", "paper"]
     with running(*command, *words, cwd=tmp_path, env={**os.environ, "PYTHONPATH": root}) as process:
         assert process.stderr is not None
         for line in process.stderr:
@@ -450,7 +450,7 @@ def test_without_photos_and_quiet(project: Path, tmp_path: Path, capsys: pytest.
         "--sh-rate",
         0.3,
         "-q",
-        *NUMPY,
+        *PAPER,
         capsys=capsys,
     )
     assert code == 0 and err == "" and f"{COUNT - COUNT // 5} of {COUNT} Gaussians" in out and "no photos" in out

@@ -34,7 +34,7 @@ from flexgs_edge.scene.source import MemorySource
 from stopped import Stopped
 from tiny_project import COUNT, HEIGHT, VIEWS, WIDTH, make_project, write_cameras
 
-FAST: dict[str, Any] = {"method": "paper", "device": "numpy", "effort": "fast", "holdout": 4}
+FAST: dict[str, Any] = {"method": "paper", "effort": "fast", "holdout": 4}
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +52,20 @@ def done(project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     return folder, result
 
 
+@pytest.mark.parametrize("method", ["paper", "best"])
+def test_the_twins_give_the_same_bytes(project: Path, tmp_path: Path, method: str) -> None:
+    words = {**FAST, "method": method, "max_drop": 2.0}
+    for name, device in (("a.fgs", None), ("b.fgs", "numpy")):
+        result = compress(project / "point_cloud.ply", tmp_path / name, device=device, **words)
+    assert "NumPy twins" in result.summary()
+    assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
+
+
 def test_the_summary_figures_are_those_of_the_decoded_file(project: Path, done: tuple[Path, CompressResult]) -> None:
     folder, result = done
     assert result.size == os.stat(folder / "a.fgs").st_size
     assert result.reached and result.decided_by == "drop" and result.decision_views == "held-out"
-    found = evaluate(folder / "a.fgs", project / "point_cloud.ply", device="numpy", holdout=4)
+    found = evaluate(folder / "a.fgs", project / "point_cloud.ply", holdout=4)
     assert result.quality is not None and found.quality.views == result.quality.views
     assert result.search is not None and result.search.chosen.measurement is not None
     # The search measured the same bits that the file decodes to.
@@ -80,7 +89,6 @@ def test_what_was_found_beside_the_scene_is_named(project: Path, done: tuple[Pat
     for word in (
         project / "cameras.json",
         project / "images",
-        "NumPy twins",
         "held-out views, which decide only where",
     ):
         assert str(word) in text
@@ -138,7 +146,7 @@ def test_saved_scores_take_one_search(project: Path, done: tuple[Path, CompressR
 
 def test_score_writes_what_compress_computes(project: Path, done: tuple[Path, CompressResult], tmp_path: Path) -> None:
     folder, _ = done
-    result = score_gaussians(project / "point_cloud.ply", tmp_path / "s.npy", device="numpy", holdout=4)
+    result = score_gaussians(project / "point_cloud.ply", tmp_path / "s.npy", holdout=4)
     assert np.array_equal(np.load(tmp_path / "s.npy"), np.load(folder / "s.npy"))
     assert result.scored_views == 6 and result.unseen == int(np.isneginf(np.load(tmp_path / "s.npy")).sum())
 
@@ -229,7 +237,7 @@ def test_bits(project: Path, tmp_path: Path, bits: str, expected: dict[str, int]
 def test_views_of_a_lone_scene_are_made_from_it(tmp_path: Path, project: Path) -> None:
     lonely = tmp_path / "scene.ply"
     lonely.write_bytes((project / "point_cloud.ply").read_bytes())
-    words: dict[str, Any] = {"device": "numpy", "resolution": 32, "method": "paper", "prune_rate": 0.2, "sh_rate": 0.2}
+    words: dict[str, Any] = {"resolution": 32, "method": "paper", "prune_rate": 0.2, "sh_rate": 0.2}
     alone = compress(lonely, tmp_path / "a.fgs", **words)
     asked = compress(project / "point_cloud.ply", tmp_path / "b.fgs", cameras="auto", **words)
     assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
@@ -249,7 +257,7 @@ def test_cameras_of_other_programs_beside_the_scene(tmp_path: Path, project: Pat
     lens = {"w": WIDTH, "h": HEIGHT, "fl_x": 40.0, "fl_y": 40.0, "cx": WIDTH / 2, "cy": HEIGHT / 2}
     pose = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, -5], [0, 0, 0, 1]]
     frames = [{"file_path": f"images/v{i:02}.png", "transform_matrix": pose} for i in range(VIEWS)]
-    rates: dict[str, Any] = {"device": "numpy", "method": "paper", "prune_rate": 0, "sh_rate": 0, "dry_run": True}
+    rates: dict[str, Any] = {"method": "paper", "prune_rate": 0, "sh_rate": 0, "dry_run": True}
     (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
     found = compress(scene, None, **rates).views
     assert found is not None and found.cameras == str(tmp_path / "transforms.json") and found.images is not None
@@ -371,7 +379,7 @@ def test_invalid_rows_are_refused_or_dropped_with_a_count(project: Path, tmp_pat
 
 
 def test_render_draws_the_chosen_views(project: Path, tmp_path: Path) -> None:
-    result = render_views(project / "point_cloud.ply", tmp_path / "out", views=[0, 8, 8, 3], device="numpy")
+    result = render_views(project / "point_cloud.ply", tmp_path / "out", views=[0, 8, 8, 3])
     assert [Path(file).name for file in result.files] == ["v00.png", "v08.png", "v03.png"]
     photo = np.asarray(Image.open(project / "images" / "v03.png"), np.float64)
     image = np.asarray(Image.open(tmp_path / "out" / "v03.png"), np.float64)
@@ -379,11 +387,11 @@ def test_render_draws_the_chosen_views(project: Path, tmp_path: Path) -> None:
     record = result.to_json()
     assert record["ms_per_view"] > 0 and {"startup_ms", "compile_ms", "view_ms"} <= set(record)
     with pytest.raises(InputError, match="exists"):
-        render_views(project / "point_cloud.ply", tmp_path / "out", views=[3], device="numpy")
+        render_views(project / "point_cloud.ply", tmp_path / "out", views=[3])
     with pytest.raises(InputError, match="no view 9; the 9 views are 0 to 8"):
-        render_views(project / "point_cloud.ply", tmp_path / "out", views=[9], device="numpy")
+        render_views(project / "point_cloud.ply", tmp_path / "out", views=[9])
     with pytest.raises(InputError, match="expected a folder"):
-        render_views(project / "point_cloud.ply", project / "cameras.json", device="numpy")
+        render_views(project / "point_cloud.ply", project / "cameras.json")
 
 
 def test_a_file_remembers_how_it_is_drawn(project: Path, tmp_path: Path) -> None:
@@ -397,7 +405,7 @@ def test_a_file_remembers_how_it_is_drawn(project: Path, tmp_path: Path) -> None
         **FAST,
     )
     cameras = str(project / "cameras.json")
-    render_views(tmp_path / "a.fgs", tmp_path / "kept", cameras=cameras, views=[0], device="numpy")
+    render_views(tmp_path / "a.fgs", tmp_path / "kept", cameras=cameras, views=[0])
     render_views(
         tmp_path / "a.fgs",
         tmp_path / "told",
@@ -407,15 +415,13 @@ def test_a_file_remembers_how_it_is_drawn(project: Path, tmp_path: Path) -> None
         near=1.5,
         background=(0, 0.5, 1),
     )
-    render_views(
-        tmp_path / "a.fgs", tmp_path / "other", cameras=cameras, views=[0], device="numpy", background=(0, 0, 0)
-    )
+    render_views(tmp_path / "a.fgs", tmp_path / "other", cameras=cameras, views=[0], background=(0, 0, 0))
     kept, told, other = ((tmp_path / name / "v00.png").read_bytes() for name in ("kept", "told", "other"))
     assert kept == told != other
 
 
 def test_a_scene_against_itself_is_identical(project: Path) -> None:
-    found = evaluate(project / "point_cloud.ply", project / "point_cloud.ply", device="numpy", holdout=0)
+    found = evaluate(project / "point_cloud.ply", project / "point_cloud.ply", holdout=0)
     assert found.quality.fidelity is None and found.quality.drop == 0.0 and found.quality.identical == VIEWS
     record = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert record["quality"]["fidelity"] is None and record["quality"]["ssim"] is not None
@@ -423,7 +429,7 @@ def test_a_scene_against_itself_is_identical(project: Path) -> None:
 
 
 def test_resolution_scales_views_and_says_so(project: Path) -> None:
-    found = evaluate(project / "point_cloud.ply", project / "point_cloud.ply", device="numpy", resolution=20)
+    found = evaluate(project / "point_cloud.ply", project / "point_cloud.ply", resolution=20)
     assert (found.views.width, found.views.height) == (20, 15) and "scaled down" in found.views.notes[0]
 
 

@@ -24,7 +24,7 @@ from tiny_project import write_cameras
 
 BLIND: dict[str, Any] = {"method": "paper", "cameras": "none", "prune_rate": 0.0, "sh_rate": 0.0}
 """Nothing is drawn, so that a scene takes milliseconds."""
-DRAWN: dict[str, Any] = {"method": "paper", "device": "numpy", "holdout": 4, "prune_rate": 0.2, "sh_rate": 0.3}
+DRAWN: dict[str, Any] = {"method": "paper", "holdout": 4, "prune_rate": 0.2, "sh_rate": 0.3}
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def test_the_files_are_those_of_single_runs(scans: Path, tmp_path: Path) -> None
 
 def test_a_target_out_of_reach_is_the_scenes_own(scans: Path, tmp_path: Path) -> None:
     write_cameras(scans / "cameras.json")
-    words: dict[str, Any] = {"method": "paper", "device": "numpy", "effort": "fast", "holdout": 4, "max_size": 1}
+    words: dict[str, Any] = {"method": "paper", "effort": "fast", "holdout": 4, "max_size": 1}
     with pytest.raises(TargetError):
         compress(scans / "a.ply", tmp_path / "a.fgs", **words)
     result = compress_all([scans / "a.ply"], tmp_path / "out", **words)

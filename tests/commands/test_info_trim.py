@@ -189,7 +189,7 @@ def test_cut_files_are_drawn_larger(tmp_path: Path) -> None:
     write_ply(grown, GrownSource(source, 900))
     poses = [dict(zip(("rotation", "translation"), look_from(seed), strict=True)) for seed in (1, 2)]
     cameras = [make_camera(64, 48, name=f"v{k}", **pose).moved(-source.origin) for k, pose in enumerate(poses)]
-    words: dict[str, Any] = {"device": "numpy", "cameras": str(write_inria(tmp_path / "cameras.json", cameras))}
+    words: dict[str, Any] = {"cameras": str(write_inria(tmp_path / "cameras.json", cameras))}
     pictures = [
         [Path(file).read_bytes() for file in render_views(scene, tmp_path / scene.stem, None, **words).files]
         for scene in (cut, grown, path)

@@ -27,7 +27,7 @@ from tiny_project import write_cameras
 
 ROWS = 80
 WHITE = [1.0, 1.0, 1.0]
-VIEWS: dict[str, Any] = {"device": "numpy", "holdout": 3, "resolution": 20}
+VIEWS: dict[str, Any] = {"holdout": 3, "resolution": 20}
 COMMON: dict[str, Any] = {**VIEWS, "effort": "fast"}
 
 
@@ -80,7 +80,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def drawn(scene: Path, cameras: Path, folder: Path, **options: Any) -> np.ndarray:
     """One view, [H, W, 3] u8."""
-    result = render_views(scene, folder, views=[0], cameras=str(cameras), force=True, device="numpy", **options)
+    result = render_views(scene, folder, views=[0], cameras=str(cameras), force=True, **options)
     return np.asarray(Image.open(result.files[0])).astype(int)
 
 

@@ -31,7 +31,7 @@ from tiny_project import write_cameras
 COUNT, DEGREE = 400, 2
 STEPS = StepSizes(2**-6, 2**-3, 2**-6, 2**-2, 2**-4, (2**-4, 2**-4))
 """Powers of two: of a value and twice the step, both ways there and back are exact."""
-VIEWS: dict[str, Any] = {"device": "numpy", "resolution": 24}
+VIEWS: dict[str, Any] = {"resolution": 24}
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_on_the_command_line(
     folder: Path, tmp_path: Path, found: dict[str, dict[str, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("matplotlib", reason="the extra [charts] is not installed")
-    command = ["info", folder / "1.fgs", "--errors", "--device", "numpy", "--resolution", 24, "-q"]
+    command = ["info", folder / "1.fgs", "--errors", "--resolution", 24, "-q"]
 
     def run(*arguments: object) -> int:
         with pytest.raises(SystemExit) as left:

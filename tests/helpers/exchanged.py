@@ -85,5 +85,5 @@ def psnr_after(path: Path, source: SceneSource, writing: Writing = PLAIN) -> flo
     rotation, translation = look_from(5)
     camera = make_camera(64, 48, 60.0, rotation, translation)
     write_foreign(path, source, writing=writing)
-    first, second = (Scene(checked_scene(each)).render(camera, device="numpy") for each in (source, read_foreign(path)))
+    first, second = (Scene(checked_scene(each)).render(camera) for each in (source, read_foreign(path)))
     return float(-10 * np.log10(np.mean(np.square(first.astype(np.float64) - second))))

@@ -32,7 +32,7 @@ def write_cameras(path: Path, views: int = VIEWS) -> Path:
 def write_photos(folder: Path, scene: Path, cameras: Path, noise: float = 0.02) -> Path:
     """Renders of the scene plus noise, as PNG."""
     budget = MemoryBudget(2**30)
-    renderer = Renderer(open_backend("numpy", budget), budget)
+    renderer = Renderer(open_backend(None, budget), budget)
     rng = np.random.default_rng(7)
     folder.mkdir()
     with renderer.load(open_scene(scene)) as loaded:

@@ -141,7 +141,7 @@ def test_one_scene_looks_the_same_in_every_format(tmp_path: Path, suffix: str) -
         write_foreign(path, MemorySource(planes))
     else:
         write_ply(path, MemorySource(planes))
-    drawn = [Scene.open(place).render(camera(), device="numpy") for place in (tmp_path / "plain.ply", path)]
+    drawn = [Scene.open(place).render(camera()) for place in (tmp_path / "plain.ply", path)]
     assert drawn[0].std() > 0.1
     found = psnr(mse(*drawn))
     assert found is None or found > 40.0

@@ -94,7 +94,7 @@ def test_a_turned_camera_sees_the_same_picture(name: str) -> None:
     camera = make_camera(64, 48, 60.0, rotation, translation)
     moved = replace(camera, rotation=rotation * frame.signs)
     budget = MemoryBudget(2**30)
-    renderer = Renderer(open_backend("numpy", budget), budget)
+    renderer = Renderer(open_backend(None, budget), budget)
     with renderer.load(scene) as loaded:
         expected = renderer.render(loaded, camera)
     with renderer.load(in_frame(scene, frame)) as loaded:

@@ -87,7 +87,7 @@ def results(backend: OpenCLBackend | TwinBackend) -> Iterator[np.ndarray]:
             yield statistics.hits
             yield statistics.weights
         drawer.release()
-    drawer = Renderer(counting, large_budget(), fit=Fit(pairs=1, chunk_rows=37))
+    drawer = Renderer(counting, large_budget(), fit=Fit(pairs=16, chunk_rows=37))
     with drawer.load_quantized(quantize_all(source, groups=3)) as scene:
         image = drawer.render(scene, camera)
         yield image

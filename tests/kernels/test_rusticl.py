@@ -1,4 +1,4 @@
-"""A second runtime: Mesa's rusticl on llvmpipe draws, scores, packs and reads the same bytes as the default device and the twins.
+"""A second runtime: Mesa's rusticl on llvmpipe draws, scores, packs and reads the same bytes as the default device.
 
 It has another compiler, and faults of its own that our kernels must live with: docs/devices.md.
 """
@@ -17,7 +17,7 @@ from tiny_project import make_project
 
 ICD = Path("/etc/OpenCL/vendors/rusticl.icd")
 NAME = "llvmpipe"
-DEVICES = (NAME, "default", "numpy")
+DEVICES = (NAME, "default")
 
 pytestmark = pytest.mark.skipif(
     not ICD.is_file(), reason="rusticl is not installed: deploy/test.sh does so where apt has it"

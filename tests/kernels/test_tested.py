@@ -15,6 +15,7 @@ import pytest
 
 from flexgs_edge.cli import app
 from flexgs_edge.errors import BudgetError, DeviceError
+from flexgs_edge.kernels import programs
 from flexgs_edge.kernels import tested as module
 from flexgs_edge.kernels import verdict as verdicts
 from flexgs_edge.kernels.choose_device import DeviceInfo, choose_device, list_devices
@@ -240,6 +241,7 @@ def test_a_device_that_fails_in_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
         for call in (lambda: session.read(array), lambda: session.write(array, [1, 2, 3, 4])):  # type: ignore[arg-type]
             with pytest.raises(DeviceError, match=f"{default_device().name}.* failed while"):
                 call()
+        patch.setattr(programs, "_CONTEXTS", {})
         patch.setattr(cl, "Context", fails(cl.RuntimeError, "clCreateContext"))
         with pytest.raises(DeviceError, match="does not open"):
             Session(replace(default_device(), context=None), large_budget())

@@ -159,7 +159,7 @@ def larger_project(folder: Path, photos: bool) -> Path:
 def test_evaluate_reports_every_pair(fake: Path, tmp_path: Path, photos: bool) -> None:
     first = larger_project(tmp_path / "first", photos) / "point_cloud.ply"
     second = make_project(tmp_path / "second", photos=False, degree=0) / "point_cloud.ply"
-    options: dict[str, Any] = {"device": "numpy", "holdout": 2}
+    options: dict[str, Any] = {"holdout": 2}
     result = evaluate(second, first, lpips=True, **options)
     pairs = calls()
     assert len(pairs) == (3 if photos else 1) * 2

@@ -36,7 +36,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> MakeJudge:
     """Makes a judge over three views of the tiny scene."""
     project = make_project(tmp_path_factory.mktemp("tiny") / "scene")
     companions, scene = companions_of(project / "point_cloud.ply"), load_scene(project / "point_cloud.ply")
-    options = resolve_drawing(ViewOptions(device="numpy"), scene, companions)
+    options = resolve_drawing(ViewOptions(), scene, companions)
     views = find_views(options, companions, scene.source)
     assert views is not None
 

@@ -73,9 +73,9 @@ def study(project: Path, studied: StudyScene, tmp_path_factory: pytest.TempPathF
 
 
 def drop_of(studied: StudyScene, project: Path, scene: SceneSource) -> float:
-    """Drop of `scene`, with nothing of the judge: rendered by the twins, photos read as 8-bit files, PSNRs by hand."""
+    """Drop of `scene`, with nothing of the judge: rendered anew, photos read as 8-bit files, PSNRs by hand."""
     budget = MemoryBudget(2**30)
-    renderer = Renderer(open_backend("numpy", budget), budget)
+    renderer = Renderer(open_backend(None, budget), budget)
     cameras = sorted(read_cameras(project / "cameras.json"), key=lambda camera: camera.name)[::4]
     drops = []
     for camera in cameras:

@@ -57,8 +57,6 @@ def drawn(scene: Path, sample_dir: Path, tmp_path_factory: pytest.TempPathFactor
     def draw(antialiased: bool) -> tuple[str, ...]:
         folder = tmp_path_factory.mktemp("drawn")
         cameras = str(sample_dir / "cameras.json")
-        return render_views(
-            scene, folder, views=POSES, cameras=cameras, device="numpy", antialiased=antialiased, **LOOK
-        ).files
+        return render_views(scene, folder, views=POSES, cameras=cameras, antialiased=antialiased, **LOOK).files
 
     return draw

@@ -50,7 +50,7 @@ def test_the_page_holds_the_file_and_the_original(page: Path, tmp_path: Path, sa
     place.write_bytes(scene_of(page, "original"))
     cameras = str(sample_dir / "cameras.json")
     drawn = [
-        render_views(scene, tmp_path / name, views=[0, 27], cameras=cameras, device="numpy").files
+        render_views(scene, tmp_path / name, views=[0, 27], cameras=cameras).files
         for scene, name in ((place, "coded"), (sample_dir / "point_cloud.ply", "plain"))
     ]
     for coded, plain in zip(*drawn, strict=True):

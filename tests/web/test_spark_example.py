@@ -56,7 +56,7 @@ def site(repository: Path, node_modules: Path, sample_dir: Path, tmp_path_factor
 def test_the_pictures_are_nearly_those_of_render(tab: Browser, site: Path, sample_dir: Path, tmp_path: Path) -> None:
     scene = site / "web" / "examples" / "spark" / "scene.fgs"
     cameras = sample_dir / "cameras.json"
-    files = render_views(scene, tmp_path, views=POSES, cameras=str(cameras), device="numpy").files
+    files = render_views(scene, tmp_path, views=POSES, cameras=str(cameras)).files
     all_cameras = sorted(read_cameras(cameras), key=lambda camera: camera.name)
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(site)))
     threading.Thread(target=server.serve_forever, daemon=True).start()

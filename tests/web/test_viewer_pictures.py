@@ -66,7 +66,7 @@ def test_pictures_are_those_of_render(
 def test_a_ply_is_shown_too(tab: Browser, sample_dir: Path, tmp_path: Path) -> None:
     """Coded with 16 bits a value, as a file of version 1."""
     cameras, scene = str(sample_dir / "cameras.json"), sample_dir / "point_cloud.ply"
-    (file,) = render_views(scene, tmp_path, views=[3], cameras=cameras, device="numpy").files
+    (file,) = render_views(scene, tmp_path, views=[3], cameras=cameras).files
     with served(scene, cameras) as address:
         go(tab, address)
         assert tab.run("viewer.header.version") == 1
@@ -84,9 +84,9 @@ def test_what_is_there_of_a_cut_file_is_drawn_larger(
     cut, grown = tmp_path / "cut.fgs", tmp_path / "grown.ply"
     trim(scene, cut, scene.stat().st_size - 1)
     write_ply(grown, GrownSource(whole.select(np.arange(count)), whole.count))
-    (file,) = render_views(grown, tmp_path / "grown", views=[3], cameras=cameras, device="numpy").files
+    (file,) = render_views(grown, tmp_path / "grown", views=[3], cameras=cameras).files
     wanted = np.asarray(Image.open(file), np.float64)
-    (file,) = render_views(cut, tmp_path / "cut", views=[3], cameras=cameras, device="numpy").files
+    (file,) = render_views(cut, tmp_path / "cut", views=[3], cameras=cameras).files
     np.testing.assert_array_equal(np.asarray(Image.open(file)), wanted)
     with served(cut, cameras) as address:
         go(tab, address)
@@ -143,7 +143,7 @@ def test_a_preview_is_shown_until_the_first_layer_is_there(
 
     monkeypatch.setattr(server, "_PIECE", 1000)
     monkeypatch.setattr(server._Handler, "_write", waiting)
-    (file,) = render_views(small, tmp_path / "small", views=[POSES[1]], cameras=cameras, device="numpy", **LOOK).files
+    (file,) = render_views(small, tmp_path / "small", views=[POSES[1]], cameras=cameras, **LOOK).files
     wanted = np.asarray(Image.open(file), np.float64)
     with served(scene, cameras, **LOOK) as address:
         tab.events.clear()

@@ -128,7 +128,7 @@ def test_the_structural_term_keeps_structure(workshop: Workshop) -> None:
     for planes in (plain, structural):
         with workshop.renderer.load(MemorySource(planes)) as scene:
             images = [workshop.renderer.render(scene, camera) for camera in workshop.cameras]
-        found.append(np.mean(ssims(TwinBackend(large_budget()), list(zip(images, workshop.original, strict=True)))))
+        found.append(np.mean(ssims(workshop.renderer.backend, list(zip(images, workshop.original, strict=True)))))
     assert found[1] > found[0] + 0.003, found
 
 

@@ -268,7 +268,7 @@ def test_layers_are_the_same_scene_and_worth_most_first(project: Path, tmp_path:
     assert half.count == sum(rows[:2])
     # The first layers against as many rows from the file's other end: what matters comes first.
     whole = open_scene(tmp_path / "layered.fgs")
-    views: dict[str, Any] = {"device": "numpy", "cameras": words["cameras"], "images": "none"}
+    views: dict[str, Any] = {"cameras": words["cameras"], "images": "none"}
     write_ply(tmp_path / "rest.ply", whole.select(np.arange(whole.count - half.count, whole.count)))
     best, rest = (
         evaluate(tmp_path / name, tmp_path / "layered.fgs", **views).quality for name in ("half.fgs", "rest.ply")
@@ -333,7 +333,7 @@ def test_a_preview_that_is_asked_for(project: Path, tmp_path: Path, caplog: pyte
     drawn = ("near", "background", "extent", "antialiased")
     assert small.settings == {name: whole.settings[name] for name in drawn}
     # Beside as many rows, as large as these would have to be, it looks better.
-    views: dict[str, Any] = {"device": "numpy", "cameras": words["cameras"], "images": "none"}
+    views: dict[str, Any] = {"cameras": words["cameras"], "images": "none"}
     rows = np.arange(0, whole.count, whole.count // small.count)[: small.count]
     write_ply(tmp_path / "rows.ply", GrownSource(whole.select(rows), whole.count))
     made, grown = (

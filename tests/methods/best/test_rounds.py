@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
 from flexgs_edge.methods.best.rounds import SNAPSHOTS_HELD, PruneRounds
 from flexgs_edge.methods.best.snapshot import Snapshot
@@ -18,7 +17,7 @@ from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
-from kernel_fixtures import large_budget
+from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, random_scene
 
 SCENE = random_scene(120, 5, 1)
@@ -30,7 +29,7 @@ CAMERAS = [
 
 @contextmanager
 def open_rounds(storage: Storage, refit: bool = True) -> Iterator[PruneRounds]:
-    renderer = Renderer(TwinBackend(large_budget()), large_budget())
+    renderer = Renderer(open_form("w16"), large_budget())
     renderer.storage = storage
     with References() as references:
         original = Original(Bench(renderer), SCENE.origin, CAMERAS, references)

@@ -23,7 +23,7 @@ from flexgs_edge.scene.source import MemorySource
 from tiny_project import make_project, write_cameras
 
 FIXED: dict[str, Any] = {
-    "method": "paper", "device": "numpy", "holdout": 2, "prune_rate": 0.3, "sh_rate": 0.3, "force": True,
+    "method": "paper", "holdout": 2, "prune_rate": 0.3, "sh_rate": 0.3, "force": True,
     "resolution": 20,
 }  # fmt: skip
 
