@@ -77,6 +77,12 @@ export class Space {
     this.parts.find((part) => part.index === index).here = true;
   }
 
+  /** The chunks of the first layer. */
+  get firstLayer() {
+    const first = Math.min(...this.parts.map(({ layer }) => layer));
+    return this.parts.filter(({ layer }) => layer === first);
+  }
+
   /** Whether all chunks are there. */
   get complete() {
     return this.parts.every(({ here }) => here);
@@ -84,7 +90,7 @@ export class Space {
 
   /** Whether of the first layer all that is in sight is there; also if nothing is. */
   get sightIsHere() {
-    return this.parts.every(({ inSight, layer, here }) => here || !inSight || layer > 0);
+    return this.firstLayer.every(({ inSight, here }) => here || !inSight);
   }
 
   /** Rows of the chunks in sight over those of them that are there; 1 if none is. */
@@ -105,7 +111,8 @@ function partsOf({ settings: { boxes }, layers, chunkRows, steps }) {
       const box = boxes[index];
       const rows = Math.min(chunkRows, count - at);
       const shRows = Math.min(box[6], rows);
-      parts.push({ index, layer, rows, shRows, low: scaled(box.slice(0, 3)), high: scaled(box.slice(3, 6)), here: false });
+      const [low, high] = [scaled(box.slice(0, 3)), scaled(box.slice(3, 6))];
+      parts.push({ index, layer, rows, shRows, low, high, here: false });
     }
   });
   return parts;

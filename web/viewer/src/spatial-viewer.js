@@ -1,5 +1,5 @@
 import { shPerLine, TEXELS, TEXTURE_WIDTH } from './pack.js';
-import { Previewed } from './previewed.js';
+import { SpacePreview } from './preview-space.js';
 import { Renderer } from './renderer.js';
 import { Space } from './space.js';
 import { GROWTH_POWER, UNASKED_BYTES, Viewer } from './viewer.js';
@@ -34,14 +34,14 @@ export class SpatialViewer extends Viewer {
     }
     const { room } = this.space;
     if (!header.preview) return room;
-    this.previewed = new Previewed(this, room, header.preview);
+    this.previewed = new SpacePreview(this, this.space, header.preview);
     this.loader.postMessage({ preview: true, start: room.count, shStart: room.shRows });
     return this.previewed.room;
   }
 
   get growth() {
     if (!this.space) return super.growth;
-    if (this.previewed) return 1;
+    if (this.previewed && !this.space.sightIsHere) return 1;
     const { layers, cutFrom, count } = this.header;
     const missing = layers.length > 1 ? this.space.missing : 1;
     return ((missing * (cutFrom ?? { count }).count) / count) ** GROWTH_POWER;
@@ -50,24 +50,17 @@ export class SpatialViewer extends Viewer {
   async loaded(data, agree) {
     const { chunk } = data;
     if (chunk) await this.ready;
-    const held = chunk && this.previewed?.holds(chunk);
-    const done = held ? false : await super.loaded(data, agree);
-    if (!this.space) return done;
-    if (data.header) this.placeBox(this.space.box);
-    if (chunk && chunk.start < this.space.room.count) {
+    const own = chunk && chunk.start < this.space?.room.count;
+    if (own) {
       this.asking--;
       this.space.arrived(chunk.index);
-    }
-    if (held && this.space.sightIsHere) await this.#endPreview(agree);
+    } else if (chunk) this.previewed?.add(chunk);
+    const done = await super.loaded(data, agree);
+    if (!this.space) return done;
+    if (data.header) this.placeBox(this.space.box);
+    this.previewed?.update();
     this.#ask();
     return this.rested;
-  }
-
-  /** Draw the scene's chunks in place of its preview. */
-  async #endPreview(agree) {
-    const waiting = this.previewed.end();
-    this.previewed = null;
-    for (const chunk of waiting) await super.loaded({ chunk }, agree);
   }
 
   /** Ask for what the camera sees and is not there. */
