@@ -76,7 +76,8 @@ __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void BLEND(
   __local uint2 list[BATCH];
   __local int open;
 #if STATS
-  __local float parts[PARTS][TOGETHER][256];
+  // For each part and each of the splats together, 256 pixels; then at its head, across these, the sums of lanes.
+  __local float parts[PARTS * TOGETHER * 256];
   __local uint counts[TOGETHER];
 #endif
 #if STATS > 2
@@ -165,9 +166,9 @@ __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void BLEND(
       red = fma(-weight, own_light, red);
       const FW error = pick(MASK(alpha < (FW)ALPHA_MAX), light, (FW)0.0f);   // gradient of the exponent
 #endif
-      STOREF(weight, parts[0][turn], p * W);
+      STOREF(weight, parts + 256 * turn, p * W);
 #if PARTS == 2
-      STOREF(error, parts[1][turn], p * W);
+      STOREF(error, parts + 256 * (TOGETHER + turn), p * W);
 #endif
       if (ANY(hit)) atomic_add(counts + turn, hit_count(hit));
       if (turn + 1 < TOGETHER && n + 1 < size) continue;
@@ -181,7 +182,7 @@ __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void BLEND(
 #pragma unroll
       for (int c = 0; c < SUMS; ++c) sum[c] = 0.0f;
       if (summing) {
-        __local const float *weights = parts[0][p / 16], *errors = parts[PARTS - 1][p / 16];
+        __local const float *weights = parts + 256 * (p / 16), *errors = weights + 256 * TOGETHER * (PARTS - 1);
 #pragma unroll
         for (int j = 0; j < 256; j += 16) {
           const int k = j + (int)l;
@@ -214,7 +215,7 @@ __kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void BLEND(
         }
       }
       barrier(CLK_LOCAL_MEM_FENCE);
-      __local float *lanes = parts[0][0] + p / 16 * (SUMS * 16);
+      __local float *lanes = parts + p / 16 * (SUMS * 16);
       if (summing)
 #pragma unroll
         for (int c = 0; c < SUMS; ++c) lanes[c * 16 + l] = sum[c];
