@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import shutil
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -27,10 +28,14 @@ SHARED = {"header": "codec"}
 REGISTERING = {"register", "add_command", "command", "group"}
 
 
+parsed = cache(ast.parse)
+"""Copies of the package have the same texts but one."""
+
+
 def modules(package: Path) -> dict[str, ast.Module]:
     """Every module by its path in the package."""
     return {
-        path.relative_to(package).as_posix(): ast.parse(path.read_text(encoding="utf-8"))
+        path.relative_to(package).as_posix(): parsed(path.read_text(encoding="utf-8"))
         for path in sorted(package.rglob("*.py"))
     }
 
@@ -118,9 +123,10 @@ def is_private(name: str) -> bool:
 
 def private_names_elsewhere(package: Path) -> list[str]:
     """Private names and modules of ours that another module imports, or reaches through an imported module."""
-    known = {name.removesuffix(".py").replace("/", ".") for name in modules(package)}
+    trees = modules(package)
+    known = {name.removesuffix(".py").replace("/", ".") for name in trees}
     found = []
-    for name, tree in modules(package).items():
+    for name, tree in trees.items():
         ours: set[str] = set()
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and (node.level or (node.module or "").startswith(PACKAGE)):

@@ -85,7 +85,7 @@ def test_levels_are_the_scene_up_to_a_layer(
 
 
 def test_parts_lie_in_their_boxes(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streamed_sog_writer, "LEAF_ROWS", 90)
+    monkeypatch.setattr(streamed_sog_writer, "LEAF_ROWS", 200)
     decompress(scene, tmp_path / "out" / "lod-meta.json")
     tree = json.loads((tmp_path / "out" / "lod-meta.json").read_text())["tree"]
     found = leaves(tree)
@@ -107,7 +107,7 @@ def test_parts_lie_in_their_boxes(scene: Path, tmp_path: Path, monkeypatch: pyte
 
 def test_a_preview_is_the_coarsest_level(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its Gaussians are in the part of the tree where they lie, and as large as they are."""
-    monkeypatch.setattr(streamed_sog_writer, "LEAF_ROWS", 90)
+    monkeypatch.setattr(streamed_sog_writer, "LEAF_ROWS", 200)
     planes = {name: np.ascontiguousarray(values[..., ::7]) for name, values in make_planes(ROWS, 2, 0).items()}
     rows = np.zeros(planes["means"].shape[1], np.uint8)
     small = to_grid({**planes, "sh_rest": planes["sh_rest"][:0]}, rows, replace(STEPS, sh=()), (5.0, -2.0, 0.0))[0]
