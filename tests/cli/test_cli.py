@@ -325,7 +325,7 @@ def test_ctrl_c_leaves_nothing_behind(sample_dir: Path, tmp_path: Path) -> None:
     # Ten poses on the twins: scoring starts soon and lasts for seconds, so that the interrupt comes in its middle.
     poses = tmp_path / "poses.json"
     poses.write_text(json.dumps(json.loads((sample_dir / "cameras.json").read_text())[:10]))
-    words = ["--cameras", "poses.json", "--images", "none", "--method", "paper"]
+    words = ["--cameras", "poses.json", "--images", "none", "--method", "paper", "--device", "numpy"]
     with running(*command, *words, cwd=tmp_path, env={**os.environ, "PYTHONPATH": root}) as process:
         assert process.stderr is not None
         for line in process.stderr:

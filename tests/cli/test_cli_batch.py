@@ -104,7 +104,7 @@ def test_misuse(arguments: list[str], says: str, scans: Path, capsys: pytest.Cap
 
 def test_ctrl_c_stops_all_and_tells_what_is_done(scans: Path, sample_dir: Path) -> None:
     # On the twins, drawing the second scene would take minutes: the interrupt surely comes in the middle.
-    words = ["--method", "paper", "--resolution", "24", "--prune-rate", "0", "--sh-rate", "0"]
+    words = ["--method", "paper", "--device", "numpy", "--resolution", "24", "--prune-rate", "0", "--sh-rate", "0"]
     inputs = ["scans/b.ply", "scans/a.ply", str(sample_dir / "point_cloud.ply"), "scans/c.ply"]
     command = [sys.executable, "-m", "flexgs_edge", "compress", *inputs, "-o", "out", *words]
     root = str(Path(cli.__file__).parents[2])

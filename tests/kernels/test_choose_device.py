@@ -189,6 +189,9 @@ def test_programs_are_built_once(session: Session) -> None:
     seconds = session.compile_seconds
     session.kernel(source, "two", (), "b")
     assert session.compile_seconds == seconds > 0
+    other = Session(default_device(), MemoryBudget(1 << 20))
+    other.kernel(source, "two", (), "b")
+    assert other.compile_seconds == 0
 
 
 def test_arrays_are_counted(session: Session) -> None:
