@@ -1,4 +1,4 @@
-/** A preview beside chunks that come in any order: a row of it is shown until the chunk of the first layer where it lies is there. */
+/** A preview beside chunks that come in any order. A row of it goes when that chunk of the first layer comes in whose box it lies. */
 export class SpacePreview {
   /**
    * @param {Viewer} viewer
