@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.io.ply import PlySource
 from flexgs_edge.scene.fields import FIELDS
 
 STEPS = StepSizes(0.05, 0.25, 0.05, 0.4, 0.1, (0.2, 0.25, 0.3, 0.3))
+FINE = StepSizes(0.003, 0.1, 0.02, 0.2, 0.03, (0.03, 0.03, 0.03))
 
 
 def make_planes(count: int, sh_degree: int = 2, seed: int = 0) -> dict[str, np.ndarray]:
@@ -27,6 +31,15 @@ def make_grid(count: int, sh_degree: int = 2, seed: int = 0, layers: int = 1, st
     degrees = rng.integers(0, sh_degree + 1, count)
     layer = rng.integers(0, layers, count)
     return to_grid(make_planes(count, sh_degree, seed), degrees, steps, (1234.5, -0.1, 1e-7), layer)[0]
+
+
+def sample_grid(sample_dir: Path, thinned: int) -> GridScene:
+    """One in `thinned` Gaussians of the sample on a fine grid, in two layers."""
+    source = PlySource(sample_dir / "point_cloud.ply")
+    planes = source.read(np.arange(0, source.count, thinned), [field.name for field in FIELDS])
+    count = planes["means"].shape[1]
+    degrees, layer = np.full(count, source.sh_degree), np.arange(count) % 2
+    return to_grid(planes, degrees, FINE, tuple(source.origin), layer)[0]
 
 
 def assert_same_grid(one: GridScene, two: GridScene) -> None:

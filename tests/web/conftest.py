@@ -6,20 +6,17 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import browser as browser_module
 from browser import Browser, find_browser
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.commands.render import render_views
-from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.grid.to_grid import to_grid
-from flexgs_edge.io.ply import PlySource
-from flexgs_edge.scene.fields import FIELD
+from grid_scenes import sample_grid
 from viewer_tab import LOOK, POSES, SOFTWARE, Drawn
 
-FINE = StepSizes(0.003, 0.1, 0.02, 0.2, 0.03, (0.03, 0.03, 0.03))
+THINNED = 4
+"""One in so many Gaussians of the sample is drawn: browsers draw in software."""
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +35,9 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def scene(sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sample, coded on a fine grid in two layers: no search, since only the drawing is looked at."""
-    source = PlySource(sample_dir / "point_cloud.ply")
-    planes = source.read(slice(0, source.count), list(FIELD))
-    layer = np.arange(source.count) % 2
-    degrees = np.full(source.count, source.sh_degree)
-    grid = to_grid(planes, degrees, FINE, tuple(source.origin), layer)[0]
+    """A part of the sample: no search, since only the drawing is looked at."""
     place = tmp_path_factory.mktemp("scene") / "still_life.fgs"
-    write_grid(place, grid, {}, chunk_rows=8192)
+    write_grid(place, sample_grid(sample_dir, THINNED), {}, chunk_rows=2048)
     return place
 
 

@@ -26,7 +26,16 @@ from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.viewer import server
+from grid_scenes import sample_grid
 from viewer_tab import LOOK, POSES, Drawn, decibels, faults, picture, served, until
+
+
+@pytest.fixture(scope="module")
+def scene(sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The whole sample: less would come with the first ranges that the viewer asks for."""
+    place = tmp_path_factory.mktemp("scene") / "still_life.fgs"
+    write_grid(place, sample_grid(sample_dir, 1), {}, chunk_rows=8192)
+    return place
 
 
 def previewed(scene: Path, folder: Path, chunk_rows: int) -> tuple[Path, Path]:

@@ -19,15 +19,9 @@ from PIL import Image
 from browser import Browser
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.commands.render import render_views
-from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.grid.to_grid import to_grid
-from flexgs_edge.io.ply import PlySource
-from flexgs_edge.scene.fields import FIELD
 from viewer_tab import decibels, faults, until
 
-FINE = StepSizes(0.003, 0.1, 0.02, 0.2, 0.03, (0.03, 0.03, 0.03))
 POSES = (0, 27, 53)
 LEAST = 41
 
@@ -38,7 +32,7 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 
 @pytest.fixture(scope="module")
-def site(repository: Path, node_modules: Path, sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(repository: Path, node_modules: Path, scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """`web/` with the packages and a scene where the page looks for them."""
     for package in ("three", "@sparkjsdev/spark"):
         if not (node_modules / package / "package.json").is_file():
@@ -46,10 +40,7 @@ def site(repository: Path, node_modules: Path, sample_dir: Path, tmp_path_factor
     folder = tmp_path_factory.mktemp("site")
     shutil.copytree(repository / "web", folder / "web")
     (folder / "web" / "examples" / "spark" / "node_modules").symlink_to(node_modules)
-    source = PlySource(sample_dir / "point_cloud.ply")
-    planes = source.read(slice(0, source.count), list(FIELD))
-    grid = to_grid(planes, np.full(source.count, source.sh_degree), FINE, tuple(source.origin))[0]
-    write_grid(folder / "web" / "examples" / "spark" / "scene.fgs", grid, {}, chunk_rows=8192)
+    shutil.copy(scene, folder / "web" / "examples" / "spark" / "scene.fgs")
     return folder
 
 

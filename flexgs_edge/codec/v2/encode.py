@@ -10,8 +10,9 @@ import numpy as np
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes, plan_chunks
 from flexgs_edge.codec.v2.device.encode_kernels import CountKernel, encode_streams
 from flexgs_edge.codec.v2.device.launch import Device
+from flexgs_edge.codec.v2.fit_groups import fit_group
 from flexgs_edge.codec.v2.fit_levels import fit_levels
-from flexgs_edge.codec.v2.groups import Group, fit_group
+from flexgs_edge.codec.v2.groups import Group
 from flexgs_edge.codec.v2.model import SHARED, Model, group_kinds, tables_of
 from flexgs_edge.codec.v2.ports import UNIFORM, Batch, CountPort, FitPort
 from flexgs_edge.codec.v2.rans import Encoder, lane_count
@@ -22,6 +23,7 @@ from flexgs_edge.constants import RANS_PRECISION as PRECISION
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import POSITION_BITS
+from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.memory.rows import blocks, put_rows, read_rows
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.curve import morton
@@ -154,8 +156,11 @@ def encode_grid(
     fit = FitPort(kinds, max(sum(chunk.stop - chunk.start for chunk in sample) // SAMPLE_ROWS, 1))
     for chunk in sample:
         _walk(grid, cells, chunk, depth, fit)
+        fit.put_away(storage)
     groups = [fit_group(kind, samples) for kind, samples in zip(kinds, fit.samples, strict=True)]
     del fit
+    if storage.spills:
+        trim_heap()  # the threads below have heaps of their own, beside what the fit has left
 
     def counted(chunk: Chunk) -> CountPort:
         port = CountPort(groups)

@@ -94,12 +94,14 @@ def _change_bits(before: np.ndarray, levels: np.ndarray, prices: np.ndarray) -> 
 
 def cheapest_path(bits: np.ndarray, prices: np.ndarray) -> np.ndarray:
     """Levels [a] of a first table, where each is stored as its change from the symbol before (Viterbi 1967)."""
-    changes = prices[(np.arange(LEVELS)[None] - np.arange(LEVELS)[:, None]) % LEVELS]
-    total, came = bits[:, 0] + changes[0], []
+    # Ways to a level lie side by side, since most of the time goes into finding the least of them.
+    changes = prices[(np.arange(LEVELS)[:, None] - np.arange(LEVELS)[None]) % LEVELS]
+    total, came = bits[:, 0] + changes[:, 0], []
+    ways, rows = np.empty_like(changes), LEVELS * np.arange(LEVELS)
     for own in bits.T[1:]:
-        ways = total[:, None] + changes
-        came.append(ways.argmin(axis=0))
-        total = ways.min(axis=0) + own
+        np.add(changes, total, ways)
+        came.append(ways.argmin(axis=1))
+        total = ways.take(rows + came[-1]) + own
     path = [int(total.argmin())]
     for back in reversed(came):
         path.append(int(back[path[-1]]))

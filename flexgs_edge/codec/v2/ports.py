@@ -6,11 +6,14 @@ import numpy as np
 
 from flexgs_edge.codec.v2 import octree
 from flexgs_edge.codec.v2.features import Sums, Term
+from flexgs_edge.codec.v2.fit_groups import Sample
 from flexgs_edge.codec.v2.groups import Group, GroupKind
 from flexgs_edge.codec.v2.model import REPEATS_MOST, SHARED, Model
 from flexgs_edge.codec.v2.rans import Decoder, StreamError, Tables
 from flexgs_edge.constants import CODE_LIMIT
 from flexgs_edge.constants import RANS_TOTAL as TOTAL
+from flexgs_edge.memory.rows import put_rows
+from flexgs_edge.memory.storage import Storage
 
 UNIFORM = [Tables(np.full((1, 1 << bits), TOTAL >> bits)) for bits in range(9)]
 """Tables of raw numbers: for each number of bits, all values are equally likely."""
@@ -37,7 +40,18 @@ class FitPort:
     def __init__(self, groups: list[GroupKind], stride: int) -> None:
         self.kinds = groups
         self.stride = stride
-        self.samples: list[list[tuple[list[np.ndarray], np.ndarray]]] = [[] for _ in groups]
+        self.samples: list[list[Sample]] = [[] for _ in groups]
+        self._batches: list[list[Sample]] = [[] for _ in groups]
+
+    def put_away(self, storage: Storage) -> None:
+        """Join the batches of a chunk to one sample of each group, in `storage`."""
+        for samples, batches in zip(self.samples, self._batches, strict=True):
+            if batches:
+                joined = np.concatenate([features for features, _ in batches], axis=1)
+                features = storage.empty(joined.shape, joined.dtype)
+                put_rows(features, slice(0, joined.shape[1]), joined)
+                samples.append((features, np.concatenate([codes for _, codes in batches])))
+                batches.clear()
 
     def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
         assert symbols is not None
@@ -60,7 +74,7 @@ class FitPort:
         for term in known:
             features[list(term.places)] = term.values[:, rows]
         # Each pass gives the same share of its rows, so the last passes, which have most rows, weigh most in the fit.
-        self.samples[group].append((list(features), codes.copy()))
+        self._batches[group].append((features, codes.copy()))
         return codes
 
 

@@ -19,6 +19,8 @@ from flexgs_edge.constants import RANS_TOTAL as TOTAL
 
 _LOW, _SHIFT, _WORD = np.uint32(TOTAL - 1), np.uint32(PRECISION), np.uint32(16)
 _FLOOR = np.uint32(FLOOR)
+FEW_LANES = 8
+"""So many lanes are coded by Python's integers: a call of NumPy takes longer than a few symbols."""
 
 
 def lane_count(rows: int) -> int:
@@ -111,6 +113,28 @@ class Encoder:
 
     def finish(self) -> bytes:
         """Code the stream: the states of all lanes as u32, then the words as u16."""
+        states, words = self._few_lanes() if self.lanes <= FEW_LANES else self._many_lanes()
+        return np.concatenate([states.astype("<u4").view("<u2"), *words]).tobytes()
+
+    def _few_lanes(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """States, and words in their order, by Python's integers."""
+        states, rounds = [FLOOR] * self.lanes, list[list[int]]()
+        for entries in reversed(self._batches):
+            freqs, starts = (entries >> _SHIFT).tolist(), (entries & _LOW).tolist()
+            for at in range((len(freqs) - 1) // self.lanes * self.lanes, -1, -self.lanes):
+                words = []
+                for lane, freq in enumerate(freqs[at : at + self.lanes]):
+                    state = states[lane]
+                    if state >= freq << (32 - PRECISION):
+                        words.append(state & 0xFFFF)
+                        state >>= 16
+                    states[lane] = (state // freq << PRECISION) + state % freq + starts[at + lane]
+                rounds.append(words)
+        ordered = [word for words in reversed(rounds) for word in words]
+        return np.array(states), [np.array(ordered, "<u2")]
+
+    def _many_lanes(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """States, and words in their order, by arrays of all lanes."""
         # f64 holds states exactly, and its division is a vector instruction. A quotient cannot round up to the next
         # integer, since states are far below 2^53.
         states = np.full(self.lanes, float(FLOOR))
@@ -137,8 +161,7 @@ class Encoder:
                 np.multiply(count, others[part], count)
                 np.add(state, count, state)
                 np.add(state, starts[part], state)
-        words.append(states.astype("<u4").view("<u2"))
-        return np.concatenate(words[::-1]).tobytes()
+        return states, words[::-1]
 
 
 def first_states(data: bytes, lanes: int) -> np.ndarray:

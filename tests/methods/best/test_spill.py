@@ -92,25 +92,28 @@ def test_the_peak_stays_below_the_limit_that_the_error_names(tmp_path: Path, mor
 
 
 @pytest.mark.timeout(900)
-def test_a_scene_that_needs_four_times_the_cap(tmp_path: Path) -> None:
-    """A million Gaussians, 3 GB with the path of their search, within a real cap of 512 MiB; docs/memory.md has larger ones."""
+def test_a_scene_that_needs_twice_the_cap(tmp_path: Path) -> None:
+    """150 000 Gaussians, half a GB with the path of their search, within a real cap of 264 MiB; docs/memory.md has larger ones.
+
+    Most rows stay, with SH of degree 3: what the coder fits its predictions to takes most, and must lie in files.
+    """
     sample = Path(__file__).resolve().parents[3] / "samples" / "still_life" / "point_cloud.ply"
-    synth(tmp_path / "point_cloud.ply", sample, 1_000_000)
+    synth(tmp_path / "point_cloud.ply", sample, 150_000)
     poses = json.loads((tmp_path / "cameras.json").read_text())
     (tmp_path / "few.json").write_text(json.dumps(poses[::10]))
-    command = [CAPPED, "512MiB", sys.executable, "-m", "flexgs_edge", "compress", tmp_path / "point_cloud.ply"]
+    command = [CAPPED, "264MiB", sys.executable, "-m", "flexgs_edge", "compress", tmp_path / "point_cloud.ply"]
     command += ["-o", tmp_path / "a.fgs", "--json", tmp_path / "a.json", "--cameras", tmp_path / "few.json", "--images"]
-    command += ["none", "--effort", "fast", "--resolution", "96", "--holdout", "4", "--no-refit", "--max-size", "27MB"]
+    command += ["none", "--effort", "fast", "--resolution", "96", "--holdout", "4", "--no-refit", "--max-size", "4MB"]
     environment = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run(
-        [*map(str, command), "--memory-limit", "480MiB"], capture_output=True, text=True, env=environment, check=False
+        [*map(str, command), "--memory-limit", "232MiB"], capture_output=True, text=True, env=environment, check=False
     )
     if done.returncode == 125 and "no memory control group" in done.stderr:
         pytest.skip(done.stderr)
     assert done.returncode == 0, done.stderr
     record = json.loads((tmp_path / "a.json").read_text())
-    assert record["run"]["scratch"] > 1_000_000 * 236
-    assert record["run"]["peak_anonymous"] <= 480 << 20
+    assert record["run"]["scratch"] > 150_000 * 236
+    assert record["run"]["peak_anonymous"] <= 232 << 20
     assert record["size"] == (tmp_path / "a.fgs").stat().st_size
 
 
