@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexgs_edge.methods.best import grid_results
+from flexgs_edge.methods.best import effort, grid_results
 from flexgs_edge.methods.best.refit.distil import STRUCTURE, Schedule, distil
 from flexgs_edge.progress import SILENT
 from flexgs_edge.run.options import CompressOptions
@@ -42,6 +42,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Schedule, bool, float]]
         found.append((schedule, bool(steps) and steps[0] is not None, structure))
         return distil(*words, structure=structure, **more)
 
+    monkeypatch.setattr(effort, "LEAST_STEPS", 60)
     for module in (grid_results, descent_parts):
         monkeypatch.setattr(module, "distil", watched)
     return found

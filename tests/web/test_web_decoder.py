@@ -28,7 +28,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 DECODER = REPOSITORY / "web" / "decoder"
 CORPUS = REPOSITORY / "tests" / "fuzz" / "corpus"
 SEEDS = REPOSITORY / "tests" / "golden"
-DAMAGED = int(os.environ.get("FLEXGS_DAMAGED", "300"))
+DAMAGED = int(os.environ.get("FLEXGS_DAMAGED", "200"))
 SLOW = 5.0
 """Seconds that no small file may take, on a busy machine."""
 

@@ -24,11 +24,11 @@ from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.storage import ScratchStorage
-from flexgs_edge.methods.best import grid_results
+from flexgs_edge.methods.best import effort, grid_results
 from flexgs_edge.methods.best import method as best_method
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.descents import INTERLEAVED_SHARE, PILOT
-from flexgs_edge.methods.best.effort import EFFORTS, LEAST_STEPS
+from flexgs_edge.methods.best.effort import EFFORTS
 from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import Schedule
@@ -354,6 +354,8 @@ def test_a_run_goes_on_from_its_last_round(
 def test_descents_between_the_rounds_are_not_done_again(
     project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    steps = 100
+    monkeypatch.setattr(effort, "LEAST_STEPS", steps)
     monkeypatch.setitem(EFFORTS, "max", replace(EFFORTS["max"], interleaved=3))
     monkeypatch.setattr("flexgs_edge.methods.best.descents.INTERLEAVE_TO", 99.0)
     monkeypatch.setattr("flexgs_edge.methods.best.descents.MOST_LEFT", 99.0)
@@ -374,12 +376,12 @@ def test_descents_between_the_rounds_are_not_done_again(
     monkeypatch.setattr(GridSearch, "_whole", stop)
     with pytest.raises(Stop):
         compress(project / "point_cloud.ply", tmp_path / "b.fgs", **words)
-    between = [math.ceil(INTERLEAVED_SHARE * LEAST_STEPS)] * 3
+    between = [math.ceil(INTERLEAVED_SHARE * steps)] * 3
     assert moved == between
     monkeypatch.setattr(GridSearch, "_whole", whole)
     compress(project / "point_cloud.ply", tmp_path / "b.fgs", **words)
     # Not those of the rounds again, but candidates, and a pilot where they are tried without these rounds.
-    assert moved[len(between)] == LEAST_STEPS and set(moved[len(between) :]) <= {LEAST_STEPS, LEAST_STEPS * PILOT}
+    assert moved[len(between)] == steps and set(moved[len(between) :]) <= {steps, steps * PILOT}
     assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
 
 
@@ -428,7 +430,7 @@ def run(folder: Path, *words: str, seconds: float | None = None) -> subprocess.C
 
 def test_kills_lose_no_bytes(tmp_path: Path) -> None:
     """Killed twice at any moment, and resumed (what lies in scratch files alone is gone with the process: test_scratch.py)."""
-    write_ply(tmp_path / "point_cloud.ply", random_scene(6000, 8, 3, size=-4.0))
+    write_ply(tmp_path / "point_cloud.ply", random_scene(3000, 8, 3, size=-4.0))
     write_cameras(tmp_path / "cameras.json")
     started = time.perf_counter()
     done = run(tmp_path)
