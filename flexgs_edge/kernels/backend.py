@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -163,7 +164,7 @@ class HostArray:
     def __init__(self, budget: MemoryBudget, shape: tuple[int, ...], dtype: Any) -> None:
         self.shape = shape
         self.dtype = np.dtype(dtype)
-        self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
+        self.nbytes = math.prod(map(int, shape)) * self.dtype.itemsize
         self._budget = budget
         budget.take("an array", self.nbytes)
         self.data = np.zeros(shape, dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -33,7 +34,7 @@ class DeviceArray:
     def __init__(self, session: Session, shape: tuple[int, ...], dtype: Any) -> None:
         self.shape = shape
         self.dtype = np.dtype(dtype)
-        self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
+        self.nbytes = math.prod(map(int, shape)) * self.dtype.itemsize
         self.changed: cl.Event | None = None
         """The last fill, or write or read that nobody waited for, which may not have begun. It holds on to its values, and is
         waited for when another event takes its place."""

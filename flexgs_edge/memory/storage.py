@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import mmap
 import os
 import tempfile
@@ -142,7 +143,7 @@ class ScratchStorage(Storage):
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         """See `Storage.empty`; raises `BudgetError` if the disk is full."""
-        size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        size = math.prod(map(int, shape)) * np.dtype(dtype).itemsize
         if size < self._least:
             return np.empty(shape, dtype)
         file = self.file()

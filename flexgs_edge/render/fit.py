@@ -5,6 +5,7 @@ This is arithmetic only; nothing is allocated.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -220,7 +221,7 @@ def chunk_shapes(rows: int) -> Shapes:
 
 def shapes_bytes(shapes: Shapes) -> int:
     """Bytes of all arrays together."""
-    return sum(int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
+    return sum(math.prod(map(int, shape)) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
 
 
 def view_bytes(size: ViewSize, count: int) -> int:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flexgs_edge.codec.v2 import fit_groups
 from flexgs_edge.codec.v2.decode import decode_chunk
 from flexgs_edge.codec.v2.encode import cells_of, chunk_codes, encode_grid
 from flexgs_edge.codec.v2.model import Model
@@ -17,6 +20,8 @@ from flexgs_edge.codec.v2.ports import FitPort
 from flexgs_edge.codec.v2.rans import StreamError
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.memory.rows import blocks
+from flexgs_edge.memory.storage import ScratchStorage
 from grid_scenes import make_grid
 
 
@@ -58,6 +63,13 @@ def test_predictions_are_fitted_to_every_layer_of_a_small_file(monkeypatch: pyte
     grid = make_grid(2000, 1, layers=4)
     encode_grid(grid)
     assert chunks == np.bincount(grid.layer).tolist()
+
+
+def test_parts_and_files_fit_the_same_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = make_grid(3000, 2, layers=2)
+    wanted = encode_grid(grid).model.to_bytes()
+    monkeypatch.setattr(fit_groups, "blocks", partial(blocks, rows=100))
+    assert encode_grid(grid, storage=ScratchStorage(tmp_path, least=1)).model.to_bytes() == wanted
 
 
 @settings(max_examples=12, deadline=None)

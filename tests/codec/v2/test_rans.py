@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flexgs_edge.codec.v2 import rans
 from flexgs_edge.codec.v2.fit_levels import cheapest_path, fit_levels
 from flexgs_edge.codec.v2.rans import Decoder, Encoder, StreamError, Tables, lane_count, normalize
 from flexgs_edge.codec.v2.tables import LEVELS, decode_tables, encode_tables, from_levels, merge_contexts, to_levels
@@ -39,6 +40,17 @@ def test_round_trip_in_batches(lanes: int, counts: tuple[int, ...]) -> None:
     for rows, symbols in batches:
         np.testing.assert_array_equal(decoder.get(tables, rows), symbols)
     assert decoder.finish() == len(data)
+
+
+@pytest.mark.parametrize("lanes", [1, 3, 8])
+def test_few_lanes_give_the_bytes_of_many(lanes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    tables = some_tables()
+    encoder = Encoder(lanes)
+    for seed, count in enumerate((7, 0, 400, 8)):
+        encoder.put(tables, *some_symbols(tables, count, seed))
+    few = encoder.finish()
+    monkeypatch.setattr(rans, "FEW_LANES", 0)
+    assert encoder.finish() == few
 
 
 def test_size_is_that_of_the_information() -> None:

@@ -142,7 +142,7 @@ def test_sums_of_a_chunk_take_the_place_of_a_view(
             for view, camera in enumerate(views):
                 references.add(view, drawer.render_planes(scene, camera))
         drawer.release()
-        for limit in range(250_000, 750_000, 20_011):
+        for limit in range(250_000, 750_000, 40_013):
             budget.limit = held + limit
             try:
                 with drawer.load(SCENE, sum_row_bytes(SCENE.sh_degree), view_sums=2) as scene:
