@@ -153,10 +153,10 @@ def encode_grid(
     chunks = plan_chunks(layers, chunk_rows)
     kinds = group_kinds(grid.sh_degree)
     sample = [chunks[i] for i in sorted({len(chunks) * k // SAMPLE_CHUNKS for k in range(SAMPLE_CHUNKS)}) if chunks]
-    fit = FitPort(kinds, max(sum(chunk.stop - chunk.start for chunk in sample) // SAMPLE_ROWS, 1))
+    fit = FitPort(kinds, max(sum(chunk.stop - chunk.start for chunk in sample) // SAMPLE_ROWS, 1), storage)
     for chunk in sample:
         _walk(grid, cells, chunk, depth, fit)
-        fit.put_away(storage)
+    fit.put_away()
     groups = [fit_group(kind, samples) for kind, samples in zip(kinds, fit.samples, strict=True)]
     del fit
     if storage.spills:

@@ -13,10 +13,12 @@ from flexgs_edge.codec.v2.rans import Decoder, StreamError, Tables
 from flexgs_edge.constants import CODE_LIMIT
 from flexgs_edge.constants import RANS_TOTAL as TOTAL
 from flexgs_edge.memory.rows import put_rows
-from flexgs_edge.memory.storage import Storage
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
 
 UNIFORM = [Tables(np.full((1, 1 << bits), TOTAL >> bits)) for bits in range(9)]
 """Tables of raw numbers: for each number of bits, all values are equally likely."""
+MOST_HELD = 1 << 24
+"""Bytes of batches that a `FitPort` holds in memory before it joins them."""
 
 Raw = tuple[int, np.ndarray]
 Batch = tuple[int, np.ndarray, np.ndarray, list[Raw]]
@@ -35,23 +37,26 @@ def split(codes: np.ndarray, group: Group, base: np.ndarray | float) -> tuple[np
 
 
 class FitPort:
-    """Collects samples (features and codes) for the fit of each group."""
+    """Collects samples (features and codes) for the fit of each group, in `storage`."""
 
-    def __init__(self, groups: list[GroupKind], stride: int) -> None:
+    def __init__(self, groups: list[GroupKind], stride: int, storage: Storage = IN_MEMORY) -> None:
         self.kinds = groups
         self.stride = stride
+        self.storage = storage
         self.samples: list[list[Sample]] = [[] for _ in groups]
         self._batches: list[list[Sample]] = [[] for _ in groups]
+        self._held = 0
 
-    def put_away(self, storage: Storage) -> None:
-        """Join the batches of a chunk to one sample of each group, in `storage`."""
+    def put_away(self) -> None:
+        """Join the batches so far to one sample of each group. Call it after the last batch."""
         for samples, batches in zip(self.samples, self._batches, strict=True):
             if batches:
                 joined = np.concatenate([features for features, _ in batches], axis=1)
-                features = storage.empty(joined.shape, joined.dtype)
+                features = self.storage.empty(joined.shape, joined.dtype)
                 put_rows(features, slice(0, joined.shape[1]), joined)
                 samples.append((features, np.concatenate([codes for _, codes in batches])))
                 batches.clear()
+        self._held = 0
 
     def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
         assert symbols is not None
@@ -75,6 +80,9 @@ class FitPort:
             features[list(term.places)] = term.values[:, rows]
         # Each pass gives the same share of its rows, so the last passes, which have most rows, weigh most in the fit.
         self._batches[group].append((features, codes.copy()))
+        self._held += features.nbytes
+        if self._held > MOST_HELD:
+            self.put_away()
         return codes
 
 
