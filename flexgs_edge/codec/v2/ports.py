@@ -18,7 +18,7 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 UNIFORM = [Tables(np.full((1, 1 << bits), TOTAL >> bits)) for bits in range(9)]
 """Tables of raw numbers: for each number of bits, all values are equally likely."""
 MOST_HELD = 1 << 24
-"""Bytes of batches that a `FitPort` holds in memory before it joins them."""
+"""Bytes of batches that a `FitPort` holds in memory before it joins them: docs/results/tuning.md#memory"""
 
 Raw = tuple[int, np.ndarray]
 Batch = tuple[int, np.ndarray, np.ndarray, list[Raw]]

@@ -20,7 +20,8 @@ from flexgs_edge.constants import RANS_TOTAL as TOTAL
 _LOW, _SHIFT, _WORD = np.uint32(TOTAL - 1), np.uint32(PRECISION), np.uint32(16)
 _FLOOR = np.uint32(FLOOR)
 FEW_LANES = 8
-"""So many lanes are coded by Python's integers: a call of NumPy takes longer than a few symbols."""
+"""Up to so many lanes are coded by Python's integers: a call of NumPy takes longer than a few symbols.
+docs/results/tuning.md#memory"""
 
 
 def lane_count(rows: int) -> int:
