@@ -22,7 +22,7 @@ SHARE, DESCENDED_SHARE = 0.5, 0.33
 matters more: docs/results/tuning.md#landing"""
 NEAR_QUALITY = 0.02
 """How far below what it allows, as a share of it, we are content."""
-QUALITY_TRIES, DESCENDED_TRIES = 1, 3
+QUALITY_TRIES, DESCENDED_TRIES = 1, 6
 """Most results that are made and measured on the way to a quality, and behind a descent; one more if none of them holds:
 docs/results/tuning.md#landing"""
 
@@ -103,10 +103,10 @@ def land_on_quality(
     """
     cheapest = np.argsort(removal, kind="stable")
     least, beyond, aim = 0, _beyond(removal), -NEAR_QUALITY / 2
-    known = np.asarray(excesses)
+    known, missed = np.asarray(excesses), None
     tries = DESCENDED_TRIES if descended else QUALITY_TRIES
     usual = (DESCENDED_SHARE if descended else SHARE) * grid.count
-    stride = (aim - known.max()) * usual
+    stride, slowest = (aim - known.max()) * usual, 0.5 / usual
     for number in range(tries + 1 if known.max() < -NEAR_QUALITY else 0):
         if number == tries and least:
             return
@@ -114,17 +114,22 @@ def land_on_quality(
         if count <= least:
             return
         found = np.asarray(attempt(grid.take(_along_curve(grid.position, np.sort(cheapest[count:])), storage)))
-        rises = (found - known) / (count - least)
-        if found.max() <= 0.0:
-            least, known = count, found
-            if found.max() >= -NEAR_QUALITY:
-                return
-        else:
-            beyond = count
-        if not (rises > 0.0).any():
+        if found.max() > 0.0:
+            beyond, missed = count, found
+            paces = (found - known) / (count - least)
+        elif found.max() >= -NEAR_QUALITY:
             return
-        # Bounds rise at paces of their own, and one may fall by chance. None is taken to rise by less than half of what is usual.
-        stride = float(((aim - known) / np.maximum(rises, 0.5 / usual)).min())
+        elif missed is None:
+            paces = (found - known) / (count - least)
+            least, known = count, found
+            slowest /= 2
+        else:
+            # A miss that stays one counts half as much each time: the loss rises late (Illinois rule of false position).
+            least, known, missed = count, found, missed / 2
+            paces = (missed - known) / (beyond - least)
+        # Bounds rise at paces of their own, and one may fall by chance. None is taken to rise by less than half of what is usual,
+        # and by ever less while all that is removed is hardly missed.
+        stride = float(((aim - known) / np.maximum(paces, slowest)).min())
 
 
 def _beyond(removal: np.ndarray) -> int:
