@@ -12,7 +12,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.on_grid import grid_comment, lowered, on_grid, steps_of
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.grid.to_grid import recolour, to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.rotations import canonical_axes
@@ -123,6 +123,21 @@ def test_a_second_trip_changes_nothing() -> None:
     np.testing.assert_array_equal(order, np.arange(400))
     for name in ("position", "opacity", "dc", "sh_degrees"):
         np.testing.assert_array_equal(getattr(back, name), getattr(grid, name))
+
+
+@pytest.mark.parametrize("with_sh", [False, True])
+def test_other_colours_on_the_same_steps(with_sh: bool) -> None:
+    """They are the codes that a new grid of these colours has. Without SH, those of the old colours stay."""
+    planes, degrees = make_planes(333, 2), np.random.default_rng(1).integers(0, 3, 333)
+    grid, order = to_grid(planes, degrees, STEPS, (1, 2, 3))
+    brighter = {name: 1.5 * planes[name] + np.float32(0.1) for name in ("sh_dc", "sh_rest")}
+    wanted, _ = to_grid({**planes, **brighter}, degrees, STEPS, (1, 2, 3))
+    found = recolour(grid, brighter["sh_dc"][:, order], brighter["sh_rest"][:, order] if with_sh else None)
+    np.testing.assert_array_equal(found.dc, wanted.dc)
+    assert (found.dc != grid.dc).any() and len(found.sh) == 2
+    for bands in zip(found.sh, wanted.sh if with_sh else grid.sh, strict=True):
+        np.testing.assert_array_equal(*bands)
+    np.testing.assert_array_equal(found.position, grid.position)
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,7 @@ def land_on_quality(
     known, missed = np.asarray(excesses), None
     tries = DESCENDED_TRIES if descended else QUALITY_TRIES
     usual = (DESCENDED_SHARE if descended else SHARE) * grid.count
-    stride, slowest = (aim - known.max()) * usual, 0.5 / usual
+    stride, slowest = (aim - known.max()) * usual, 1.0 / usual
     for number in range(tries + 1 if known.max() < -NEAR_QUALITY else 0):
         if number == tries and least:
             return
@@ -127,8 +127,8 @@ def land_on_quality(
             # A miss that stays one counts half as much each time: the loss rises late (Illinois rule of false position).
             least, known, missed = count, found, missed / 2
             paces = (missed - known) / (beyond - least)
-        # Bounds rise at paces of their own, and one may fall by chance. None is taken to rise by less than half of what is usual,
-        # and by ever less while all that is removed is hardly missed.
+        # Bounds rise at paces of their own, and one may fall by chance. None is taken to rise by less than half of what is usual
+        # behind one result that holds, a quarter behind two, and so on.
         stride = float(((aim - known) / np.maximum(paces, slowest)).min())
 
 

@@ -331,7 +331,7 @@ def open_rounds(
                     Original(bench, source.origin, scored, references, between, run.progress, steps, turns, nearest),
                     source,
                     refit=options.refit,
-                    unseen=options.unseen_share,
+                    unseen_share=options.unseen_share,
                     **({} if checkpoint is None else {"checkpoint": checkpoint}),
                 )
             yield rounds

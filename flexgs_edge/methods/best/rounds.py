@@ -64,7 +64,7 @@ class PruneRounds:
         The whole scene. Neighbours in space become neighbours in memory, so that views are drawn faster.
     refit : bool
         Refit colours in each round (default).
-    unseen : float
+    unseen_share : float
         Share of the Gaussians that no pose sees to keep, 0 to 1 (default: all). Those that are largest and most opaque
         stay first.
     checkpoint : Checkpoint, optional
@@ -90,7 +90,7 @@ class PruneRounds:
         original: Original,
         source: SceneSource,
         refit: bool = True,
-        unseen: float = 1.0,
+        unseen_share: float = 1.0,
         checkpoint: Checkpoint | None = None,
     ) -> None:
         self.original, self.refit, self.checkpoint, self._source = original, refit, checkpoint, source
@@ -104,7 +104,7 @@ class PruneRounds:
         self._renewed: set[int] = set()
         """Snapshots that a descent has made."""
         if not self._resumed():
-            self._begin(start, unseen)
+            self._begin(start, unseen_share)
         first = self.snapshots[0]
         # Rows that the first snapshot lacks were seen by no pose.
         self.unseen = len(self.rows) - int(np.count_nonzero(first.costs.weight2 > 0))
@@ -118,7 +118,7 @@ class PruneRounds:
         rows = storage.take(rows, near_rows(storage.take(planes["means"], rows), storage))
         return rows, take_rows(planes, rows, storage)
 
-    def _begin(self, start: dict[str, np.ndarray], unseen: float) -> None:
+    def _begin(self, start: dict[str, np.ndarray], unseen_share: float) -> None:
         """Measure costs on the whole scene, and draw the references."""
         original, renderer, storage = self.original, self.original.bench.renderer, self.storage
         source = MemorySource(start, origin=original.origin)
@@ -130,11 +130,11 @@ class PruneRounds:
                 original.references.add(view, renderer.render_planes(scene, camera))
         costs = RemovalCosts.of(self._parts, storage)
         rows = storage.copy(np.arange(len(self.rows)))
-        keep = np.flatnonzero(~_hidden(start, costs.weight2, unseen))
+        keep = np.flatnonzero(~_hidden(start, costs.weight2, unseen_share))
         if not len(keep):
             raise InputError(
-                f"none of {len(original.cameras)} scored views sees any Gaussian, and --unseen {unseen:g} keeps none of those "
-                "that no view sees: nothing would be left. Give cameras that look at the scene, or leave --unseen out"
+                f"none of {len(original.cameras)} scored views sees any Gaussian, and --unseen {unseen_share:g} keeps none of "
+                "those that no view sees: nothing would be left. Give cameras that look at the scene, or leave --unseen out"
             )
         if len(keep) < len(rows):
             rows, start = storage.take(rows, keep), take_rows(start, keep, storage)
