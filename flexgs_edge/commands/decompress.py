@@ -87,7 +87,7 @@ def decompress(
     budget = MemoryBudget.from_limit(memory_limit)
     with clock.stage("open"):
         scene = load_scene(input, reading=reading)
-        budget.take("the file's values", scene.held_bytes)
+        budget.take("reading the scene", scene.held_bytes)
     antialiased = scene.settings.get("antialiased") is True
     backend = None
     if format is None:
