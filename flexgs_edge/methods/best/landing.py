@@ -114,19 +114,19 @@ def land_on_quality(
         if count <= least:
             return
         found = np.asarray(attempt(grid.take(_along_curve(grid.position, np.sort(cheapest[count:])), storage)))
+        paces = (found - known) / (count - least)
         if found.max() > 0.0:
             beyond, missed = count, found
-            paces = (found - known) / (count - least)
         elif found.max() >= -NEAR_QUALITY:
             return
-        elif missed is None:
-            paces = (found - known) / (count - least)
-            least, known = count, found
-            slowest /= 2
         else:
-            # A miss that stays one counts half as much each time: the loss rises late (Illinois rule of false position).
-            least, known, missed = count, found, missed / 2
-            paces = (missed - known) / (beyond - least)
+            least, known = count, found
+            if missed is None:
+                slowest /= 2
+            else:
+                # A miss that stays one counts half as much each time: the loss rises late (Illinois rule of false position).
+                missed = missed / 2
+                paces = (missed - known) / (beyond - least)
         # Bounds rise at paces of their own, and one may fall by chance. None is taken to rise by less than half of what is usual
         # behind one result that holds, a quarter behind two, and so on.
         stride = float(((aim - known) / np.maximum(paces, slowest)).min())
