@@ -6,18 +6,20 @@ import logging
 import os
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from flexgs_edge.goals.promise import in_the_way, kept_promise
 from flexgs_edge.goals.steps import SearchResult
 from flexgs_edge.methods.best import method as best
-from flexgs_edge.methods.best.spill import prepare_memory
+from flexgs_edge.methods.best.spill import expected_bytes, prepare_memory
 from flexgs_edge.methods.foreign import method as foreign
 from flexgs_edge.methods.paper import method as paper
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.doubts import doubts
+from flexgs_edge.run.foresight import foresee
 from flexgs_edge.run.inputs import ScenePlace, scene_info
 from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.live import live_scenes
@@ -74,9 +76,11 @@ def compress(
     run = open_compression(input, output, options, progress, given)
     with run.clock.stage("open"):
         prepare_memory(run)
+        _foresee(run)
         scores = paper.given_scores(run)
     with ExitStack() as stack:
         bench = None if run.views is None else stack.enter_context(open_bench(run, options.cluster))
+        _foresee(run, opened=True)
         if run.output.format is not None:
             made = foreign.compress(run, bench, scores)
         elif options.method == "paper":
@@ -91,6 +95,15 @@ def compress(
             _show_live(run, run.output.path)
         run.reporter.write(result, None if run.plan is None else run.plan.target)
     return result
+
+
+def _foresee(run: Run[CompressOptions], opened: bool = False) -> None:
+    """Let the first error about the memory limit name one that is enough; `opened` as for `foresee`."""
+    if run.views is None:
+        run.budget.require("the scene", 0)
+    else:
+        needed = paper.expected_bytes if run.options.method == "paper" else expected_bytes
+        foresee(run, opened, partial(needed, run))
 
 
 def _show_live(run: Run[CompressOptions], path: Path) -> None:

@@ -12,6 +12,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.lpips import Lpips
 from flexgs_edge.report.results import EvaluateResult
+from flexgs_edge.run.foresight import foresee
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.open_bench import bench_info, open_bench
@@ -68,8 +69,10 @@ def evaluate(
     run = open_run(against, options, progress, reporter, judged_path=input)
     views, scene, clock, budget = run.seen, run.judged or run.scene, run.clock, run.budget
     indices = views.held_out or views.train
+    foresee(run)
     with ExitStack() as stack:
         bench = stack.enter_context(open_bench(run))
+        foresee(run, opened=True)
         renderer = bench.renderer
         distance: Lpips | None = None
         if lpips:  # first, because packages or weights may be missing

@@ -31,6 +31,8 @@ class MemoryBudget:
     used: int = 0
     reclaimers: list[Callable[[int], None]] = field(default_factory=list)
     """Functions to call with the missing bytes before a stage is refused; each lets a cache free memory."""
+    foreseen: Callable[[], int] | None = None
+    """A limit that is expected to be enough for all stages. Only errors ask, so that the first one names it."""
 
     @classmethod
     def from_limit(cls, limit: int | None) -> MemoryBudget:
@@ -67,19 +69,27 @@ class MemoryBudget:
         return rows
 
     def require(self, stage: str, size: int) -> None:
-        """Raise `BudgetError` unless `size` more bytes fit; the message names the smallest sufficient limit."""
+        """Raise `BudgetError` unless `size` more bytes fit; the message names a sufficient limit."""
         for reclaim in self.reclaimers:
             if size > self.free:
                 reclaim(size - self.free)
         if size > self.free:
+            enough = max(self.used + size, 0 if self.foreseen is None else self.foreseen())
+            held = format_mib(self.used)
+            found = f"needs {format_mib(size)} beside the {held} already held" if size else f"already holds {held}"
+            counted = ", with what later stages need" if enough > self.used + size else ""
             raise BudgetError(
-                f"{stage} needs {format_mib(size)} beside the {format_mib(self.used)} already held, "
-                f"but the memory limit is {format_mib(self.limit)}: use --memory-limit {format_mib(self.used + size)} or more"
+                f"{stage} {found}, but the memory limit is {format_mib(self.limit)}: "
+                f"use --memory-limit {format_mib(enough)} or more{counted}"
             )
 
     def take(self, stage: str, size: int) -> None:
         """Take `size` bytes until `give` returns them; raises `BudgetError` if they do not fit."""
         self.require(stage, size)
+        self.used += size
+
+    def hold(self, size: int) -> None:
+        """Count `size` bytes that are held already. The next stage finds out whether the limit is enough."""
         self.used += size
 
     def give(self, size: int) -> None:

@@ -35,7 +35,7 @@ from flexgs_edge.render.fit import (
 )
 from flexgs_edge.render.residual import add_structure, target_residual
 from flexgs_edge.render.statistics import Statistics, SumReader
-from flexgs_edge.render.tile_lists import list_tiles, sort_splats
+from flexgs_edge.render.tile_lists import list_tiles, sort_splats, split_batches
 from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
 from flexgs_edge.scene.source import SceneSource
 
@@ -348,7 +348,7 @@ class Renderer:
             count = sum(part.count for part in parts.values())
         shown, pairs = sort_splats(self.backend, buffers, count)
         self.splats_shown = shown
-        batches = [(0, shown)] if pairs <= buffers.capacity else buffers.batches(shown)
+        batches = [(0, shown)] if pairs <= buffers.capacity else split_batches(self.backend, buffers, shown)
         self._drawn = _View(buffers, camera, batches, count, parts)
         return self._drawn
 

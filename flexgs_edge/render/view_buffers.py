@@ -103,17 +103,6 @@ class ViewBuffers:
         self.arrays.append(made)
         return made
 
-    def batches(self, shown: int) -> list[tuple[int, int]]:
-        """Split the depth order of `shown` splats into batches whose pairs fit."""
-        order = self._backend.read(self.sorted[0][1], np.empty(shown, np.uint32))
-        ends = np.cumsum(self._backend.read(self.bounds)[order], dtype=np.int64)
-        batches, start, done = [], 0, 0
-        while start < shown:
-            stop = int(np.searchsorted(ends, done + self.capacity, side="right"))
-            batches.append((start, stop))
-            start, done = stop, int(ends[stop - 1])
-        return batches
-
     def coverage(self) -> float:
         """Mean over the view's pixels of 1 - transmittance, from `state` after the last batch.
 

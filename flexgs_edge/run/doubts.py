@@ -9,6 +9,7 @@ from flexgs_edge.io.frames import RDF
 from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.view_set import ViewSet
+from flexgs_edge.scene.sample import some_positions
 from flexgs_edge.small_matrices import product
 
 FIT_GAP = 2.0
@@ -33,10 +34,8 @@ def frame_doubts(views: ViewSet, scene: CheckedScene) -> tuple[str, ...]:
     """
     if scene.frame == RDF or views.cameras_from == AUTO_CAMERAS:
         return ()
-    source = scene.source
-    rows = np.arange(0, source.count, -(-source.count // _SAMPLE_ROWS))
-    means = source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
-    behind = np.ones(rows.size, bool)
+    means = some_positions(scene.source, _SAMPLE_ROWS)
+    behind = np.ones(means.shape[1], bool)
     for camera in views.cameras[:: -(-len(views.cameras) // _SAMPLE_VIEWS)]:
         behind &= product(camera.rotation[2:], means)[0] + camera.translation[2] <= 0
     share = float(behind.mean())

@@ -37,6 +37,11 @@ ESTIMATE_STEP = 2
 """An estimate reads every second pixel in both directions."""
 
 
+def work_bytes(cameras: Sequence[Camera]) -> int:
+    """Bytes that comparing the views of these cameras takes, without their reference images."""
+    return LIBRARY_BYTES + WORK_BYTES * max(camera.width * camera.height for camera in cameras)
+
+
 class Judge:
     """Compares a scene with the original, and with photos, over some views.
 
@@ -93,10 +98,9 @@ class Judge:
         self.made: FewPoses | None = None
         """Made poses that whole comparisons look at too."""
         # Reserve the memory now: scenes that are loaded later must not count on it.
-        pixels = [camera.width * camera.height for camera in self.cameras]
         images = 1 if self.photos is None else 2
         wanted = sum(camera.width * camera.height + _coarse_pixels(camera) for camera in self.cameras) * 12 * images
-        self._work = LIBRARY_BYTES + WORK_BYTES * max(pixels)
+        self._work = work_bytes(self.cameras)
         budget.take("comparing views", self._work)
         self._reserved = min(wanted, budget.free // SHARE)
         budget.take("reference images", self._reserved)

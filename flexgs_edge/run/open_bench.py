@@ -62,6 +62,7 @@ def open_bench(run: Run[Any], cluster: str | None = None) -> Bench:
 
 def counted_backend(device: str | None, budget: MemoryBudget, clock: Stopwatch) -> Backend:
     """Open the backend that `device` names, as the stage `device`, and take its runtime's memory from the budget."""
+    budget.require("the program", 0)  # whose size is known by now
     before = current_rss()
     with clock.stage("device"):
         backend = open_backend(device, budget)

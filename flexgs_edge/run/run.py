@@ -131,7 +131,7 @@ def open_run(
         judged = None if judged_path is None else load_scene(judged_path, options.drop_invalid)
         for each in (scene, judged):
             if each is not None:
-                budget.take("reading the scene", each.held_bytes)
+                budget.hold(each.held_bytes)
         asked = options.near
         options = resolve_drawing(options, judged if judged is not None and judged.settings else scene, companions)
         views = find_views(options, companions, scene.source, photos, given)

@@ -110,6 +110,29 @@ def test_require_says_what_and_how_much() -> None:
         assert words in str(caught.value)
 
 
+def test_errors_name_what_is_foreseen() -> None:
+    budget = MemoryBudget(300 * 2**20, 100 * 2**20)
+    budget.foreseen = lambda: 400 * 2**20
+    budget.require("scoring", 200 * 2**20)
+    for size, words in (
+        (201, "use --memory-limit 400MiB or more, with what later stages need"),
+        (300, "use --memory-limit 400MiB or more"),
+        (301, "use --memory-limit 401MiB or more"),
+    ):
+        with pytest.raises(BudgetError) as caught:
+            budget.require("scoring", size * 2**20)
+        assert str(caught.value).endswith(words)
+
+
+def test_what_is_held_already_is_found_by_the_next_stage() -> None:
+    budget = MemoryBudget(300 * 2**20, 100 * 2**20)
+    budget.hold(201 * 2**20)
+    with pytest.raises(
+        BudgetError, match=r"the program already holds 301MiB, .* 300MiB: use --memory-limit 301MiB or more$"
+    ):
+        budget.require("the program", 0)
+
+
 def test_take_and_give() -> None:
     budget = MemoryBudget(1000)
     budget.take("a stage", 600)

@@ -40,6 +40,7 @@ from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, choose_storage, least_spilled, needed_bytes
 from flexgs_edge.methods.best.view_weights import KnownErrors
 from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.render.view_buffers import view_size
 from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.run.judges import Judges
@@ -318,7 +319,8 @@ def open_rounds(
     if storage.spills:
         size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest_of(scored), steps > 0)
     else:
-        size, least = needed_bytes(renderer, source, scored, options, steps > 0)
+        view = view_size(renderer.backend, largest_of(scored))
+        size, least = needed_bytes(renderer.fit, view, source, len(scored), options, steps > 0)
     budget.require("a search by measured costs", size + least)
     budget.take("the scene and its search", size)
     try:

@@ -17,6 +17,7 @@ from flexgs_edge.methods.best.view_weights import KnownErrors, base_errors, rare
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import DEFAULT_MAX_DROP, CompressOptions
 from flexgs_edge.scene.lower_sh import without_degrees
+from flexgs_edge.scene.sample import some_positions
 from flexgs_edge.scene.source import SceneSource
 
 FINE_DROP, FINE_FIDELITY, FINE_RATIO = 0.3, 42.0, 30.0
@@ -89,7 +90,7 @@ def scored_poses(
         them, with the more points, the more often they lost. Default: none.
     """
     plan = EFFORTS[options.effort]
-    positions = some_positions(source)
+    positions = some_positions(source, SAMPLE_ROWS)
     order = covering_order(cameras, positions, renderer.near, plan.views)
     rest = sorted(set(range(len(cameras))) - set(order))
     ordered = [cameras[i] for i in (*order, *rest)]
@@ -139,13 +140,6 @@ def _coverage(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera]
             pixels += camera.width * camera.height
     renderer.release()
     return covered / pixels
-
-
-def some_positions(source: SceneSource) -> np.ndarray:
-    """[3, n] f64, world coordinates of at most `SAMPLE_ROWS` rows, evenly spread over the scene's rows."""
-    rows = np.arange(0, source.count, max(-(-source.count // SAMPLE_ROWS), 1))
-    positions: np.ndarray = source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
-    return positions
 
 
 def is_fine(options: CompressOptions, source: SceneSource) -> bool:

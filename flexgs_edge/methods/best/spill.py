@@ -20,8 +20,11 @@ from flexgs_edge.methods.best.refit.streamed_descent import streamed_descent_byt
 from flexgs_edge.methods.best.rounds import MOST_PARTS, PARTS, parts_of, sum_row_bytes
 from flexgs_edge.render.ahead import AHEAD_ROW_BYTES
 from flexgs_edge.render.fit import (
+    DEFAULT,
     GRADIENT_SUMS,
     MOST_SUMS,
+    Fit,
+    ViewSize,
     chunk_shapes,
     padded,
     plane_bytes,
@@ -34,6 +37,7 @@ from flexgs_edge.render.fit import (
 )
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.view_buffers import view_size
+from flexgs_edge.run.foresight import drawing_bytes, shown_rows, size_of
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD
@@ -67,6 +71,23 @@ def prepare_memory(run: Run[CompressOptions]) -> None:
         return_freed_memory()
 
 
+def expected_bytes(run: Run[CompressOptions]) -> int:
+    """Bytes that the search is expected to need at least, with all in scratch files that can lie there; see `foresee`."""
+    source, options = run.source, run.options
+    foreign, cameras = run.output.format is not None, run.seen.of(run.seen.train)
+    size = size_of(largest_of(cameras))  # poses of large weight keep all their pixels
+    distils = distil_steps(options, len(cameras), source.count, foreign) > 0
+    held = sum(needed_bytes(DEFAULT, size, source, len(cameras), options, distils))
+    if foreign:
+        return held
+    pruning = spilled_bytes(DEFAULT, source, size, shown_rows(run), False)
+    descent = spilled_bytes(
+        DEFAULT, source, size, -(-source.count // DEFAULT.first_share), distils
+    )  # once many rows went
+    view = max(pruning, descent, drawing_bytes(run))
+    return min(held, READING_BYTES + SPILLED_ROW_BYTES * source.count + view)
+
+
 def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera], folder: Path) -> Storage:
     """Memory if the scene and its search fit, else scratch files; logs where these go and how large they may get.
 
@@ -89,9 +110,11 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
     source, options, budget = run.source, run.options, run.budget
     largest = largest_of(scored)
     rows, keep = source.count, EFFORTS[options.effort].keep
-    whole = rows * row_bytes(source.sh_degree, keep, _most_parts(options, scored))
+    whole = rows * row_bytes(source.sh_degree, keep, _most_parts(options, len(scored)))
     distils = distil_steps(options, len(scored), source.count) > 0
-    size, least = needed_bytes(renderer, source, scored, options, distils)
+    size, least = needed_bytes(
+        renderer.fit, view_size(renderer.backend, largest), source, len(scored), options, distils
+    )
     if size + least <= budget.free:
         return IN_MEMORY
     budget.require(
@@ -113,29 +136,34 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
 
 
 def needed_bytes(
-    renderer: Renderer, source: SceneSource, scored: Sequence[Camera], options: CompressOptions, distils: bool
+    fit: Fit, size: ViewSize, source: SceneSource, poses: int, options: CompressOptions, distils: bool
 ) -> tuple[int, int]:
-    """Bytes that a search in memory holds, and the least bytes that drawing needs beside them."""
-    size, sums = (
-        source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep, _most_parts(options, scored)),
+    """Bytes that a search with so many scored poses holds in memory, and the least bytes that drawing needs beside them."""
+    held, sums = (
+        source.count * row_bytes(source.sh_degree, EFFORTS[options.effort].keep, _most_parts(options, poses)),
         sum_row_bytes(source.sh_degree),
     )
     if distils:
         # A descent holds all kept rows at once, with their gradients. That is the whole scene at most.
         sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))
-        size += source.count * DESCENTS * stored_bytes(source.sh_degree)
-    return size, _least_bytes(renderer, source, largest_of(scored), sums, distils)
+        held += source.count * DESCENTS * stored_bytes(source.sh_degree)
+    return held, _least_bytes(fit, size, source, sums, distils)
 
 
-def _most_parts(options: CompressOptions, scored: Sequence[Camera]) -> int:
+def _most_parts(options: CompressOptions, poses: int) -> int:
     """Sets that the poses make at most: a search may begin anew with more of them, and then it must fit as well."""
-    return MOST_PARTS if options.makes_poses else parts_of(len(scored))
+    return MOST_PARTS if options.makes_poses else parts_of(poses)
 
 
 def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera, distils: bool) -> int:
     """Bytes that the first view of a search in scratch files needs. A view that shows more rows than expected needs more."""
-    fit, size, degree = renderer.fit, view_size(renderer.backend, largest), source.sh_degree
-    shown = -(-source.count // fit.first_share)
+    shown = -(-source.count // renderer.fit.first_share)
+    return spilled_bytes(renderer.fit, source, view_size(renderer.backend, largest), shown, distils)
+
+
+def spilled_bytes(fit: Fit, source: SceneSource, size: ViewSize, shown: int, distils: bool) -> int:
+    """Bytes that a view needs in a search in scratch files if it has room for `shown` rows."""
+    degree = source.sh_degree
 
     def least(rows: int, sums: int) -> int:
         rows = padded(rows)
@@ -150,10 +178,9 @@ def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera, dist
     return max(pruning, least(rows, GRADIENT_SUMS) + structure + streamed_descent_bytes(degree, rows))
 
 
-def _least_bytes(renderer: Renderer, source: SceneSource, camera: Camera, sum_bytes: int, structure: bool) -> int:
+def _least_bytes(fit: Fit, size: ViewSize, source: SceneSource, sum_bytes: int, structure: bool) -> int:
     """Least bytes that a view of `source` needs, with its reference and sums of `sum_bytes` a row; nothing is loaded yet."""
-    chunk = padded(min(renderer.fit.least_rows, source.count)) * streamed_bytes(source.sh_degree)
-    size = view_size(renderer.backend, camera)
+    chunk = padded(min(fit.least_rows, source.count)) * streamed_bytes(source.sh_degree)
     target = reference_bytes(size) + (shapes_bytes(structure_shapes(size)) if structure else 0)
     return view_bytes(size, source.count) + target + sum_bytes * source.count + chunk
 

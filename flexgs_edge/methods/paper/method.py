@@ -23,10 +23,11 @@ from flexgs_edge.methods.paper.score_files import load_scores, save_scores
 from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.methods.paper.search import adapt, measure_fixed
 from flexgs_edge.packed.bitspec import PAPER
-from flexgs_edge.packed.quantize import QuantizedScene
+from flexgs_edge.packed.quantize import QuantizedScene, quantized_bytes
 from flexgs_edge.packed.sensitivity import Sensitivity
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.fingerprint import fingerprint
+from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.judges import Judges
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.options import CompressOptions
@@ -101,6 +102,12 @@ def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray 
             sensitivity=tuple(sensitivity),
             scores_reused=ranking.reused,
         )
+
+
+def expected_bytes(run: Run[CompressOptions]) -> int:
+    """Bytes that the search is expected to need: a view, and the codes of all rows, up to twice as large on the device."""
+    source, (bits, groups) = run.source, run.options.bit_spec()
+    return drawing_bytes(run) + 3 * quantized_bytes(source.count, source.count, source.sh_degree, bits or PAPER, groups)
 
 
 def given_scores(run: Run[CompressOptions]) -> np.ndarray | None:

@@ -1,0 +1,82 @@
+"""The memory limit that a run is expected to need. Only the error about too small a limit asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from flexgs_edge.cameras.camera import Camera, largest_of
+from flexgs_edge.cameras.order import in_picture
+from flexgs_edge.render.fit import (
+    DEFAULT,
+    GUESS,
+    ViewSize,
+    chunk_shapes,
+    padded,
+    shapes_bytes,
+    streamed_bytes,
+    view_bytes,
+)
+from flexgs_edge.run.judge import work_bytes
+from flexgs_edge.run.open_bench import BUILD_BYTES
+from flexgs_edge.run.run import Run
+from flexgs_edge.scene.sample import some_positions
+
+RUNTIME_BYTES = 88 * 2**20
+"""Bound on what PoCL's runtime and its compiler take before our kernels are built. Once the device is open, it is known."""
+BLOCKS = 64
+"""Blocks of a view's passes on the device: as many as a processor of 16 cores has."""
+SAMPLE_ROWS = 4096
+
+
+def foresee(run: Run[Any], opened: bool = False, search: Callable[[], int] | None = None) -> None:
+    """Let errors about the limit name one that is expected to be enough for all stages, not for the next one alone.
+
+    Call it before the device is opened, and again when it is open.
+
+    Parameters
+    ----------
+    run : Run
+        With views that are compared.
+    opened : bool
+        The device is open, and its memory is taken from the budget.
+    search : callable, optional
+        Bytes that the search needs beside the comparison of views. Default: those of drawing one view.
+    """
+    budget, plan, views = run.budget, run.plan, run.seen
+    compared = (
+        [views.held_out or views.train]
+        if plan is None
+        else [plan.report, *([plan.decide] * (plan.decide != plan.report))]
+    )
+    held = budget.used
+    if not opened and run.options.device != "numpy":
+        held += RUNTIME_BYTES + BUILD_BYTES
+
+    def enough() -> int:
+        compared_bytes = sum(work_bytes(views.of(indices)) for indices in compared)
+        return held + compared_bytes + (drawing_bytes(run) if search is None else search())
+
+    budget.foreseen = enough
+
+
+def drawing_bytes(run: Run[Any]) -> int:
+    """Bytes of drawing the largest view, and of the part of the scene that must be loaded for it."""
+    source = run.source
+    size, shown = size_of(largest_of(run.seen.cameras)), shown_rows(run)
+    rows = padded(min(DEFAULT.compact_rows, source.count))
+    compact = view_bytes(size, shown) + shapes_bytes(chunk_shapes(rows)) + rows * streamed_bytes(source.sh_degree)
+    least = padded(min(DEFAULT.least_rows, source.count)) * streamed_bytes(source.sh_degree)
+    return min(view_bytes(size, source.count) + least, compact)
+
+
+def size_of(camera: Camera) -> ViewSize:
+    """The size of a camera's view, on a device with `BLOCKS` blocks."""
+    return ViewSize(camera.width, camera.height, BLOCKS, BLOCKS)
+
+
+def shown_rows(run: Run[Any]) -> int:
+    """Rows for which a view gets room: those that lie in the picture of the view that has most of them, and some more."""
+    source, positions = run.source, some_positions(run.source, SAMPLE_ROWS)
+    shares = (in_picture(camera, positions, run.options.near).mean() for camera in run.seen.cameras)
+    return DEFAULT.capacity(source.count, GUESS * max(shares))
