@@ -21,7 +21,7 @@ import pytest
 from flexgs_edge.codec.open_fgs import read_header
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.commands.view import view
-from flexgs_edge.errors import InputError
+from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.viewer.assets import PLAIN, PREVIEWED, SPATIAL, entries_of, web_files
 from flexgs_edge.viewer.join import join_modules
@@ -106,6 +106,12 @@ def test_arguments_that_are_wrong(scene: Path) -> None:
         view(scene, port=70000)
     with pytest.raises(InputError, match="cannot listen"):
         view(scene, host="no.such.host.invalid", browser=False)
+
+
+def test_too_small_a_memory_limit(scene: Path) -> None:
+    with pytest.raises(BudgetError, match="the program already holds .* use --memory-limit"):
+        view(scene, scene.with_suffix(".html"), memory_limit=1 << 20)
+    assert not scene.with_suffix(".html").exists()
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
