@@ -62,6 +62,9 @@ SPILLED_ROW_BYTES = 24
 SPOOL_ROW_BYTES = 52
 """Bytes of the scratch file of sums (`ViewSums`) for each row that a view shows."""
 
+USUAL_SHARE = 4
+"""Scratch files usually take one byte in so many of the most that they may take: docs/results/tuning.md#let_go"""
+
 
 def prepare_memory(run: Run[CompressOptions]) -> None:
     """Have freed memory returned if the search will not fit into memory. Call this before the device is opened."""
@@ -124,13 +127,12 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
     storage = ScratchStorage(folder, budget.limit)
     budget.take("reading scratch files", READING_BYTES)  # until the process ends
     renderer.largest = largest
-    spooled = SPOOL_ROW_BYTES * rows * len(scored) + renderer.fit.ahead * AHEAD_ROW_BYTES * rows
+    most = whole + SPOOL_ROW_BYTES * rows * len(scored) + renderer.fit.ahead * AHEAD_ROW_BYTES * rows
     LOG.info(
         "%d Gaussians and the rounds of their search need %s in memory, %s are free: they go to scratch files in %s "
-        "(at most about %s; --scratch names another folder), %d rows at a time; %d bytes of each Gaussian and views of the "
-        "Gaussians that they show stay in memory; %d passes over %d poses",
-        rows, format_size(size + least), format_size(budget.free), storage.folder, format_size(whole + spooled),
-        renderer.fit.compact_rows, SPILLED_ROW_BYTES, 2 + EFFORTS[options.effort].refit_rounds, len(scored),
+        "(usually about %s, at most %s; --scratch names another folder)",
+        rows, format_size(size + least), format_size(budget.free), storage.folder, format_size(most // USUAL_SHARE),
+        format_size(most),
     )  # fmt: skip
     return storage
 
