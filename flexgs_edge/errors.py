@@ -62,6 +62,6 @@ class DeviceError(FlexGSError, RuntimeError):
 
 
 class BudgetError(FlexGSError, MemoryError):
-    """The memory limit or the disk is too small; the message names the smallest sufficient limit."""
+    """The memory limit or the disk is too small; the message names a limit that is expected to be enough."""
 
     exit_code = 5

@@ -2,7 +2,8 @@
 
 The limit counts what the process already holds (Python, libraries, the OpenCL compiler) and every array and device
 buffer that a stage declares. A stage asks for `fixed` bytes plus `per_row` bytes. The planner answers with the rows
-that fit, or raises an error that names the smallest sufficient limit.
+that fit, or raises an error that names a sufficient limit: the smallest one for this stage, or one for the whole run where it
+is foreseen.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class MemoryBudget:
         Raises
         ------
         BudgetError
-            If not even `minimum` rows fit; the message names the smallest sufficient limit.
+            If not even `minimum` rows fit; the message names a sufficient limit.
         """
         rows = min(most, (self.free - fixed) // max(per_row, 1))
         if rows < minimum:
