@@ -44,11 +44,9 @@ def foresee(run: Run[Any], opened: bool = False, search: Callable[[], int] | Non
         Bytes that the search needs beside the comparison of views. Default: those of drawing one view.
     """
     budget, plan, views = run.budget, run.plan, run.seen
-    compared = (
-        [views.held_out or views.train]
-        if plan is None
-        else [plan.report, *([plan.decide] * (plan.decide != plan.report))]
-    )
+    reporting = views.held_out or views.train
+    deciding = reporting if plan is None else plan.decide
+    compared = [reporting] if deciding == reporting else [reporting, deciding]
     held = budget.used
     if not opened and run.options.device != "numpy":
         held += RUNTIME_BYTES + BUILD_BYTES

@@ -84,9 +84,8 @@ def expected_bytes(run: Run[CompressOptions]) -> int:
     if foreign:
         return held
     pruning = spilled_bytes(DEFAULT, source, size, shown_rows(run), False)
-    descent = spilled_bytes(
-        DEFAULT, source, size, -(-source.count // DEFAULT.first_share), distils
-    )  # once many rows went
+    few = -(-source.count // DEFAULT.first_share)  # descents begin once many rows went
+    descent = spilled_bytes(DEFAULT, source, size, few, distils)
     view = max(pruning, descent, drawing_bytes(run))
     return min(held, READING_BYTES + SPILLED_ROW_BYTES * source.count + view)
 
