@@ -16,8 +16,8 @@ from synthetic import make_camera, random_scene
 
 @pytest.mark.parametrize("form", ["numpy", "w8", "gpu"])
 def test_batches_are_full_and_fit(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = 20_000
-    use_fit(monkeypatch, pairs=3000)
+    rows = 60_000
+    use_fit(monkeypatch, pairs=9000)
     backend = open_form(form)
     renderer = Renderer(backend, large_budget())
     with renderer.load(random_scene(rows, 3, 0, size=-3.2)) as scene:
@@ -37,4 +37,4 @@ def test_batches_are_full_and_fit(form: str, monkeypatch: pytest.MonkeyPatch) ->
     assert sums.max() <= buffers.capacity
     assert sums[:-1].min() >= buffers.capacity * (1 - 1 / PIECES) - pairs.max()
     if form != "numpy":  # whose arrays are on the host
-        assert peak < 2 * shown, "the host must not hold a number for every splat"
+        assert peak < 4 * shown, "the host must not hold a number for every splat"
