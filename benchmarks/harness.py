@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import csv
 import functools
 import json
 import os
@@ -10,7 +11,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,16 @@ def check(holds: bool, what: str) -> None:
     """Raise `CheckFailed` unless `holds`. Call this before timing anything."""
     if not holds:
         raise CheckFailed(what)
+
+
+def add_row(place: Path, columns: Sequence[str], row: Mapping[str, object]) -> None:
+    """Append a line to a CSV file. A new file gets its head first."""
+    new = not place.exists()
+    with open(place, "a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ for each constant and scene, the value that is best in the worst one of the othe
 from __future__ import annotations
 
 import argparse
-import csv
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,8 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.figures import SCENES
-from benchmarks.harness import ROOT
+from benchmarks.figures import SCENES, Row, read_rows
+from benchmarks.harness import ROOT, add_row
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import TargetError
 from flexgs_edge.methods.best.effort import EFFORTS
@@ -51,9 +50,8 @@ HEAD = """# Leave one scene out
 
 Would a constant that was chosen without a scene serve it as well? For each constant that `balanced` rests on, and each scene:
 
-- the value, among those measured, that is best in the worst one of the other scenes
-- its bytes on the scene that was left out, over those of the value that is best there
-- and over those of the value that the program has
+- *chosen* is the value that is best in the worst one of the other scenes, among those measured. `now` is that of the code.
+- The bytes are those on the scene that was left out: how many more than with the value that is best there, and than now.
 
 Whole searches at 1 dB under the promise. Files of one scene vary by 3 to 7 % with the order in which descents look at views.
 
@@ -63,7 +61,6 @@ Whole searches at 1 dB under the promise. Files of one scene vary by 3 to 7 % wi
 All runs: [left_out.csv](left_out.csv).
 
 """
-Row = dict[str, str]
 
 
 def put(name: str, value: Any) -> None:
@@ -99,14 +96,6 @@ def wanted(constants: list[str], scenes: list[str]) -> Iterator[Row]:
                 yield {"constant": constant, "value": str(value), "scene": scene}
 
 
-def read_rows(place: Path) -> list[Row]:
-    """The rows of the CSV file; none if there is no file."""
-    if not place.exists():
-        return []
-    with open(place, newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def run(place: Path, constants: list[str], scenes: list[str]) -> None:
     """Measure what the file lacks."""
     known = {(row["constant"], row["value"], row["scene"]) for row in read_rows(place)}
@@ -115,12 +104,7 @@ def run(place: Path, constants: list[str], scenes: list[str]) -> None:
             continue
         command = [sys.executable, "-m", "benchmarks.left_out", "one", *row.values()]
         size, kept = subprocess.run(command, stdout=subprocess.PIPE, text=True, cwd=ROOT, check=True).stdout.split()
-        new = not place.exists()
-        with open(place, "a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            if new:
-                writer.writeheader()
-            writer.writerow(row | {"bytes": size, "kept": kept})
+        add_row(place, COLUMNS, row | {"bytes": size, "kept": kept})
         print(*row.values(), size, kept, flush=True)
 
 

@@ -19,7 +19,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.harness import ROOT, check
+from benchmarks.harness import ROOT, add_row, check
 from flexgs_edge.report.plots import LineChart, Series, picture
 from flexgs_edge.units import parse_size
 
@@ -58,16 +58,6 @@ def run(scene: Path, cameras: Path, cap: str | None, limit: str | None) -> dict[
             "bytes": output.stat().st_size,
             "sha256": hashlib.sha256(output.read_bytes()).hexdigest(),
         }
-
-
-def add(place: Path, row: dict[str, object]) -> None:
-    """Append a line. A new file gets its head first."""
-    new = not place.exists()
-    with open(place, "a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
 
 
 def chart(rows: Sequence[dict[str, str]]) -> LineChart:
@@ -110,7 +100,7 @@ def main() -> None:
     if options.scene is None or options.cameras is None:
         parser.error("run: expected SCENE.ply and --cameras POSES.json")
     row = run(options.scene.resolve(), options.cameras.resolve(), options.cap, options.limit)
-    add(options.csv, row)
+    add_row(options.csv, COLUMNS, row)
     print(json.dumps(row))
 
 

@@ -33,7 +33,7 @@ class MemoryBudget:
     reclaimers: list[Callable[[int], None]] = field(default_factory=list)
     """Functions to call with the missing bytes before a stage is refused; each lets a cache free memory."""
     foreseen: Callable[[], int] | None = None
-    """A limit that is expected to be enough for all stages. Only errors ask, so that the first one names it."""
+    """Reckons a limit that is expected to be enough for all stages. Only an error calls it, and names that limit."""
 
     @classmethod
     def from_limit(cls, limit: int | None) -> MemoryBudget:
@@ -78,7 +78,7 @@ class MemoryBudget:
             enough = max(self.used + size, 0 if self.foreseen is None else self.foreseen())
             held = format_mib(self.used)
             found = f"needs {format_mib(size)} beside the {held} already held" if size else f"already holds {held}"
-            counted = ", with what later stages need" if enough > self.used + size else ""
+            counted = ", which counts later stages too" if enough > self.used + size else ""
             raise BudgetError(
                 f"{stage} {found}, but the memory limit is {format_mib(self.limit)}: "
                 f"use --memory-limit {format_mib(enough)} or more{counted}"

@@ -229,6 +229,12 @@ def view_bytes(size: ViewSize, count: int) -> int:
     return shapes_bytes(view_shapes(size, count)) + PAIR_BYTES * size.tiles
 
 
+def compact_bytes(size: ViewSize, shown: int, rows: int, sh_degree: int) -> int:
+    """Bytes of a compact view with room for `shown` rows, and of chunks of so many `rows` that are projected into it."""
+    rows = padded(rows)
+    return view_bytes(size, shown) + rows * streamed_bytes(sh_degree) + shapes_bytes(chunk_shapes(rows))
+
+
 def reference_bytes(size: ViewSize) -> int:
     """Bytes of a view's target and of the residual against it."""
     return REFERENCE_BYTES * 3 * size.pixels

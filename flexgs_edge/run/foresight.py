@@ -7,16 +7,7 @@ from typing import Any
 
 from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.cameras.order import in_picture
-from flexgs_edge.render.fit import (
-    DEFAULT,
-    GUESS,
-    ViewSize,
-    chunk_shapes,
-    padded,
-    shapes_bytes,
-    streamed_bytes,
-    view_bytes,
-)
+from flexgs_edge.render.fit import DEFAULT, GUESS, ViewSize, compact_bytes, padded, streamed_bytes, view_bytes
 from flexgs_edge.run.judge import work_bytes
 from flexgs_edge.run.open_bench import BUILD_BYTES
 from flexgs_edge.run.run import Run
@@ -26,7 +17,6 @@ RUNTIME_BYTES = 88 * 2**20
 """Bound on what PoCL's runtime and its compiler take before our kernels are built. Once the device is open, it is known."""
 BLOCKS = 64
 """Blocks of a view's passes on the device: as many as a processor of 16 cores has."""
-SAMPLE_ROWS = 4096
 
 
 def foresee(run: Run[Any], opened: bool = False, search: Callable[[], int] | None = None) -> None:
@@ -61,9 +51,8 @@ def foresee(run: Run[Any], opened: bool = False, search: Callable[[], int] | Non
 def drawing_bytes(run: Run[Any]) -> int:
     """Bytes of drawing the largest view, and of the part of the scene that must be loaded for it."""
     source = run.source
-    size, shown = size_of(largest_of(run.seen.cameras)), shown_rows(run)
-    rows = padded(min(DEFAULT.compact_rows, source.count))
-    compact = view_bytes(size, shown) + shapes_bytes(chunk_shapes(rows)) + rows * streamed_bytes(source.sh_degree)
+    size = size_of(largest_of(run.seen.cameras))
+    compact = compact_bytes(size, shown_rows(run), min(DEFAULT.compact_rows, source.count), source.sh_degree)
     least = padded(min(DEFAULT.least_rows, source.count)) * streamed_bytes(source.sh_degree)
     return min(view_bytes(size, source.count) + least, compact)
 
@@ -75,6 +64,6 @@ def size_of(camera: Camera) -> ViewSize:
 
 def shown_rows(run: Run[Any]) -> int:
     """Rows for which a view gets room: those that lie in the picture of the view that has most of them, and some more."""
-    source, positions = run.source, some_positions(run.source, SAMPLE_ROWS)
+    source, positions = run.source, some_positions(run.source)
     shares = (in_picture(camera, positions, run.options.near).mean() for camera in run.seen.cameras)
     return DEFAULT.capacity(source.count, GUESS * max(shares))

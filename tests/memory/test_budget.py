@@ -115,7 +115,7 @@ def test_errors_name_what_is_foreseen() -> None:
     budget.foreseen = lambda: 400 * 2**20
     budget.require("scoring", 200 * 2**20)
     for size, words in (
-        (201, "use --memory-limit 400MiB or more, with what later stages need"),
+        (201, "use --memory-limit 400MiB or more, which counts later stages too"),
         (300, "use --memory-limit 400MiB or more"),
         (301, "use --memory-limit 401MiB or more"),
     ):

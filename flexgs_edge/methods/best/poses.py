@@ -26,8 +26,6 @@ as a part of the pixels, and a refit to that part would overfit. So such targets
 effort allows: docs/results/tuning.md#fine_drop"""
 COVERAGE_POSES = 32
 """Poses that tell how much of the views the scene covers. All 220 of one scene took a tenth of the run."""
-SAMPLE_ROWS = 4096
-"""Most Gaussians whose positions tell which poses see which part of the scene."""
 BESIDE_FINER = 2.0
 """How much finer we look at poses beside a view that lost too much, for each search that lost it:
 docs/results/tuning.md#needed"""
@@ -90,7 +88,7 @@ def scored_poses(
         them, with the more points, the more often they lost. Default: none.
     """
     plan = EFFORTS[options.effort]
-    positions = some_positions(source, SAMPLE_ROWS)
+    positions = some_positions(source)
     order = covering_order(cameras, positions, renderer.near, plan.views)
     rest = sorted(set(range(len(cameras))) - set(order))
     ordered = [cameras[i] for i in (*order, *rest)]

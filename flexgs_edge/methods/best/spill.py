@@ -25,7 +25,7 @@ from flexgs_edge.render.fit import (
     MOST_SUMS,
     Fit,
     ViewSize,
-    chunk_shapes,
+    compact_bytes,
     padded,
     plane_bytes,
     reference_bytes,
@@ -167,9 +167,7 @@ def spilled_bytes(fit: Fit, source: SceneSource, size: ViewSize, shown: int, dis
     degree = source.sh_degree
 
     def least(rows: int, sums: int) -> int:
-        rows = padded(rows)
-        chunk = rows * streamed_bytes(degree) + shapes_bytes(chunk_shapes(rows))
-        return view_bytes(size, shown) + reference_bytes(size) + sum_bytes(sums) * shown + chunk
+        return compact_bytes(size, shown, rows, degree) + reference_bytes(size) + sum_bytes(sums) * shown
 
     pruning = least(min(fit.compact_rows, source.count), MOST_SUMS)
     if not distils:

@@ -10,7 +10,6 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.order import covering_order, farthest_order
 from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
-from flexgs_edge.methods.best.poses import SAMPLE_ROWS
 from flexgs_edge.methods.paper.evaluator import SceneEvaluator
 from flexgs_edge.methods.paper.prune import order_from_scores
 from flexgs_edge.methods.paper.scores import score_scene
@@ -91,7 +90,7 @@ def score_rows(studied: StudyScene, fewest: int = FEWEST, orders: Sequence[str] 
     """
     cameras = studied.views.of(studied.views.train)
     counts = view_counts(len(cameras), fewest)
-    positions = some_positions(studied.run.source, SAMPLE_ROWS)
+    positions = some_positions(studied.run.source)
     covering = covering_order(cameras, positions, studied.bench.renderer.near, len(cameras))
     spread = farthest_order(cameras)
     places: dict[str, Callable[[int], list[int]]] = {
