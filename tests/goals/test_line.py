@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.line import CLOSE, LINE_STEPS, next_point, search_line
+from flexgs_edge.goals.line import AIM, CLOSE, LINE_STEPS, next_point, search_line
 from flexgs_edge.goals.steps import MAX_PRUNE, Step, better
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, Target
 
@@ -35,6 +35,13 @@ class Files:
         for step in points[1:]:
             answer = step if better(step, answer, self.target) else answer
         return answer
+
+
+def test_the_slope_is_that_between_the_nearest_points() -> None:
+    """On both sides of the target, whatever lies farther away, and within bounds of what was expected."""
+    assert next_point([(0.0, -9.0), (1.0, -3.0), (4.0, -1.5)], 1.0, 10.0) == pytest.approx(4 + (AIM + 1.5) / 0.5)
+    assert next_point([(0.0, 1.5), (3.0, 3.0), (4.0, 9.0)], 1.0, 10.0) == pytest.approx((AIM - 1.5) / 0.5)
+    assert next_point([(0.0, -9.0), (1.0, -2.0)], 1.0, 10.0) == pytest.approx(1 + (AIM + 2) / 3)
 
 
 @settings(deadline=None)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
-from benchmarks.mutations import GOLDEN, MUTATIONS, TABLE, Mutation, kernel_folder, run_tests
+from benchmarks.mutations import TABLE, kernel_folder, run_tests
+from benchmarks.planted_faults import GOLDEN, MUTATIONS, Mutation
 
 FEW = ("sign of the conic's B", "no near plane", "fused multiply-add in dequantize")
 QUICK = {
@@ -20,6 +22,13 @@ QUICK = {
 def test_the_text_is_there(mutation: Mutation, tmp_path: Path) -> None:
     """Kernels change; a mutation whose text is gone would prove nothing."""
     assert kernel_folder(tmp_path, mutation).is_dir()
+
+
+def test_constants_are_used(repository: Path) -> None:
+    """A fault in a number that no kernel reads would prove nothing either."""
+    kernels = "".join(path.read_text() for path in (repository / "cl_kernels").glob("*.cl*"))
+    names = {name for mutation in MUTATIONS for name in re.findall(r"#define (\w+)", mutation.new)}
+    assert names and not [name for name in names if not re.search(rf"\b{name}\b", kernels)]
 
 
 def test_the_tests_are_there(repository: Path) -> None:

@@ -67,10 +67,22 @@ class Checkpoint:
         return number
 
     def load(self, number: int, storage: Storage) -> dict[str, np.ndarray]:
-        """The arrays of a finished round, by name, in `storage`."""
+        """The arrays of a finished round, by name, in `storage`.
+
+        Raises
+        ------
+        InputError
+            When a file is damaged.
+        """
         arrays = {}
         for place in sorted(self._place(number).glob("*.npy")):
-            held = np.load(place, mmap_mode="r", allow_pickle=False)
+            try:
+                held = np.load(place, mmap_mode="r", allow_pickle=False)
+            except (ValueError, EOFError) as error:
+                raise InputError(
+                    f"{place}: expected an array of a finished round, found something else ({error}); delete {self.folder} "
+                    "to begin anew"
+                ) from error
             arrays[place.stem] = storage.copy(held)
         return arrays
 

@@ -245,6 +245,24 @@ def test_sh_cost_is_what_a_render_loses_where_one_splat_is_alone() -> None:
         assert costs.sh[level, 0] == pytest.approx(lost, rel=1e-4) and lost > 0
 
 
+def test_sums_go_beyond_64_bits() -> None:
+    """A splat that is as bright as a view can count, in front of many poses."""
+    source = random_scene(3, 37, size=0.0, opacity=2.0)
+    planes = source.read(slice(0, 3), list(FIELD))
+    planes["sh_dc"][:] = [[1e5, 1.0, 1.0]]
+    source, cameras = MemorySource(planes), poses(12)
+    backend = open_form("w16")
+    costs = costs_of(backend, source, cameras)
+    renderer, expected = Renderer(backend, large_budget()), [0, 0, 0]
+    with renderer.load(source) as scene:
+        for camera in cameras:
+            removal = renderer.read_sums(renderer.removal_sums(scene, camera), 2, scene.count)[0]
+            expected = [old + more for old, more in zip(expected, removal.tolist(), strict=True)]
+    assert max(expected) > 2**64
+    assert costs.removal == pytest.approx(np.array(expected, np.float64) / FIXED_ERROR, rel=1e-12)
+    assert np.array_equal(costs_of(open_form("numpy"), source, cameras).removal, costs.removal)
+
+
 def test_nothing_is_measured_of_nothing() -> None:
     for count in (0, 1):
         costs = costs_of(open_form("w16"), random_scene(count, 36, 1), [])

@@ -14,6 +14,7 @@ from flexgs_edge.methods.best.effort import (
     LEAST_STEPS,
     MANY_POSES,
     distil_steps,
+    effort_of,
     sampled_poses,
     sampling_steps,
 )
@@ -40,6 +41,7 @@ def test_who_descends() -> None:
     assert distil_steps(CompressOptions(), 100, least - 1) == 0 < distil_steps(CompressOptions(), 100, least)
     assert distil_steps(CompressOptions(effort="max"), 100, least - 1) > 0
     assert distil_steps(CompressOptions(distil=7), 100, least - 1) == 7
+    assert effort_of(CompressOptions()).interleaved > 0 == effort_of(CompressOptions(distil=7)).interleaved
     for words, foreign in (({"distil": 0}, False), ({"refit": False}, False), ({"effort": "fast"}, False), ({}, True)):
         assert distil_steps(CompressOptions(**words), 100, least, foreign) == 0, (words, foreign)
 

@@ -198,6 +198,15 @@ def test_a_limit_of_gaussians_ends_what_cannot_get_better() -> None:
     assert len(found.steps) == 2 and found.chosen.count == 20
 
 
+def test_of_two_searches_the_better_answer_is_taken() -> None:
+    target, quality = MaxDrop(1.0), Measurement(0.9, 40.0, 0.9)
+    small, large = (Candidate(AT, 9, 0, size, quality, -0.1, 0.0) for size in (500, 600))
+    one, other = (RateResult(step.size, step, True, (step,)) for step in (small, large))
+    for first, second in ((one, other), (other, one)):
+        both = KnownSearch._also(first, second, target)
+        assert (both.product, both.chosen) == (500, small) and both.steps == (*first.steps, *second.steps)
+
+
 def test_nothing_that_any_pose_sees() -> None:
     found = search(powers(), MaxDrop(1.0), FakeRounds(40, unseen=40), best_effort=True)
     assert found.product.count == 40 and found.product.sh_count == 0
