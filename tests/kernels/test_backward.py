@@ -206,6 +206,10 @@ def test_a_bit_away_from_the_centre_costs_its_worth() -> None:
     logits = planes["opacity_logits"][0].astype(np.float64)
     assert prices[29] == np.float32(np.median(logits)) and prices[5] == np.float32(WIDTH * STEPS.opacity)
     assert np.isclose(prices[4] * np.abs(logits - np.median(logits)).mean() * np.log(2), 0.25)
+    red, green, blue = planes["sh_dc"].astype(np.float64)
+    luma = (red + 2 * green + blue) / 4
+    assert np.isclose(prices[30], np.median(luma)) and np.isclose(prices[31], np.median(red - blue))
+    assert np.isclose(prices[6] * np.abs(luma - np.median(luma)).mean() * np.log(2), 0.25)
     # Degrees that the grid does not have cost nothing, and values that are all alike no more than a quarter of a step says.
     assert (prices[14:26] == 0).all()
     alike = {name: np.full_like(values, 0.5) for name, values in planes.items()}

@@ -15,8 +15,8 @@ from flexgs_edge.methods.best.checkpoint import Checkpoint
 
 def test_rounds_come_back(tmp_path: Path) -> None:
     checkpoint = Checkpoint(tmp_path / "rounds")
-    arrays = {"rows": np.arange(7), "plane-means": np.random.default_rng(0).normal(size=(3, 7)).astype(np.float32)}
-    arrays["none"] = np.zeros((0, 7))
+    means = np.random.default_rng(0).normal(size=(3, 7)).astype(np.float32)
+    arrays: dict[str, np.ndarray] = {"rows": np.arange(7), "plane-means": means, "none": np.zeros((0, 7))}
     checkpoint.save(0, arrays.items())
     assert checkpoint.has(0) and not checkpoint.has(1) and checkpoint.rounds == 1
     found = checkpoint.load(0, IN_MEMORY)

@@ -1,0 +1,35 @@
+"""How a preview is made: in stages that each leave fewer Gaussians."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flexgs_edge.api.coding import compress
+from flexgs_edge.methods.best import preview
+from flexgs_edge.scene.source import Planes
+from tiny_project import make_project
+
+
+def test_each_stage_leaves_so_many_times_the_rows_that_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = make_project(tmp_path / "scene")
+    asked: list[float] = []
+    stage = preview._stage
+
+    def counted(planes: Planes, rows: float, *rest: Any) -> Planes:
+        asked.append(rows)
+        made = stage(planes, rows, *rest)
+        assert made["means"].shape[1] <= rows + 1
+        return made
+
+    monkeypatch.setattr(preview, "_stage", counted)
+    words: dict[str, Any] = {"cameras": str(project / "cameras.json"), "images": "none", "min_fidelity": 40.0}
+    compress(project / "point_cloud.ply", tmp_path / "a.fgs", preview=2500, effort="fast", **words)
+    stages = len(preview.STAGES)
+    ends = asked[stages:]
+    assert 1 <= len(ends) <= preview.TRIES and sorted(ends, reverse=True) == ends
+    # The first stages go by the bits of the whole scene's rows, the last one by what rows and headers took before it.
+    assert asked[:stages] == pytest.approx([times * ends[0] for times in preview.STAGES], rel=0.75)
+    assert asked[0] / asked[-len(ends) - 1] == pytest.approx(preview.STAGES[0] / preview.STAGES[-1])
