@@ -44,6 +44,22 @@ def test_a_slab_takes_the_light_that_it_should() -> None:
     assert np.mean(-np.log(light) / slant) == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.parametrize("along", range(3))
+def test_a_wide_splat_lies_along_its_axes(along: int) -> None:
+    """A rod among faint small splats, of which the grid is made: its matter is where the rod is."""
+    rng = np.random.default_rng(0)
+    count = 20000
+    means = np.concatenate([rng.uniform(-2, 2, (3, count)), np.zeros((3, 1))], axis=1)
+    axes = np.eye(3)[:, :, None] * np.full(count + 1, 0.01)
+    axes[:, :, -1] = np.eye(3) * 0.1
+    axes[along, along, -1] = 1.0
+    opacity = np.append(np.full(count, 1e-6), 0.9)
+    grid = spread_matter(means, axes, opacity, (np.full(3, -2.0), np.full(3, 2.0)), (np.zeros(3), 5.0))
+    places = np.linspace(0.5, 1.5, 50)
+    found = [grid.optical_depth(sign * np.eye(3)[:, [axis]] * places).max() for axis in range(3) for sign in (1, -1)]
+    assert [depth > 0.5 for depth in found] == [axis == along for axis in range(3) for _ in range(2)]
+
+
 def test_cells_are_small_where_the_scene_is_dense() -> None:
     points = np.concatenate([ball(2000, 0.5), ball(1500, 40.0)])
     scene = gather_witnesses(make_splats(points, np.full((3500, 3), 0.02)))
