@@ -53,6 +53,7 @@ def test_info_of_version_2_shares_every_byte_out(tmp_path: Path) -> None:
     found = json.loads(json.dumps(info(path).to_json(), allow_nan=False))
     assert (found["version"], found["count"], found["sh_count"]) == (2, 900, grid.sh_count)
     assert found["size"] == path.stat().st_size
+    assert found["bits_per_gaussian"] == round(8 * path.stat().st_size / 900, 3)
     channels = found["channels"]
     assert list(channels) == ["position", "scale", "rotation", "opacity", "dc", "sh degree", "sh 1", "sh 2"]
     assert sum(channel["bytes"] for channel in channels.values()) + found["overhead_bytes"] == found["size"]

@@ -113,6 +113,11 @@ def test_version_1_saves_what_its_arrays_take(folder: Path, found: dict[str, dic
     lessers = {(one.channel, one.change): one for one in reduced_scenes(open_fgs(folder / "1.fgs"))}
     old, new = read(open_fgs(folder / "1.fgs")), read(lessers["rest from 2", DROPPED].make()[1])
     np.testing.assert_array_equal(new["sh_rest"].reshape(3, 3, COUNT), old["sh_rest"].reshape(3, 8, COUNT)[:, :3])
+    # The highest code has no higher one to round to.
+    logits = read(open_fgs(folder / "1.fgs"))["opacity_logits"][0]
+    step = np.diff(np.unique(logits)).min()
+    coarser = read(lessers["opacity", ONE_LESS].make()[1])["opacity_logits"][0]
+    assert logits.argmax() in np.flatnonzero(coarser == coarser.max()) and abs(coarser - logits).max() < 1.01 * step
     flat = read(lessers["dc", DROPPED].make()[1])["sh_dc"]
     np.testing.assert_allclose(flat, np.repeat(old["sh_dc"].mean(axis=1, keepdims=True), COUNT, axis=1), atol=1e-6)
 
