@@ -88,6 +88,16 @@ def backward(
     return Mutation(name, file, old, new, form, reference, BACKWARD)
 
 
+def structure(name: str, old: str, new: str) -> Mutation:
+    """A fault in the gradient of SSIM."""
+    return Mutation(name, "similarity.cl", old, new, tests=STRUCTURE)
+
+
+def costs(name: str, old: str, new: str, file: str = "score.cl", form: str = "w16", reference: bool = True) -> Mutation:
+    """A fault in costs of removal, or of dropping SH."""
+    return Mutation(name, file, old, new, form, reference, COSTS)
+
+
 def coder(name: str, old: str, new: str, file: str = "code_chunks.cl") -> Mutation:
     """A fault in the entropy coder."""
     return Mutation(name, file, old, new, reference=False, tests=CODER)
@@ -238,59 +248,38 @@ MUTATIONS = (
     Mutation(
         "SSIM: windows one pixel short", "similarity.cl", "k < SSIM_WINDOW", "k < SSIM_WINDOW - 1", tests=SIMILARITY
     ),
-    Mutation("structure: target without a slope", "similarity.cl", " + b * by[2]", "", tests=STRUCTURE),
-    Mutation(
-        "structure: windows beyond the picture",
-        "similarity.cl",
-        "pick(inside, (FW)2.0f * by_mean, (FW)0.0f)",
-        "(FW)2.0f * by_mean",
-        tests=STRUCTURE,
+    structure("structure: target without a slope", " + b * by[2]", ""),
+    structure(
+        "structure: windows beyond the picture", "pick(inside, (FW)2.0f * by_mean, (FW)0.0f)", "(FW)2.0f * by_mean"
     ),
-    Mutation(
+    structure(
         "structure: slopes of pixels beyond the range",
-        "similarity.cl",
         "pick(MASK(a >= (FW)0.0f) & MASK(a <= (FW)1.0f), (FW)factor * slope, (FW)0.0f)",
         "(FW)factor * slope",
-        tests=STRUCTURE,
     ),
-    Mutation(
+    costs(
         "costs: what is behind stays as it was",
-        "blend_cpu.cl",
         "er = fma(cr, trans[k], red[k] - whole_r[k])",
         "er = cr * trans[k]",
-        tests=COSTS,
-    ),
-    Mutation(
-        "costs: weights not squared",
         "blend_cpu.cl",
+    ),
+    costs(
+        "costs: weights not squared",
         "squares[v] = fma(weight, weight, squares[v])",
         "squares[v] += weight",
-        tests=COSTS,
+        "blend_cpu.cl",
     ),
-    Mutation(
+    costs(
         "GPU form: costs of what is behind",
-        "blend_gpu.cl",
         "er = fma((FW)splats[n][6], t, red - whole_r)",
         "er = (FW)splats[n][6] * t",
+        "blend_gpu.cl",
         "gpu",
         reference=False,
-        tests=COSTS,
     ),
-    Mutation(
-        "costs: each band for itself",
-        "score.cl",
-        "FW square = (FW)0.0f;",
-        "FW square = d[0] = d[1] = d[2] = (FW)0.0f;",
-        tests=COSTS,
-    ),
-    Mutation(
-        "costs: mean colour without weights",
-        "score.cl",
-        "+ level * 4 + c, i), w2 * d[c]",
-        "+ level * 4 + c, i), d[c]",
-        tests=COSTS,
-    ),
-    Mutation("costs: high words not added", "score.cl", "low[SUM_LANES] += sum < value;", "", tests=COSTS),
+    costs("costs: each band for itself", "FW square = (FW)0.0f;", "FW square = d[0] = d[1] = d[2] = (FW)0.0f;"),
+    costs("costs: mean colour without weights", "+ level * 4 + c, i), w2 * d[c]", "+ level * 4 + c, i), d[c]"),
+    costs("costs: high words not added", "low[SUM_LANES] += sum < value;", ""),
     Mutation(
         "refit: negative bases lessen the weight",
         "score.cl",
