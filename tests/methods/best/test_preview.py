@@ -27,9 +27,8 @@ def test_each_stage_leaves_so_many_times_the_rows_that_fit(tmp_path: Path, monke
     monkeypatch.setattr(preview, "_stage", counted)
     words: dict[str, Any] = {"cameras": str(project / "cameras.json"), "images": "none", "min_fidelity": 40.0}
     compress(project / "point_cloud.ply", tmp_path / "a.fgs", preview=2500, effort="fast", **words)
-    stages = len(preview.STAGES)
-    ends = asked[stages:]
+    stages, ends = asked[: len(preview.STAGES)], asked[len(preview.STAGES) :]
     assert 1 <= len(ends) <= preview.TRIES and sorted(ends, reverse=True) == ends
-    # The first stages go by the bits of the whole scene's rows, the last one by what rows and headers took before it.
-    assert asked[:stages] == pytest.approx([times * ends[0] for times in preview.STAGES], rel=0.75)
-    assert asked[0] / asked[-len(ends) - 1] == pytest.approx(preview.STAGES[0] / preview.STAGES[-1])
+    assert stages[0] / stages[-1] == pytest.approx(preview.STAGES[0] / preview.STAGES[-1])
+    # The first stages go by the bits of the whole scene's rows. The last one goes by what a file took, with its headers.
+    assert stages == pytest.approx([times * ends[0] for times in preview.STAGES], rel=0.75)
