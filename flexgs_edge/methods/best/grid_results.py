@@ -37,6 +37,8 @@ from flexgs_edge.views.original import Original
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
 
+NO_COLOURS = np.zeros((3, 0), np.float32)
+
 
 class GridResults(MultiplierSearch[GridScene]):
     """Makes the candidates of a search: grids that are coded in container version 2.
@@ -79,6 +81,9 @@ class GridResults(MultiplierSearch[GridScene]):
         """Begin as if no candidate had been made."""
         self._slopes: Slopes | None = None
         self._refitted: Refitted | None = None
+        self._constants = np.zeros(
+            (3, 0), np.float32
+        )  # constant colours of the last descent, not rounded, in the grid's order
         self._looking: Original | None = None  # candidates change how often descents look at its poses
 
     def _before_refit(self, multiplier: float) -> GridScene:
@@ -131,9 +136,11 @@ class GridResults(MultiplierSearch[GridScene]):
 
         As in `_finish`, copies go as soon as they can, those of `kept` as well: a large scene has no room for all of them.
         """
+        self._constants = NO_COLOURS  # a descent has no room for those of the last one
         moved = self._distil(kept, schedule, step_sizes)
         kept.planes = {}
-        grid = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved), self.rounds.storage)[0]
+        grid, order = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved), self.rounds.storage)
+        self._constants = self.rounds.storage.take(moved["sh_dc"], order)
         del moved
         return self._with_constants(grid) if self.refit else grid
 
@@ -164,6 +171,12 @@ class GridResults(MultiplierSearch[GridScene]):
         storage = self.rounds.storage
         moved = self._refit_colours(values_of(grid, storage), grid.sh_degrees, 1, bands=False)
         return recolour(grid, moved["sh_dc"], storage=storage)
+
+    def _with_finer_constants(self, grid: GridScene, factor: float) -> GridScene:
+        """The last descent's grid with constant colours in steps `factor` times as large, from values that were not rounded."""
+        step_sizes = replace(grid.step_sizes, dc=factor * grid.step_sizes.dc)
+        finer = recolour(replace(grid, step_sizes=step_sizes), self._constants, storage=self.rounds.storage)
+        return self._with_constants(finer) if self.refit else finer
 
     def _landed(self, grid: GridScene, size: int, limit: int) -> tuple[GridScene, int]:
         """`land`, and then the constant colours, which had been fitted to what is gone, once more."""

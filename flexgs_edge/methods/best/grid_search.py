@@ -38,6 +38,9 @@ CLOSE_SIZE = 0.003
 ROOM = 0.1
 """How far below what is asked the means must be for a result to lose Gaussians although its worst view misses:
 docs/results/tuning.md#room"""
+NEAR_MISS, FINER = 0.07, (0.8, 0.64)
+"""Largest log by which a descent's result may miss to be tried with finer steps of its constant colours, and factors of these:
+docs/results/tuning.md#near_miss"""
 DECAY = 0.8
 """Share of the last drift that the next refit adds again. It is above zero because refits overfit the scored poses:
 docs/results/tuning.md#decay"""
@@ -236,14 +239,38 @@ class GridSearch(GridResults):
     def _mended(
         self, missed: Candidate, product: GridScene, target: Target, tried: list[Candidate]
     ) -> tuple[Candidate, GridScene] | None:
-        """With fewer Gaussians, if only the worst view misses while the means are far better than asked.
+        """With fewer Gaussians, if only the worst view misses while the means are far better than asked; else with finer colours.
 
         The bound on the worst view grows with the mean, so that a finer result would miss it as well.
         """
-        if target.limit_bytes is not None or means(target).excess(missed.size, missed.measurement) > -ROOM:
+        if target.limit_bytes is not None:
             return None
-        step, grid = self._thinned(missed, product, target, means(target), tried)
-        return (step, grid) if step.holds else None
+        if means(target).excess(missed.size, missed.measurement) <= -ROOM:
+            step, grid = self._thinned(missed, product, target, means(target), tried)
+            return (step, grid) if step.holds else None
+        return self._with_finer(missed, product, target, tried) if self.steps and missed.excess <= NEAR_MISS else None
+
+    def _with_finer(
+        self, missed: Candidate, product: GridScene, target: Target, tried: list[Candidate]
+    ) -> tuple[Candidate, GridScene] | None:
+        """What holds of the last descent's result with finer steps of constant colours; one that gains too little is the last."""
+        for factor in FINER:
+            grid = self._with_finer_constants(product, factor)
+            step = self._variant(grid, missed, target, tried)
+            if step.holds:
+                return step, grid
+            if step.excess > missed.excess / 2:
+                break
+        return None
+
+    def _variant(self, grid: GridScene, of: Candidate, target: Target, tried: list[Candidate]) -> Candidate:
+        """Code and measure a grid that was made of a candidate's."""
+        started = time.perf_counter()
+        step = self._measured(grid, self.size_of(grid), of.multiplier, target, started, of.left_out)
+        tried.append(step)
+        if self.on_step:
+            self.on_step(step)
+        return step
 
     def _thinned(
         self, chosen: Candidate, grid: GridScene, target: Target, goal: Target, steps: list[Candidate]
@@ -253,12 +280,8 @@ class GridSearch(GridResults):
 
         def attempt(smaller: GridScene) -> list[float]:
             nonlocal best
-            started = time.perf_counter()
             mended = self._with_constants(smaller) if self.refit else smaller
-            step = self._measured(mended, self.size_of(mended), chosen.multiplier, target, started, chosen.left_out)
-            steps.append(step)
-            if self.on_step:
-                self.on_step(step)
+            step = self._variant(mended, chosen, target, steps)
             if better(step, best[0], target):
                 best = step, mended
             return excesses(goal, step.size, step.measurement)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,8 +14,9 @@ from flexgs_edge.goals.promise import MeanSsim, Promised, WorstView
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.grid.values import values_of
 from flexgs_edge.methods.best import descents, grid_results, grid_search
-from flexgs_edge.methods.best.candidates import Candidate
+from flexgs_edge.methods.best.candidates import Candidate, RateResult
 from flexgs_edge.methods.best.descents import (
     BEHIND_LONG,
     BEHIND_SHORT,
@@ -32,6 +34,7 @@ from flexgs_edge.methods.best.descents import (
     fits,
     rate_from,
 )
+from flexgs_edge.methods.best.grid_search import GridSearch
 from flexgs_edge.methods.best.kept import Kept
 from flexgs_edge.methods.best.refit.distil import STRUCTURE, Schedule
 from flexgs_edge.methods.best.rounds import take_rows
@@ -75,6 +78,9 @@ class Mending(KnownSearch):
 
     def _refit_colours(self, planes: Any, *_: Any, **__: Any) -> Any:
         return planes
+
+    def _with_finer(self, *_: Any) -> Any:
+        return None
 
 
 MARK = 9.0
@@ -180,6 +186,62 @@ def test_a_mended_result_does_not_take_the_place_of_a_smaller_one(monkeypatch: p
     monkeypatch.setattr(finder, "_whole", lambda *_: (next(again), object()))
     monkeypatch.setattr(finder, "_mended", lambda *_: finder.interrupted())
     assert finder.run(MaxDrop(0.5), best_effort=True).chosen.size == 100
+
+
+class Settling(Mended):
+    """The log of the loss falls by `gain` for each unit by which the log of the steps of constant colours does."""
+
+    gain = 0.0
+
+    def measure(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
+        found = super().measure(planes, estimate)
+        if estimate or not self.grids:
+            return found
+        drop = (found.drop or 0.0) * (dc_share(self.grids[-1]) / dc_share(self.grids[0])) ** self.gain
+        return Measurement(drop, 30.0, drop)
+
+
+def dc_share(grid: GridScene) -> float:
+    """Step of constant colours over that of opacities."""
+    return grid.step_sizes.dc / grid.step_sizes.opacity
+
+
+class Finer(Mending):
+    """Candidates miss by `miss`, and then by less than nothing. A result that holds is not landed."""
+
+    miss, _with_finer = 0.0, GridSearch._with_finer
+
+    def _aim(self, multiplier: float, steps: Sequence[Candidate], target: Target) -> float:
+        return AT * math.exp((-0.02 if len(steps) else self.miss) / 0.6)
+
+    def _landed_on_quality(self, found: RateResult[GridScene], target: Target) -> RateResult[GridScene]:
+        return found
+
+
+@pytest.mark.parametrize(
+    ("miss", "gain", "factors"),
+    [(0.06, 0.3, [1, 0.8]), (0.06, 0.2, [1, 0.8, 0.64]), (0.06, 0.1, [1, 0.8, 1]), (0.08, 0.5, [1, 1])],
+)
+def test_a_descent_that_hardly_misses_gets_finer_constant_colours(
+    miss: float, gain: float, factors: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are the descent's, not the grid's that missed. Where they gain less than half of it, another candidate is made."""
+    world = Settling(1.0, 1.0)
+    world.gain = gain
+    monkeypatch.setattr(Finer, "miss", miss)
+    Mending.calls = calls = []
+    result = search(world, MaxDrop(1.0), kind=Finer, refit=True, steps=100)
+    assert result.reached and len(calls) == factors.count(1) and len(result.steps) == len(factors)
+    assert [dc_share(grid) / dc_share(world.grids[0]) for grid in world.grids] == pytest.approx(factors)
+    assert dc_share(result.product) == pytest.approx(factors[-1] * dc_share(world.grids[0]))
+    if factors[-1] < 1:
+        assert off_the_original(result.product) < 0.9 * off_the_original(world.grids[0])
+
+
+def off_the_original(grid: GridScene) -> float:
+    """How far constant colours are from the nearest ones of the original, in the mean."""
+    colours, original = (planes["sh_dc"].T for planes in (values_of(grid), FakeRounds().snapshots[0].planes))
+    return float(np.linalg.norm(colours[:, None] - original, axis=2).min(axis=1).mean())
 
 
 @pytest.mark.parametrize(
