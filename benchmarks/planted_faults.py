@@ -98,7 +98,7 @@ def costs(name: str, old: str, new: str, file: str = "score.cl", form: str = "w1
     return Mutation(name, file, old, new, form, reference, COSTS)
 
 
-def coder(name: str, old: str, new: str, file: str = "code_chunks.cl") -> Mutation:
+def coder(name: str, old: str, new: str, file: str) -> Mutation:
     """A fault in the entropy coder."""
     return Mutation(name, file, old, new, reference=False, tests=CODER)
 
@@ -345,8 +345,20 @@ MUTATIONS = (
         "(float)sqrt((double)(square > 0.0f ? square : 0.0f))",
         "sqrt(square > 0.0f ? square : 0.0f) * 1.0000001f",
     ),
-    coder("coder: states are not filled up", "return (state / RANS_FLOOR - 1) >> 31", "return 0"),
-    coder("coder: predictions rounded down", "mean * (DW)(1.0 / 65536.0) + (DW)0.5", "mean * (DW)(1.0 / 65536.0)"),
-    coder("coder: places of far values", "long code = start + (rounded[j] & keep) + more", "long code = start + more"),
-    coder("coder: raw bits in one place", "(uchar)(offset >> (8 * piece)", "(uchar)(offset >> piece"),
+    coder("coder: states are not filled up", "return (state / RANS_FLOOR - 1) >> 31", "return 0", "chunk_streams.clh"),
+    coder(
+        "coder: predictions rounded down",
+        "mean * (DW)(1.0 / 65536.0) + (DW)0.5",
+        "mean * (DW)(1.0 / 65536.0)",
+        "chunk_passes.clh",
+    ),
+    coder(
+        "coder: places of far values",
+        "long code = start + (rounded[j] & keep) + more",
+        "long code = start + more",
+        "chunk_passes.clh",
+    ),
+    coder(
+        "coder: raw bits in one place", "(uchar)(offset >> (8 * piece)", "(uchar)(offset >> piece", "chunk_passes.clh"
+    ),
 )

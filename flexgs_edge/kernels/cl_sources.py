@@ -17,9 +17,9 @@ KERNEL_DIR_VARIABLE = "FLEXGS_KERNEL_DIR"
 
 _COMMON = "common.clh"
 _SHARED = (_COMMON, "sh.clh", "activate.clh", "values.clh")
-"""Files of helpers, which come before every kernel file."""
+"""Files of helpers that come before every kernel file."""
 _TOGETHER = ("activate.cl", "project.cl", "sort.cl", "score.cl", "similarity.cl", "flip.cl")
-_CODEC = ("code_chunks.cl", "encode_chunks.cl")
+_CODEC = ("chunk_streams.clh", "chunk_passes.clh", "code_chunks.cl", "encode_chunks.cl")
 """Files that together make one program of the codec."""
 _BLENDS = {spec.stats: name for name, spec in KERNELS.items() if spec.stats is not None}
 """Blend kernels by their kind of statistics, STATS; one file makes all of them."""
