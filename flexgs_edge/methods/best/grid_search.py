@@ -255,8 +255,14 @@ class GridSearch(GridResults):
     ) -> tuple[Candidate, GridScene] | None:
         """What holds of the last descent's result with finer steps of constant colours; one that gains too little is the last."""
         for factor in FINER:
-            grid = self._with_finer_constants(product, factor)
-            step = self._variant(grid, missed, target, tried)
+            try:
+                grid = self._with_finer_constants(product, factor)
+                step = self._variant(grid, missed, target, tried)
+            except KeyboardInterrupt:
+                if not self.keeps_best:
+                    raise
+                self.interrupted()
+                break
             if step.holds:
                 return step, grid
             if step.excess > missed.excess / 2:

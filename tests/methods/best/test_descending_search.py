@@ -238,6 +238,17 @@ def test_a_descent_that_hardly_misses_gets_finer_constant_colours(
         assert off_the_original(result.product) < 0.9 * off_the_original(world.grids[0])
 
 
+def test_an_interruption_while_colours_get_finer_keeps_the_best_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    world = Settling(1.0, 1.0)
+    monkeypatch.setattr(Finer, "miss", 0.06)
+    monkeypatch.setattr(Finer, "_with_finer_constants", interrupt)
+    result = search(world, MaxDrop(1.0), kind=Finer, refit=True, steps=100, best_effort=True)
+    assert not result.reached and result.product is world.grids[0]
+
+
 def off_the_original(grid: GridScene) -> float:
     """How far constant colours are from the nearest ones of the original, in the mean."""
     colours, original = (planes["sh_dc"].T for planes in (values_of(grid), FakeRounds().snapshots[0].planes))
