@@ -38,6 +38,7 @@ FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
 
 NO_COLOURS = np.zeros((3, 0), np.float32)
+"""Constant colours where no descent has moved any."""
 
 
 class GridResults(MultiplierSearch[GridScene]):

@@ -253,7 +253,7 @@ class GridSearch(GridResults):
     def _with_finer(
         self, missed: Candidate, product: GridScene, target: Target, tried: list[Candidate]
     ) -> tuple[Candidate, GridScene] | None:
-        """What holds of the last descent's result with finer steps of constant colours; one that gains too little is the last."""
+        """The last descent's result with finer steps of constant colours, if it holds; one that gains too little is the last."""
         for factor in FINER:
             try:
                 grid = self._with_finer_constants(product, factor)
