@@ -75,6 +75,12 @@ def test_links_and_anchors_lead_somewhere(repository: Path) -> None:
     assert not missing, "\n".join(missing)
 
 
+def test_no_page_spells_an_anchor_twice(repository: Path) -> None:
+    for page in pages_of(repository):
+        spelt = Counter(NAMED_ANCHOR.findall(page.read_text(encoding="utf-8")))
+        assert not [anchor for anchor, times in spelt.items() if times > 1], page
+
+
 def test_paths_that_pages_name_exist(repository: Path) -> None:
     roots = (
         repository,
