@@ -38,7 +38,7 @@ FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
 
 NO_COLOURS = np.zeros((3, 0), np.float32)
-"""Constant colours where no descent has moved any."""
+"""Constant colours before the first descent, and during each."""
 
 
 class GridResults(MultiplierSearch[GridScene]):
@@ -82,9 +82,7 @@ class GridResults(MultiplierSearch[GridScene]):
         """Begin as if no candidate had been made."""
         self._slopes: Slopes | None = None
         self._refitted: Refitted | None = None
-        self._constants = np.zeros(
-            (3, 0), np.float32
-        )  # constant colours of the last descent, not rounded, in the grid's order
+        self._constants = NO_COLOURS  # of the last descent, not rounded, in the order of its grid
         self._looking: Original | None = None  # candidates change how often descents look at its poses
 
     def _before_refit(self, multiplier: float) -> GridScene:

@@ -253,11 +253,15 @@ class GridSearch(GridResults):
     def _with_finer(
         self, missed: Candidate, product: GridScene, target: Target, tried: list[Candidate]
     ) -> tuple[Candidate, GridScene] | None:
-        """The last descent's result with finer steps of constant colours, if it holds; one that gains too little is the last."""
+        """The last descent's result with finer steps of constant colours, if it holds.
+
+        If a factor gains less than half of the miss, the next ones are not tried.
+        """
         for factor in FINER:
+            started = time.perf_counter()
             try:
                 grid = self._with_finer_constants(product, factor)
-                step = self._variant(grid, missed, target, tried)
+                step = self._variant(grid, missed, target, tried, started)
             except KeyboardInterrupt:
                 if not self.keeps_best:
                     raise
@@ -269,9 +273,10 @@ class GridSearch(GridResults):
                 break
         return None
 
-    def _variant(self, grid: GridScene, of: Candidate, target: Target, tried: list[Candidate]) -> Candidate:
-        """Code and measure a grid that was made of a candidate's."""
-        started = time.perf_counter()
+    def _variant(
+        self, grid: GridScene, of: Candidate, target: Target, tried: list[Candidate], started: float
+    ) -> Candidate:
+        """Code and measure a grid that was made of a candidate's, from `started` on."""
         step = self._measured(grid, self.size_of(grid), of.multiplier, target, started, of.left_out)
         tried.append(step)
         if self.on_step:
@@ -286,8 +291,9 @@ class GridSearch(GridResults):
 
         def attempt(smaller: GridScene) -> list[float]:
             nonlocal best
+            started = time.perf_counter()
             mended = self._with_constants(smaller) if self.refit else smaller
-            step = self._variant(mended, chosen, target, steps)
+            step = self._variant(mended, chosen, target, steps, started)
             if better(step, best[0], target):
                 best = step, mended
             return excesses(goal, step.size, step.measurement)
