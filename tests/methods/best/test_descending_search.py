@@ -207,7 +207,7 @@ def dc_share(grid: GridScene) -> float:
 
 
 class Finer(Mending):
-    """Candidates miss by `miss`, and then by less than nothing. A result that holds is not landed."""
+    """The first candidate misses by `miss`, all further ones hold. What holds is not landed."""
 
     miss, _with_finer = 0.0, GridSearch._with_finer
 
