@@ -17,13 +17,18 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import RenderResult
+from flexgs_edge.run.foresight import drawing_bytes, foresee
 from flexgs_edge.run.inputs import scene_info
+from flexgs_edge.run.judge import LIBRARY_BYTES
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import open_run
 from flexgs_edge.run.view_set import views_info
 
 LOG = logging.getLogger("flexgs_edge")
+
+PICTURE_BYTES = 48
+"""Bound on the bytes a pixel of a view that is read, rounded and written as PNG."""
 
 
 def render_views(
@@ -66,8 +71,11 @@ def render_views(
         chosen = _choose(views, len(found.cameras))
         places = _places(Path(output), [found.cameras[i].name for i in chosen], force)
     seconds = []
+    writing = LIBRARY_BYTES + PICTURE_BYTES * max(found.cameras[i].width * found.cameras[i].height for i in chosen)
+    foresee(run, search=lambda: writing + drawing_bytes(run), compares=False)
     with open_bench(run) as bench:
         renderer = bench.renderer
+        run.budget.take("writing pictures", writing)
         with clock.stage("load"):
             device_scene = renderer.load(run.scene.drawn)
         with device_scene:

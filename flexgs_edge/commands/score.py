@@ -12,9 +12,10 @@ import numpy as np
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_writable
 from flexgs_edge.methods.paper.score_files import save_scores
-from flexgs_edge.methods.paper.scores import SCORES, score_scene
+from flexgs_edge.methods.paper.scores import SCORE_ROW_BYTES, SCORES, score_scene
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import ScoreResult
+from flexgs_edge.run.foresight import drawing_bytes, foresee
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import ViewOptions
@@ -66,8 +67,11 @@ def score_gaussians(
     views, clock = run.seen, run.clock
     if not views.train:
         raise InputError(f"{views.cameras_from}: every view is held out: give more views, or --holdout 0")
+    needed = SCORE_ROW_BYTES * run.source.count
+    foresee(run, search=lambda: needed + drawing_bytes(run), compares=False)
     with open_bench(run) as bench:
         renderer = bench.renderer
+        run.budget.take("scores", needed)
         with clock.stage("load"):
             device_scene = renderer.load(run.source)
         with device_scene, clock.stage("score"):

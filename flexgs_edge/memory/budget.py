@@ -12,8 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from flexgs_edge.errors import BudgetError
+from flexgs_edge.memory.heap import HeapWatch
 from flexgs_edge.memory.process import available_memory, current_rss
 from flexgs_edge.units import format_mib
+
+LARGE = 2**20
+"""Bytes from which a stage may look whether the heaps of this process have holes."""
 
 
 @dataclass
@@ -32,8 +36,12 @@ class MemoryBudget:
     used: int = 0
     reclaimers: list[Callable[[int], None]] = field(default_factory=list)
     """Functions to call with the missing bytes before a stage is refused; each lets a cache free memory."""
+    evictors: list[Callable[[], None]] = field(default_factory=list)
+    """Functions that free whole scenes on the device, each of which is then loaded again when it is drawn next."""
     foreseen: Callable[[], int] | None = None
     """Reckons a limit that is expected to be enough for all stages. Only an error calls it, and names that limit."""
+    heap: HeapWatch | None = field(default_factory=HeapWatch)
+    """Keeps freed memory from counting against the limit; None where pages of scratch files may lie above the limit."""
 
     @classmethod
     def from_limit(cls, limit: int | None) -> MemoryBudget:
@@ -88,6 +96,8 @@ class MemoryBudget:
         """Take `size` bytes until `give` returns them; raises `BudgetError` if they do not fit."""
         self.require(stage, size)
         self.used += size
+        if self.heap is not None and size >= LARGE and self.used > self.limit // 2:
+            self.heap.check(self.limit)
 
     def hold(self, size: int) -> None:
         """Count `size` bytes that are held already. The next stage finds out whether the limit is enough."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import resource
 import sys
 import threading
@@ -12,10 +11,6 @@ from pathlib import Path
 
 SAMPLE_SECONDS = 0.05
 """Seconds between two samples of the memory; shorter peaks may be missed."""
-
-_MALLOPT = {-3: 8 << 20, -1: 32 << 20, -8: 2}
-"""Settings of glibc: M_MMAP_THRESHOLD and M_TRIM_THRESHOLD in bytes, and M_ARENA_MAX, the number of heaps for
-threads."""
 
 
 def peak_rss() -> int:
@@ -107,26 +102,3 @@ def _left_in_groups(proc: Path, groups: Path) -> Iterator[int]:
                 stat = dict(line.split() for line in (place / "memory.stat").read_text().splitlines())
                 # Inactive file pages count as used, but the kernel drops them first.
                 yield limit - int((place / used).read_text()) + int(stat.get(cache, 0))
-
-
-def return_freed_memory() -> None:
-    """Make glibc return large freed arrays to the system; does nothing with another C library.
-
-    By default, each freed mapped array raises the size from which glibc maps (up to 32 MiB). Then arrays of several
-    threads leave holes in heaps, and the peak rises. Lower limits than ours cost time: the kernel clears each page that
-    is mapped again. Call this before any large allocation: docs/results/tuning.md#memory
-    """
-    with suppress(OSError, AttributeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        for parameter, value in _MALLOPT.items():
-            mallopt(parameter, value)
-
-
-def trim_heap() -> None:
-    """Return what is freed by now to the system; does nothing with another C library than glibc.
-
-    `return_freed_memory` bounds the holes of arrays that are mapped; the heaps of threads keep those of smaller arrays until
-    this call. Call it before work whose limit counts all resident memory: docs/results/tuning.md#memory
-    """
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)

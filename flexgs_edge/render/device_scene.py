@@ -90,6 +90,7 @@ class DeviceScene:
         """Chunks of a compact scene that stay on the backend, by their first rows."""
         self._drawn = -1
         """First row of the chunk in use, -1 if none is; `give_way` must not free it."""
+        self._stays = False
         self._rows = 0
         self._chunk_row_bytes = streamed_bytes(planes.sh_degree)
         self._least_rows = min(self.fit.least_rows, max(self.count, 1))
@@ -186,7 +187,7 @@ class DeviceScene:
         self.statistics = []
 
     def _decide(self) -> None:
-        """Load the scene if it fits, else choose the rows of a streamed chunk; later views keep that number."""
+        """Load the scene if it fits, else choose the rows of a streamed chunk; later views of this size keep that number."""
         budget, later = self._budget, self.later_bytes
         if self.shown is not None:
             self._rows, self._streamed = self._least_rows, True
@@ -201,14 +202,29 @@ class DeviceScene:
             self._rows = max(min(most, (spare // per_row // LANES - 2) * LANES), self._least_rows)
         if fits:
             self._resident = [self._load(*span) for span in self.spans()]
+            self._budget.evictors.append(self.evict)
         # Fixed here: in the middle of a view, a part of the memory it left free is taken, and the answer would change.
         self.resident, self._streamed = fits, not fits
 
+    def choose_rows_anew(self) -> None:
+        """Let the next view choose the rows of a chunk again, unless all are loaded: new buffers leave other room."""
+        if not self._resident and self.shown is None:
+            self._rows, self._streamed = 0, False
+            self._planes.bounds.clear()
+
+    def stay(self) -> None:
+        """Keep the loaded scene on the backend until it is closed, as its values will change there."""
+        self._stays = True
+
     def evict(self) -> None:
-        """Free a loaded scene; the next view decides again whether it fits."""
+        """Free a loaded scene, unless it has to `stay`; the next view decides again whether it fits."""
+        if self._stays:
+            return
         for chunk in (*self._resident, *self._pinned.values()):
             chunk.release()
         self._resident, self._pinned, self.resident, self._streamed = [], {}, False, False
+        if self.evict in self._budget.evictors:
+            self._budget.evictors.remove(self.evict)
 
     def give_way(self, size: int) -> None:
         """Free `size` bytes of chunks that stay, or as many as there are; the chunk in use is kept."""
@@ -318,6 +334,7 @@ class DeviceScene:
 
     def close(self) -> None:
         """Free everything."""
+        self._stays = False
         self.evict()
         if self.give_way in self._budget.reclaimers:
             self._budget.reclaimers.remove(self.give_way)

@@ -417,9 +417,11 @@ class Renderer:
             except BudgetError:
                 if scene.shown is not None:
                     scene.shown = self.fit.capacity(scene.count, 1 / self.fit.first_share)
-                # A larger view than before needs memory: free the scene, which is streamed from now on if need be.
-                scene.evict()
+                # The view needs memory: free this scene and all others, which are streamed from now on if need be.
+                for evict in (scene.evict, *self.budget.evictors):
+                    evict()
                 self._buffers = ViewBuffers(self.backend, scene, camera, self.budget, scene.shown)
+            scene.choose_rows_anew()
         return self._buffers
 
     def _may_be_compact(self, scene: DeviceScene, camera: Camera, shown: int) -> bool:

@@ -19,7 +19,9 @@ BLOCKS = 64
 """Blocks of a view's passes on the device: as many as a processor of 16 cores has."""
 
 
-def foresee(run: Run[Any], opened: bool = False, search: Callable[[], int] | None = None) -> None:
+def foresee(
+    run: Run[Any], opened: bool = False, search: Callable[[], int] | None = None, compares: bool = True
+) -> None:
     """Let errors about the limit name one that is expected to be enough for all stages, not for the next one alone.
 
     Call it before the device is opened, and again when it is open.
@@ -27,11 +29,13 @@ def foresee(run: Run[Any], opened: bool = False, search: Callable[[], int] | Non
     Parameters
     ----------
     run : Run
-        With views that are compared.
+        With views.
     opened : bool
         The device is open, and its memory is taken from the budget.
     search : callable, optional
         Bytes that the search needs beside the comparison of views. Default: those of drawing one view.
+    compares : bool
+        Views are compared (default), not drawn alone.
     """
     budget, plan, views = run.budget, run.plan, run.seen
     reporting = views.held_out or views.train
@@ -42,7 +46,7 @@ def foresee(run: Run[Any], opened: bool = False, search: Callable[[], int] | Non
         held += RUNTIME_BYTES + BUILD_BYTES
 
     def enough() -> int:
-        compared_bytes = sum(work_bytes(views.of(indices)) for indices in compared)
+        compared_bytes = sum(work_bytes(views.of(indices)) for indices in compared if compares)
         return held + compared_bytes + (drawing_bytes(run) if search is None else search())
 
     budget.foreseen = enough

@@ -10,6 +10,8 @@ import pytest
 
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.evaluate import evaluate
+from flexgs_edge.commands.render import render_views
+from flexgs_edge.commands.score import score_gaussians
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.units import parse_size
 from tiny_project import make_project
@@ -36,3 +38,18 @@ def test_that_of_an_evaluation_as_well(tmp_path: Path) -> None:
     with pytest.raises(BudgetError, match="the program already holds .* which counts later stages too") as caught:
         evaluate(scene, scene, memory_limit=2**20, device="numpy")
     evaluate(scene, scene, memory_limit=named(caught.value) + (8 << 20), device="numpy")
+
+
+@pytest.mark.parametrize("command", ["render", "score"])
+def test_that_of_drawing_as_well(command: str, tmp_path: Path) -> None:
+    scene = make_project(tmp_path) / "point_cloud.ply"
+
+    def run(limit: int) -> None:
+        if command == "render":
+            render_views(scene, tmp_path / "views", force=True, device="numpy", memory_limit=limit)
+        else:
+            score_gaussians(scene, tmp_path / "scores.npy", force=True, device="numpy", memory_limit=limit)
+
+    with pytest.raises(BudgetError, match="which counts later stages too") as caught:
+        run(2**20)
+    run(named(caught.value) + (8 << 20))

@@ -23,7 +23,7 @@ from flexgs_edge.constants import RANS_PRECISION as PRECISION
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import POSITION_BITS
-from flexgs_edge.memory.process import trim_heap
+from flexgs_edge.memory.heap import trim_heap
 from flexgs_edge.memory.rows import blocks, put_rows, read_rows
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.curve import morton

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flexgs_edge.cameras.camera import Camera, largest_of
-from flexgs_edge.memory.process import return_freed_memory
+from flexgs_edge.memory.heap import return_freed_memory
 from flexgs_edge.memory.rows import READING_BYTES
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
@@ -123,7 +123,7 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
         "a search by measured costs with all else in scratch files",
         READING_BYTES + SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest, distils),
     )
-    storage = ScratchStorage(folder, budget.limit)
+    storage, budget.heap = ScratchStorage(folder, budget.limit), None
     budget.take("reading scratch files", READING_BYTES)  # until the process ends
     renderer.largest = largest
     most = whole + SPOOL_ROW_BYTES * rows * len(scored) + renderer.fit.ahead * AHEAD_ROW_BYTES * rows

@@ -38,6 +38,9 @@ from flexgs_edge.views.bench import Bench
 
 LOG = logging.getLogger("flexgs_edge")
 
+RANK_ROW_BYTES = 36
+"""Bytes a Gaussian of orders, ranks, numbers of rows with SH, and rows of one choice. Scores, made before, take less."""
+
 
 @dataclass(frozen=True)
 class Ranking:
@@ -67,6 +70,7 @@ def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray 
     scores : np.ndarray or None
         [N] f64 from a file (see `given_scores`). By default they are computed if the run needs them.
     """
+    run.budget.take("the order of the Gaussians", RANK_ROW_BYTES * run.source.count)
     with nullcontext() if bench is None else Judges(run, bench) as judges:
         ranking = rank(run, judges, bench, scores)
         with run.clock.stage("open"):
@@ -105,9 +109,13 @@ def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray 
 
 
 def expected_bytes(run: Run[CompressOptions]) -> int:
-    """Bytes that the search is expected to need: a view, and the codes of all rows, up to twice as large on the device."""
+    """Bytes that the search is expected to need: ranks, a view, and codes of all rows, up to twice as large on the device."""
     source, (bits, groups) = run.source, run.options.bit_spec()
-    return drawing_bytes(run) + 3 * quantized_bytes(source.count, source.count, source.sh_degree, bits or PAPER, groups)
+    return (
+        RANK_ROW_BYTES * source.count
+        + drawing_bytes(run)
+        + 3 * quantized_bytes(source.count, source.count, source.sh_degree, bits or PAPER, groups)
+    )
 
 
 def given_scores(run: Run[CompressOptions]) -> np.ndarray | None:

@@ -18,6 +18,8 @@ from flexgs_edge.scene.source import SceneSource
 SCORES = ("gs", "meson")
 ROWS = 1 << 16
 """Rows of the scene read at a time."""
+SCORE_ROW_BYTES = 28
+"""Bytes a Gaussian that scoring holds: hits and weights, and what one view adds to them."""
 
 
 def score_scene(
@@ -59,17 +61,16 @@ def score_scene(
     if kind not in SCORES:
         raise InputError(f"score {kind!r}: expected one of {', '.join(SCORES)} or a .npy/.npz file")
     statistics = gather_statistics(renderer, scene, cameras, progress)
-    volume = np.empty(source.count)
-    log_opacity = np.empty(source.count)
+    scores = np.empty(source.count)
     for rows in source.chunks(ROWS):
         part = source.read(rows, ["log_scales", "opacity_logits"])
-        volume[rows] = part["log_scales"].sum(axis=0, dtype=np.float64)
-        log_opacity[rows] = -np.logaddexp(0.0, -part["opacity_logits"][0].astype(np.float64))
-    with np.errstate(divide="ignore"):  # unseen Gaussians get log(0) = -inf
+        seen = Statistics(statistics.hits[rows], statistics.weights[rows])
+        scores[rows] = VOLUME_POWER * part["log_scales"].sum(axis=0, dtype=np.float64)
         if kind == "gs":
-            return log_opacity + VOLUME_POWER * volume + np.log(statistics.hits.astype(np.float64))
-        scores: np.ndarray = VOLUME_POWER * volume + np.log(statistics.weight_sums)
-        return scores
+            scores[rows] -= np.logaddexp(0.0, -part["opacity_logits"][0].astype(np.float64))
+        with np.errstate(divide="ignore"):  # unseen Gaussians get log(0) = -inf
+            scores[rows] += np.log(seen.hits.astype(np.float64) if kind == "gs" else seen.weight_sums)
+    return scores
 
 
 def gather_statistics(

@@ -83,6 +83,7 @@ class Descent:
                     f"distilling {source.count} Gaussians keeps all of them in memory at once with what their steps remember "
                     f"({format_mib(size)}), more than the memory limit leaves: use a larger --memory-limit, or --distil 0"
                 )
+            self._scene.stay()
             lengths = sum(self.widths.values()), GRID_VALUES, PRICES
             self._rates, self._steps, self._prices = (self._array((n,)) for n in lengths)
             for chunk in self._scene.chunks():
