@@ -207,8 +207,11 @@ class DeviceScene:
         self.resident, self._streamed = fits, not fits
 
     def choose_rows_anew(self) -> None:
-        """Let the next view choose the rows of a chunk again, unless all are loaded: new buffers leave other room."""
-        if not self._resident and self.shown is None:
+        """Let the next view choose the rows of a chunk again: new buffers leave other room.
+
+        A loaded scene stays as it is, and so does one whose views have sums: sums over views belong to its chunks.
+        """
+        if not self._resident and not self.statistics and self.shown is None:
             self._rows, self._streamed = 0, False
             self._planes.bounds.clear()
 

@@ -9,7 +9,10 @@ import pytest
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
+from flexgs_edge.render.fit import SUM_BYTES, sum_bytes
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.views.bench import Bench
 from kernel_fixtures import large_budget
 from quantized_scenes import quantize_all
 from synthetic import make_camera, random_scene
@@ -19,14 +22,14 @@ CODES = quantize_all(SCENE)
 SMALL, LARGE = make_camera(24, 16), make_camera(112, 80)
 
 
-def scarce() -> Iterator[Renderer]:
+def scarce(sums: int = SUM_BYTES) -> Iterator[Renderer]:
     """With less and less memory, as long as each of two scenes alone can be drawn beside the codes of one."""
     for limit in range(3 << 20, 0, -(96 << 10)):
         budget = MemoryBudget(limit)
         renderer = Renderer(TwinBackend(budget), budget)
         try:
             with renderer.load_quantized(CODES) as codes:
-                with renderer.load(SCENE) as scene:
+                with renderer.load(SCENE, sums) as scene:
                     renderer.render(scene, LARGE)
                 renderer.release()
                 renderer.render(codes, LARGE)
@@ -80,6 +83,23 @@ def test_a_larger_view_cuts_a_scene_anew() -> None:
             renderer.render(scene, LARGE)
             cut += len(scene.starts) > before
         renderer.release()
+    assert cut
+
+
+def test_sums_over_views_of_two_sizes_belong_to_the_same_chunks() -> None:
+    """A scene that was cut for its first view stays cut so, although a smaller one leaves room for larger chunks."""
+    room, views = cost_bytes(3) + sum_bytes(2), [LARGE, SMALL, LARGE]
+    bench = Bench(Renderer(TwinBackend(large_budget()), large_budget()))
+    with bench.renderer.load(SCENE, room) as scene:
+        expected = measure_costs(bench, scene, views)
+    cut = 0
+    for renderer in scarce(room):
+        with renderer.load(SCENE, room) as scene:
+            found = measure_costs(Bench(renderer), scene, views)
+            cut += not scene.resident
+        renderer.release()
+        assert found.removal.tobytes() == expected.removal.tobytes()
+        assert found.sh.tobytes() == expected.sh.tobytes()
     assert cut
 
 
