@@ -90,7 +90,7 @@ class DeviceScene:
         """Chunks of a compact scene that stay on the backend, by their first rows."""
         self._drawn = -1
         """First row of the chunk in use, -1 if none is; `give_way` must not free it."""
-        self._stays = False
+        self._stays = self._keeps_chunks = False
         self._rows = 0
         self._chunk_row_bytes = streamed_bytes(planes.sh_degree)
         self._least_rows = min(self.fit.least_rows, max(self.count, 1))
@@ -207,17 +207,18 @@ class DeviceScene:
         self.resident, self._streamed = fits, not fits
 
     def choose_rows_anew(self) -> None:
-        """Let the next view choose the rows of a chunk again: new buffers leave other room.
-
-        A loaded scene stays as it is, and so does one whose views have sums: sums over views belong to its chunks.
-        """
-        if not self._resident and not self.statistics and self.shown is None:
+        """Let the next view choose the rows of a chunk again, as new buffers leave other room, unless chunks are kept."""
+        if not self._resident and not self._keeps_chunks and self.shown is None:
             self._rows, self._streamed = 0, False
             self._planes.bounds.clear()
 
     def stay(self) -> None:
         """Keep the loaded scene on the backend until it is closed, as its values will change there."""
         self._stays = True
+
+    def keep_chunks(self) -> None:
+        """Cut the scene into the same chunks for all views from now on, as sums over views belong to them."""
+        self._keeps_chunks = True
 
     def evict(self) -> None:
         """Free a loaded scene, unless it has to `stay`; the next view decides again whether it fits."""

@@ -49,6 +49,7 @@ class ViewSums:
 
     def __init__(self, bench: Bench, scene: DeviceScene, makers: Sequence[Maker]) -> None:
         self._bench, self._renderer, self._scene, self._makers = bench, bench.renderer, scene, makers
+        scene.keep_chunks()
         self._held: dict[int, tuple[int, list[ChunkSums]]] = {}
         self._spool: Spool | None = None
         self._dense: DenseSums | None = None
