@@ -21,7 +21,7 @@ from flexgs_edge.io.streamed_sog_writer import STREAMED
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.report.file_results import DecompressResult
 from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.decoding import ahead, decoder
+from flexgs_edge.run.decoding import ahead, decode_bytes, decoded_once, decoder
 from flexgs_edge.run.inputs import CheckedScene, ScenePlace, load_scene, scene_info
 from flexgs_edge.run.open_bench import run_info
 from flexgs_edge.run.open_scene import is_fgs, scene_file
@@ -89,23 +89,25 @@ def decompress(
         scene = load_scene(input, reading=reading)
         budget.take("reading the scene", scene.held_bytes)
     antialiased = scene.settings.get("antialiased") is True
-    backend = None
-    if format is None:
-        backend = decoder(device, scene.source, budget, clock)
+    backend = decoder(device, scene.source, budget, clock)
     with clock.stage("write"):
         if format is not None:
-            budget.require(f"writing a {format.suffix}", format.memory * scene.source.count)
+            needed = format.memory * scene.source.count
+            budget.require(f"writing a {format.suffix}", needed)
+            source = decoded_once(scene.source, budget, needed, backend)
             writing = replace(writing, antialiased=antialiased)
             if streamed:
-                layers, preview = _layers(input, scene.source.count, reading)
+                layers, preview = _layers(input, source.count, reading)
                 notes = write_streamed(
-                    Path(output).parent, scene.source, layers, preview=preview, force=force, writing=writing
+                    Path(output).parent, source, layers, preview=preview, force=force, writing=writing
                 )
             else:
-                notes = write_foreign(output, scene.source, force=force, writing=writing)
+                notes = write_foreign(output, source, force=force, writing=writing)
         else:
-            row = inria_dtype(scene.source.sh_degree).itemsize
-            rows = budget.rows("decoding", WRITE_COPIES * row, minimum=min(scene.source.count, 1024), most=65536)
+            row = WRITE_COPIES * inria_dtype(scene.source.sh_degree).itemsize
+            least, decoding = min(scene.source.count, 1024), decode_bytes(scene.source, backend)
+            rows = budget.rows("decoding", row, fixed=decoding, minimum=least, most=65536)
+            budget.take("writing rows", row * rows)  # what is left decodes further chunks ahead
             with ahead(scene.source, budget, backend):
                 notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
         if antialiased and not (format is not None and format.marks_antialiased):

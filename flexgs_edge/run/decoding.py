@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from weakref import WeakKeyDictionary
 
+import numpy as np
+
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS
 from flexgs_edge.codec.v2.device.encode_kernels import device_bytes
 from flexgs_edge.codec.v2.grid_source import GridSource
@@ -17,10 +19,11 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.heap import trim_heap
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.open_bench import counted_backend
+from flexgs_edge.run.open_bench import BUILD_BYTES, RUNTIME_BYTES, counted_backend
+from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
 
-DECODE_BYTES = 800
+DECODE_BYTES = 900
 """Bound on the bytes per row while a chunk is decoded: codes, features, neighbours' weights, sums."""
 DEVICE_ROWS = 40_000
 """A device codes scenes with at least this many Gaussians. Below, starting the kernels takes longer than they save:
@@ -43,7 +46,8 @@ def decoder(
     Parameters
     ----------
     device : str or None
-        As the user named it. Default: a processor, if one has a working driver and the scene has at least `least` Gaussians.
+        As the user named it. Default: a processor, if one has a working driver, the scene has at least `least` Gaussians, and
+        its runtime fits into memory.
     source : SceneSource
         The scene to decode. Devices decode container version 2 only.
     budget : MemoryBudget
@@ -70,11 +74,20 @@ def decoder(
     if device is None:
         if source.count < least:
             return None
+        if budget.free < RUNTIME_BYTES + BUILD_BYTES + source.device_bytes(1):
+            return None
         if not any(found.type == "cpu" and found.usable for found in devices()):
             return None
         device = "cpu"
     backend = counted_backend(device, budget, clock)
     return backend if backend.threads else None
+
+
+def decode_bytes(source: SceneSource, backend: Backend | None) -> int:
+    """Bytes that decoding takes at least, one chunk at a time; 0 where nothing is to be decoded."""
+    if not isinstance(source, GridSource):
+        return 0
+    return min(source.count, CHUNK_ROWS) * DECODE_BYTES if backend is None else source.device_bytes(1)
 
 
 @contextmanager
@@ -97,6 +110,20 @@ def ahead(source: SceneSource, budget: MemoryBudget, backend: Backend | None = N
         yield
 
 
+def decoded_once(source: SceneSource, budget: MemoryBudget, spare: int, backend: Backend | None) -> SceneSource:
+    """Decode a file's scene to memory, so that it can be read several times, if it fits there beside `spare` bytes."""
+    size = source.count * sum(4 * source.width(name) for name in FIELD)
+    if not isinstance(source, GridSource) or budget.free < size + decode_bytes(source, backend) + spare:
+        return source
+    budget.take("the decoded scene", size)
+    planes = {name: np.empty((source.width(name), source.count), np.float32) for name in FIELD}
+    with ahead(source, budget, backend):
+        for rows in source.chunks(CHUNK_ROWS):
+            for name, values in source.read(rows, list(FIELD)).items():
+                planes[name][:, rows] = values
+    return MemorySource(planes, source.sh_degree, source.origin, source.name)
+
+
 def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
     """Prepare a file's scene for drawing several views.
 
@@ -109,7 +136,7 @@ def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
         return source
     renderer.release()
     trim_heap()
-    budget.require("decoding the file", min(source.count, CHUNK_ROWS) * DECODE_BYTES)
+    budget.require("decoding the file", decode_bytes(source, None))
     with ahead(source, budget):
         planes = read_all(source, storage)
     trim_heap()

@@ -9,12 +9,10 @@ from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.cameras.order import in_picture
 from flexgs_edge.render.fit import DEFAULT, GUESS, ViewSize, compact_bytes, padded, streamed_bytes, view_bytes
 from flexgs_edge.run.judge import work_bytes
-from flexgs_edge.run.open_bench import BUILD_BYTES
+from flexgs_edge.run.open_bench import BUILD_BYTES, RUNTIME_BYTES
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.sample import some_positions
 
-RUNTIME_BYTES = 88 * 2**20
-"""Bound on what PoCL's runtime and its compiler take before our kernels are built. Once the device is open, it is known."""
 BLOCKS = 64
 """Blocks of a view's passes on the device: as many as a processor of 16 cores has."""
 

@@ -18,6 +18,8 @@ from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.cluster import Cluster
 from flexgs_edge.views.worker import Drawing
 
+RUNTIME_BYTES = 88 * 2**20
+"""Bound on what PoCL's runtime and its compiler take before our kernels are built. Once the device is open, it is known."""
 BUILD_BYTES = 24 * 2**20
 """Bound on the bytes that building our kernels adds to the loaded compiler: docs/results/tuning.md#memory"""
 
