@@ -29,6 +29,8 @@ from flexgs_edge.scene.source import SceneSource
 
 WRITE_COPIES = 3
 """Copies of a chunk's rows in memory while decoding and writing: codes, planes, rows of the PLY."""
+SPARE_SHARE = 8
+"""Of what decoding takes, one part in so many is left free beside rows of a PLY: docs/results/tuning.md#heap"""
 ANTIALIASED_NOTE = "an antialiased model: the file does not say so; viewers must be told, and here --antialiased"
 
 
@@ -106,7 +108,7 @@ def decompress(
         else:
             row = WRITE_COPIES * inria_dtype(scene.source.sh_degree).itemsize
             least, decoding = min(scene.source.count, 1024), decode_bytes(scene.source, backend)
-            rows = budget.rows("decoding", row, fixed=decoding, minimum=least, most=65536)
+            rows = budget.rows("decoding", row, fixed=decoding + decoding // SPARE_SHARE, minimum=least, most=65536)
             budget.take("writing rows", row * rows)  # what is left decodes further chunks ahead
             with ahead(scene.source, budget, backend):
                 notes = write_ply(output, scene.source, force=force, chunk_rows=rows)

@@ -23,7 +23,7 @@ from flexgs_edge.run.open_bench import BUILD_BYTES, RUNTIME_BYTES, counted_backe
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
 
-DECODE_BYTES = 900
+DECODE_BYTES = 800
 """Bound on the bytes per row while a chunk is decoded: codes, features, neighbours' weights, sums."""
 DEVICE_ROWS = 40_000
 """A device codes scenes with at least this many Gaussians. Below, starting the kernels takes longer than they save:
