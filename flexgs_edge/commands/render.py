@@ -72,8 +72,13 @@ def render_views(
         places = _places(Path(output), [found.cameras[i].name for i in chosen], force)
     seconds = []
     writing = LIBRARY_BYTES + PICTURE_BYTES * max(found.cameras[i].width * found.cameras[i].height for i in chosen)
-    foresee(run, search=lambda: writing + drawing_bytes(run), compares=False)
+
+    def needed() -> int:
+        return writing + drawing_bytes(run)
+
+    foresee(run, search=needed, compares=False)
     with open_bench(run) as bench:
+        foresee(run, opened=True, search=needed, compares=False)
         renderer = bench.renderer
         run.budget.take("writing pictures", writing)
         with clock.stage("load"):

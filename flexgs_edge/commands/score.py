@@ -67,11 +67,16 @@ def score_gaussians(
     views, clock = run.seen, run.clock
     if not views.train:
         raise InputError(f"{views.cameras_from}: every view is held out: give more views, or --holdout 0")
-    needed = SCORE_ROW_BYTES * run.source.count
-    foresee(run, search=lambda: needed + drawing_bytes(run), compares=False)
+    sums = SCORE_ROW_BYTES * run.source.count
+
+    def needed() -> int:
+        return sums + drawing_bytes(run)
+
+    foresee(run, search=needed, compares=False)
     with open_bench(run) as bench:
+        foresee(run, opened=True, search=needed, compares=False)
         renderer = bench.renderer
-        run.budget.take("scores", needed)
+        run.budget.take("scores", sums)
         with clock.stage("load"):
             device_scene = renderer.load(run.source)
         with device_scene, clock.stage("score"):

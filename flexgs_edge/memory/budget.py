@@ -17,7 +17,7 @@ from flexgs_edge.memory.process import available_memory, current_rss
 from flexgs_edge.units import format_mib
 
 LARGE = 2**20
-"""Bytes from which a stage may look whether the heaps of this process have holes."""
+"""A stage that takes so many bytes or more has the heaps of this process checked."""
 
 
 @dataclass
@@ -37,7 +37,7 @@ class MemoryBudget:
     reclaimers: list[Callable[[int], None]] = field(default_factory=list)
     """Functions to call with the missing bytes before a stage is refused; each lets a cache free memory."""
     evictors: list[Callable[[], None]] = field(default_factory=list)
-    """Functions that free whole scenes on the device, each of which is then loaded again when it is drawn next."""
+    """Functions that each free a whole scene on the device. The scene is loaded again when it is drawn next."""
     foreseen: Callable[[], int] | None = None
     """Reckons a limit that is expected to be enough for all stages. Only an error calls it, and names that limit."""
     heap: HeapWatch | None = field(default_factory=HeapWatch)

@@ -22,7 +22,7 @@ def return_freed_memory(settings: dict[int, int] = USUAL) -> None:
 
     By default, each freed mapped array raises the size from which glibc maps (up to 32 MiB). Then arrays of several
     threads leave holes in heaps, and the peak rises. `STRICT` costs time: the kernel clears each page that is mapped again.
-    Call this before any large allocation: docs/results/tuning.md#memory
+    It works best before any large allocation: docs/results/tuning.md#memory
     """
     with suppress(OSError, AttributeError):
         mallopt = ctypes.CDLL(None).mallopt

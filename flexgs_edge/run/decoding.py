@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from weakref import WeakKeyDictionary
 
-import numpy as np
-
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS
 from flexgs_edge.codec.v2.device.encode_kernels import device_bytes
 from flexgs_edge.codec.v2.grid_source import GridSource
@@ -17,6 +15,7 @@ from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.tested import processors_with_verdicts
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.heap import trim_heap
+from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.open_bench import BUILD_BYTES, RUNTIME_BYTES, counted_backend
@@ -116,11 +115,8 @@ def decoded_once(source: SceneSource, budget: MemoryBudget, spare: int, backend:
     if not isinstance(source, GridSource) or budget.free < size + decode_bytes(source, backend) + spare:
         return source
     budget.take("the decoded scene", size)
-    planes = {name: np.empty((source.width(name), source.count), np.float32) for name in FIELD}
     with ahead(source, budget, backend):
-        for rows in source.chunks(CHUNK_ROWS):
-            for name, values in source.read(rows, list(FIELD)).items():
-                planes[name][:, rows] = values
+        planes = read_all(source, IN_MEMORY)
     return MemorySource(planes, source.sh_degree, source.origin, source.name)
 
 

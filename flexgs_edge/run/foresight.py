@@ -31,7 +31,8 @@ def foresee(
     opened : bool
         The device is open, and its memory is taken from the budget.
     search : callable, optional
-        Bytes that the search needs beside the comparison of views. Default: those of drawing one view.
+        Bytes that the search, or what the command does in its place, needs beside the comparison of views. Default: those
+        of drawing one view.
     compares : bool
         Views are compared (default), not drawn alone.
     """
