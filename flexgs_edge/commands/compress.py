@@ -18,6 +18,7 @@ from flexgs_edge.methods.foreign import method as foreign
 from flexgs_edge.methods.paper import method as paper
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import CompressResult
+from flexgs_edge.run.decoding import read_often
 from flexgs_edge.run.doubts import doubts
 from flexgs_edge.run.foresight import foresee
 from flexgs_edge.run.inputs import ScenePlace, scene_info
@@ -81,13 +82,14 @@ def compress(
     with ExitStack() as stack:
         bench = None if run.views is None else stack.enter_context(open_bench(run, options.cluster))
         _foresee(run, opened=True)
+        read = run if bench is None or options.method != "paper" else _read_often(run, bench)
         if run.output.format is not None:
-            made = foreign.compress(run, bench, scores)
+            made = foreign.compress(read, bench, scores)
         elif options.method == "paper":
-            made = paper.compress(run, bench, scores)
+            made = paper.compress(read, bench, scores)
         else:
             assert bench is not None  # the plan has refused such runs without views
-            made = best.compress(run, bench)
+            made = best.compress(read, bench)
         result = _result(run, bench, made)
     if run.reporter is not None:
         if run.output.path is not None:
@@ -104,6 +106,13 @@ def _foresee(run: Run[CompressOptions], opened: bool = False) -> None:
     else:
         needed = paper.expected_bytes if run.options.method == "paper" else expected_bytes
         foresee(run, opened, partial(needed, run))
+
+
+def _read_often(run: Run[CompressOptions], bench: Bench) -> Run[CompressOptions]:
+    """The same run for the paper's search, which reads the scene for every choice that it measures."""
+    with run.clock.stage("open"):
+        spare = paper.searching_bytes(run)
+        return run.of_source(read_often(run.source, run.budget, spare, bench.renderer.backend))
 
 
 def _show_live(run: Run[CompressOptions], path: Path) -> None:

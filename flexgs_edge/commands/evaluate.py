@@ -12,7 +12,8 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.lpips import Lpips
 from flexgs_edge.report.results import EvaluateResult
-from flexgs_edge.run.foresight import foresee
+from flexgs_edge.run.decoding import decode_bytes, read_often
+from flexgs_edge.run.foresight import drawing_bytes, foresee
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.open_bench import bench_info, open_bench
@@ -69,21 +70,30 @@ def evaluate(
     run = open_run(against, options, progress, reporter, judged_path=input)
     views, scene, clock, budget = run.seen, run.judged or run.scene, run.clock, run.budget
     indices = views.held_out or views.train
-    foresee(run)
+
+    def needed() -> int:
+        return drawing_bytes(run) + decode_bytes(run.source, None) + decode_bytes(scene.source, None)
+
+    foresee(run, search=needed)
     with ExitStack() as stack:
         bench = stack.enter_context(open_bench(run))
-        foresee(run, opened=True)
+        foresee(run, opened=True, search=needed)
         renderer = bench.renderer
         distance: Lpips | None = None
         if lpips:  # first, because packages or weights may be missing
             with clock.stage("lpips"):
                 distance = Lpips(budget, max(camera.width * camera.height for camera in views.of(indices)))
             stack.callback(distance.close)
-        judge = Judge(bench, run.source, views, indices, base_psnr=base_psnr)
+        with clock.stage("load"):
+            spare = drawing_bytes(run) + decode_bytes(scene.source, None)
+            original_source = read_often(run.source, budget, spare, renderer.backend)
+        judge = Judge(bench, original_source, views, indices, base_psnr=base_psnr)
         stack.callback(judge.close)
-        with clock.stage("references"), renderer.load(run.source) as original:
+        with clock.stage("references"), renderer.load(original_source) as original:
             judge.prepare(original, progress)
-        with clock.stage("measure"), renderer.load(scene.drawn) as compressed:
+        with clock.stage("load"):
+            drawn = replace(scene, source=read_often(scene.source, budget, drawing_bytes(run), renderer.backend)).drawn
+        with clock.stage("measure"), renderer.load(drawn) as compressed:
             quality = judge.compare(compressed, with_ssim=True, progress=progress, lpips=distance, flip=True)
             if reporter is not None:
                 reporter.look(judge, compressed, quality, clock, progress)

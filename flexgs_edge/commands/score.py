@@ -15,6 +15,7 @@ from flexgs_edge.methods.paper.score_files import save_scores
 from flexgs_edge.methods.paper.scores import SCORE_ROW_BYTES, SCORES, score_scene
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import ScoreResult
+from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes, foresee
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_bench import bench_info, open_bench
@@ -70,7 +71,7 @@ def score_gaussians(
     sums = SCORE_ROW_BYTES * run.source.count
 
     def needed() -> int:
-        return sums + drawing_bytes(run)
+        return sums + drawing_bytes(run) + decode_bytes(run.source, None)
 
     foresee(run, search=needed, compares=False)
     with open_bench(run) as bench:
@@ -78,9 +79,10 @@ def score_gaussians(
         renderer = bench.renderer
         run.budget.take("scores", sums)
         with clock.stage("load"):
-            device_scene = renderer.load(run.source)
+            source = read_often(run.source, run.budget, drawing_bytes(run), renderer.backend)
+            device_scene = renderer.load(source)
         with device_scene, clock.stage("score"):
-            scores = score_scene(renderer, device_scene, run.source, views.of(views.train), score, progress)
+            scores = score_scene(renderer, device_scene, source, views.of(views.train), score, progress)
         save_scores(output, scores, force)
         return ScoreResult(
             scene=scene_info(run.scene),

@@ -22,8 +22,6 @@ from flexgs_edge.run.open_bench import BUILD_BYTES, RUNTIME_BYTES, counted_backe
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
 
-DECODE_BYTES = 800
-"""Bound on the bytes per row while a chunk is decoded: codes, features, neighbours' weights, sums."""
 DEVICE_ROWS = 40_000
 """A device codes scenes with at least this many Gaussians. Below, starting the kernels takes longer than they save:
 docs/results/tuning.md#device_rows"""
@@ -86,7 +84,7 @@ def decode_bytes(source: SceneSource, backend: Backend | None) -> int:
     """Bytes that decoding takes at least, one chunk at a time; 0 where nothing is to be decoded."""
     if not isinstance(source, GridSource):
         return 0
-    return min(source.count, CHUNK_ROWS) * DECODE_BYTES if backend is None else source.device_bytes(1)
+    return source.table_bytes + source.chunk_bytes if backend is None else source.device_bytes(1)
 
 
 @contextmanager
@@ -102,8 +100,7 @@ def ahead(source: SceneSource, budget: MemoryBudget, backend: Backend | None = N
             yield
         return
     threads = source.threads
-    chunk = min(source.count, CHUNK_ROWS) * DECODE_BYTES
-    while threads > 1 and budget.free < (threads + 1) * chunk:
+    while threads > 1 and budget.free < source.table_bytes + (threads + 1) * source.chunk_bytes:
         threads -= 1
     with source.whole_in_order(threads):
         yield
@@ -117,7 +114,20 @@ def decoded_once(source: SceneSource, budget: MemoryBudget, spare: int, backend:
     budget.take("the decoded scene", size)
     with ahead(source, budget, backend):
         planes = read_all(source, IN_MEMORY)
-    return MemorySource(planes, source.sh_degree, source.origin, source.name)
+    return MemorySource(planes, source.sh_degree, source.origin, source.name, source.sh_count)
+
+
+def read_often(source: SceneSource, budget: MemoryBudget, spare: int, backend: Backend) -> SceneSource:
+    """Prepare a scene for being read several times while other work takes `spare` bytes.
+
+    A file that is not decoded to memory is decoded at each reading, by NumPy. What that takes is taken from the budget.
+    """
+    if not isinstance(source, GridSource):
+        return source
+    once = decoded_once(source, budget, spare, coding_device(backend, budget, source.count, source.sh_degree))
+    if once is source:
+        budget.take("decoding the file", decode_bytes(source, None))
+    return once
 
 
 def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
@@ -132,7 +142,9 @@ def decoded(source: SceneSource, renderer: Renderer) -> SceneSource:
         return source
     renderer.release()
     trim_heap()
-    budget.require("decoding the file", decode_bytes(source, None))
+    if isinstance(source, GridSource):
+        # Pages of libraries, which the budget counts and a limit on anonymous memory does not, leave room for `table_bytes`.
+        budget.require("decoding the file", source.chunk_bytes)
     with ahead(source, budget):
         planes = read_all(source, storage)
     trim_heap()

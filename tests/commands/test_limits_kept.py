@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from flexgs_edge.codec.v2.container import write_grid
+from grid_scenes import sample_grid
+
 SAMPLE = Path(__file__).parents[2] / "samples" / "still_life"
 TOLERANCE = 1.02
 """Some parts of a run have bounds and are not counted to the byte: kernels that are built anew, stacks of threads."""
@@ -31,8 +34,34 @@ def run(words: list[str], limit: str) -> subprocess.CompletedProcess[str]:
     ids=["paper", "score", "render"],
 )
 def test_the_named_limit_is_kept(words: list[str], output: str, tmp_path: Path) -> None:
-    found = tmp_path / "found.json"
-    command = [words[0], str(SAMPLE), *words[1:], "-o", str(tmp_path / output), "--json", str(found)]
+    check_limit([words[0], str(SAMPLE), *words[1:], "-o", str(tmp_path / output)], tmp_path / "found.json")
+
+
+@pytest.fixture(scope="module")
+def fine_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample with wide codes and with as many rows as there are, whose decoding takes much."""
+    place = tmp_path_factory.mktemp("limits") / "fine.fgs"
+    write_grid(place, sample_grid(SAMPLE, 1), {})
+    return place
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["compress", "{file}", "--method", "paper", "-o", "{folder}/scene.fgs"],
+        ["score", "{file}", "-o", "{folder}/scores.npy"],
+        ["render", "{file}", "--views", "0,1,2", "-o", "{folder}/views"],
+        ["evaluate", "{file}", "--against", str(SAMPLE)],
+    ],
+    ids=lambda words: words[0],
+)
+def test_the_named_limit_is_kept_while_a_file_is_decoded(words: list[str], fine_file: Path, tmp_path: Path) -> None:
+    command = [word.format(file=fine_file, folder=tmp_path) for word in words]
+    check_limit([*command, "--cameras", str(SAMPLE / "cameras.json")], tmp_path / "found.json")
+
+
+def check_limit(command: list[str], found: Path) -> None:
+    command = [*command, "--json", str(found)]
     refused = run(command, "100MiB")
     assert refused.returncode == 5, refused.stderr
     limit = re.search(r"use --memory-limit (\d+MiB) or more, which counts later stages too", refused.stderr)

@@ -12,10 +12,11 @@ from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands import decompress as command
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.errors import BudgetError
+from flexgs_edge.kernels.open_backend import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.process import current_rss
 from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.decoding import decode_bytes, decoded_once, decoder
+from flexgs_edge.run.decoding import decode_bytes, decoded_once, decoder, read_often
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from grid_scenes import make_grid
@@ -38,6 +39,17 @@ def test_a_scene_is_decoded_to_memory_where_it_fits(file: Path) -> None:
     for name, values in source.read(rows, list(FIELD)).items():
         np.testing.assert_array_equal(once.read(rows, [name])[name], values)
     assert decoded_once(source, MemoryBudget(1 << 30), 1 << 30, None) is source
+
+
+def test_a_scene_that_does_not_fit_decoded_has_room_for_its_decoding(file: Path) -> None:
+    source, budget = GridSource(file), MemoryBudget(1 << 30)
+    backend = open_backend("numpy", budget)
+    once = read_often(source, MemoryBudget(1 << 30), 0, backend)
+    assert isinstance(once, MemorySource)
+    assert read_often(source, budget, 1 << 30, backend) is source
+    assert budget.used == decode_bytes(source, None) > source.table_bytes > 0
+    assert read_often(once, budget, 1 << 30, backend) is once
+    assert budget.used == decode_bytes(source, None)
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".glb", ".compressed.ply", ".splat"])

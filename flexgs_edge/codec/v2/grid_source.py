@@ -23,6 +23,8 @@ from flexgs_edge.grid.values import from_grid
 from flexgs_edge.scene.check import SH_LARGEST
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 
+DECODE_BYTES = 800
+"""Bound on the bytes per row while NumPy decodes a chunk: codes, features, neighbours' weights, sums."""
 _ROTATION_STEP_MOST = 2.0**38
 """Bound up to which three squares of a rotation code (24 bits) times its step stay finite in float32."""
 
@@ -158,6 +160,16 @@ class GridSource(SceneSource):
         each = ChunkKernel.bytes_of(self._most_rows, self.sh_degree) + 3 * table + longest + (1 << 14)
         model = sum(tables.slots.nbytes + tables.entries.nbytes for tables in self._model.tables)
         return model + table + chunks * each + (1 << 16)
+
+    @property
+    def chunk_bytes(self) -> int:
+        """Bytes for decoding a chunk by NumPy, beside `table_bytes`."""
+        return self._most_rows * DECODE_BYTES
+
+    @property
+    def table_bytes(self) -> int:
+        """Bytes of what NumPy looks symbols up in. It is made once, whatever the number of chunks."""
+        return sum(tables.decoding_bytes for tables in self._model.tables)
 
     @property
     def _most_rows(self) -> int:

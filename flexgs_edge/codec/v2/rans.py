@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -61,11 +62,19 @@ class Tables:
         self._moves: np.ndarray | None = None
 
     @property
+    def decoding_bytes(self) -> int:
+        """Bytes of `slots` and `moves`, which a decoder makes."""
+        return len(self.freqs) * TOTAL * (self._kind.itemsize + 4)
+
+    @property
+    def _kind(self) -> np.dtype[Any]:
+        return np.dtype(np.uint8 if self.size <= 256 else np.uint16)
+
+    @property
     def slots(self) -> np.ndarray:
         """[t * 2^14], the symbol of every slot of every table."""
         if self._slots is None:
-            kind = np.uint8 if self.size <= 256 else np.uint16
-            symbols = np.tile(np.arange(self.size, dtype=kind), len(self.freqs))
+            symbols = np.tile(np.arange(self.size, dtype=self._kind), len(self.freqs))
             self._slots = np.repeat(symbols, self.freqs.reshape(-1))
         return self._slots
 

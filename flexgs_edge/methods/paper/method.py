@@ -26,6 +26,7 @@ from flexgs_edge.packed.bitspec import PAPER
 from flexgs_edge.packed.quantize import QuantizedScene, quantized_bytes
 from flexgs_edge.packed.sensitivity import Sensitivity
 from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.run.decoding import decode_bytes
 from flexgs_edge.run.fingerprint import fingerprint
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.judges import Judges
@@ -109,7 +110,12 @@ def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray 
 
 
 def expected_bytes(run: Run[CompressOptions]) -> int:
-    """Bytes that the search is expected to need: ranks, a view, and codes of all rows, up to twice as large on the device."""
+    """Bytes that the search is expected to need, and reading the scene beside it."""
+    return searching_bytes(run) + decode_bytes(run.source, None)
+
+
+def searching_bytes(run: Run[CompressOptions]) -> int:
+    """Bytes of ranks, of a view, and of the codes of all rows, up to twice as large on the device."""
     source, (bits, groups) = run.source, run.options.bit_spec()
     return (
         RANK_ROW_BYTES * source.count

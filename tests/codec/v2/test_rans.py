@@ -27,6 +27,12 @@ def some_symbols(tables: Tables, count: int, seed: int = 1) -> tuple[np.ndarray,
     return rows, tables.slots[rows * TOTAL + rng.integers(0, TOTAL, count)]
 
 
+@pytest.mark.parametrize("size", [9, 256, 257])
+def test_bytes_of_decoding_are_those_of_both_lists(size: int) -> None:
+    tables = some_tables(size=size)
+    assert tables.decoding_bytes == tables.slots.nbytes + tables.moves.nbytes
+
+
 @pytest.mark.parametrize("lanes", [1, 2, 64, 512])
 @pytest.mark.parametrize("counts", [(), (0,), (1,), (5, 0, 513), (64, 63, 65), (2000,)])
 def test_round_trip_in_batches(lanes: int, counts: tuple[int, ...]) -> None:
