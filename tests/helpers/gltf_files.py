@@ -1,4 +1,4 @@
-"""Builds small glTF files from arrays: one buffer, one accessor for each array, one node for each mesh."""
+"""Builds small glTF files from arrays, with one buffer, one accessor for each array and one node for each mesh; reads them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from flexgs_edge.io.gltf import read_gltf
+from flexgs_edge.io.reading import AS_WRITTEN
+from flexgs_edge.scene.fields import FIELD
+from flexgs_edge.scene.source import Planes, SceneSource
 
 EXTENSION = "KHR_gaussian_splatting"
 TYPES = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
@@ -133,3 +138,13 @@ def glb_record(path: Path) -> dict[str, Any]:
     data = path.read_bytes()
     record: dict[str, Any] = json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
     return record
+
+
+def own(path: Path) -> SceneSource:
+    """A file's scene in its own frame."""
+    return read_gltf(path, str(path), AS_WRITTEN)
+
+
+def planes(source: SceneSource) -> Planes:
+    """All values of a scene."""
+    return source.read(slice(0, source.count), list(FIELD))
