@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -17,6 +18,8 @@ from flexgs_edge.run.open_scene import open_scene
 from synthetic import look_from, make_camera, random_scene
 
 COUNT, VIEWS, WIDTH, HEIGHT = 400, 9, 40, 30
+FAST: dict[str, Any] = {"method": "paper", "effort": "fast", "holdout": 4}
+"""Options of a short search by the paper's method."""
 
 
 def write_cameras(path: Path, views: int = VIEWS) -> Path:
