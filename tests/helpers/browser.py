@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any
 
 NAMES = ("chromium", "google-chrome")
-FLAGS = (
+FLAGS: tuple[str, ...] = (
     "--headless=new",
     "--no-sandbox",
     "--disable-gpu",

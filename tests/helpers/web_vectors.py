@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -159,7 +158,7 @@ def _file_name(name: str) -> str:
 def expected(path: Path) -> dict[str, Any]:
     """What a decoder must read: checksums of the codes (i32) and values (f32) of each chunk, in the order of docs/format.md."""
     source = open_fgs(path)
-    record = {"version": source.container.version, "count": source.count, "sh_degree": source.sh_degree}
+    record: dict[str, Any] = {"version": source.container.version, "count": source.count, "sh_degree": source.sh_degree}
     record["origin"] = source.origin.tolist()
     if isinstance(source, GridSource):
         header = source.container.header
@@ -206,4 +205,4 @@ def main(folder: Path = FOLDER) -> None:
 __all__ = ["FOLDER", "KINDS", "PACKED", "expected", "random_grid", "write_all", "write_expected"]
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
