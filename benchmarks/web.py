@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -44,6 +45,8 @@ AGAIN = 3
 LINE: dict[str, Any] = {"offline": False, "latency": 20, "downloadThroughput": 1.25e6, "uploadThroughput": 1.25e6}
 """10 Mbit/s; the latency is in milliseconds."""
 POSES = 30
+PAUSE = 3.0
+"""Seconds between two pages."""
 NODE = """
 const { readFileSync } = await import('node:fs');
 const { open } = await import(process.argv[1]);
@@ -55,20 +58,24 @@ for (let k = 0; k <= Number(process.argv[3]); k++) {
   const used = process.cpuUsage(before);
   seconds.push((used.user + used.system) / 1e6);
 }
-const [, peak] = readFileSync('/proc/self/status', 'utf8').match(/VmHWM: *(\\d+) kB/);
+const [, peak] = readFileSync('/proc/self/status', 'utf8').match(/VmHWM:\\s*(\\d+) kB/);
 console.log(JSON.stringify({ seconds, peak: peak * 1024 }));
 """
 PAGE = """
-(async () => {
+(async (times) => {
   const { openInWorker } = await import('/src/worker-client.js');
   const bytes = new Uint8Array(await (await fetch('/scene.fgs')).arrayBuffer());
-  const start = performance.now();
-  const file = await openInWorker(bytes.slice());
-  for await (const chunk of file.chunks({ values: true }));
-  const first = performance.now() - start;
-  file.close();
-  return first / 1000;
-})()
+  const worker = new Worker('/src/worker.js', { type: 'module' });
+  const seconds = [];
+  for (let k = 0; k < times; k++) {
+    const start = performance.now();
+    const file = await openInWorker(bytes.slice(), { worker });
+    for await (const chunk of file.chunks({ values: true }));
+    seconds.push((performance.now() - start) / 1000);
+  }
+  worker.terminate();
+  return seconds;
+})(%d)
 """
 
 
@@ -122,15 +129,16 @@ def page_of(file: Path) -> Iterator[str]:
 
 
 def bench_worker(timer: Timer, name: str, file: Path, tab: Browser) -> None:
-    """Time the decoder in a worker of a page: with the page just loaded, and again."""
+    """Time the decoder in a worker that has just been made, and again."""
     count, firsts, later = GridSource(file).count, [], []
     with page_of(file) as address:
         for _ in range(timer.repeats):
             tab.send("Page.navigate", url=address)
             tab.wait("Page.loadEventFired")
-            firsts.append(count / float(tab.run(PAGE)) / 1e6)
-            later += [count / float(tab.run(PAGE)) / 1e6 for _ in range(AGAIN)]
-    note = f"{count} Gaussians, a worker anew each time"
+            first, *more = [count / seconds / 1e6 for seconds in tab.run(PAGE % (1 + AGAIN))]
+            firsts.append(first)
+            later += more
+    note = f"{count} Gaussians in one worker, from bytes in memory to values on the page"
     timer.add(f"{name}, Chromium, first time", firsts, "M/s", note)
     timer.add(f"{name}, Chromium, later", later, "M/s", note)
 
@@ -143,6 +151,10 @@ def bench_line(timer: Timer, name: str, file: Path, cameras: Path, tab: Browser)
         tab.send("Network.setCacheDisabled", cacheDisabled=True)
         tab.send("Network.emulateNetworkConditions", **LINE)
         for _ in range(timer.repeats):
+            # Frames of the page before would still be drawn.
+            tab.send("Page.navigate", url="about:blank")
+            tab.wait("Page.loadEventFired")
+            time.sleep(PAUSE)
             tab.send("Page.navigate", url=address)
             tab.wait("Page.loadEventFired")
             until(tab, "globalThis.viewer && viewer.stats.wholeMs > 0 && viewer.stats.firstMs > 0")
