@@ -29,7 +29,18 @@ from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.inputs import read_scene
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
-from tiny_project import COUNT, FAST, HEIGHT, VIEWS, WIDTH
+from tiny_project import COUNT, FAST, HEIGHT, VIEWS, WIDTH, compress_project, make_project
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_project(tmp_path_factory.mktemp("tiny") / "scene")
+
+
+@pytest.fixture(scope="module")
+def done(project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CompressResult]:
+    folder = tmp_path_factory.mktemp("done")
+    return folder, compress_project(project, folder)
 
 
 @pytest.mark.parametrize("method", ["paper", "best"])

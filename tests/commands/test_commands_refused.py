@@ -21,7 +21,18 @@ from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from stopped import Stopped
-from tiny_project import COUNT, FAST, write_cameras
+from tiny_project import COUNT, FAST, compress_project, make_project, write_cameras
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_project(tmp_path_factory.mktemp("tiny") / "scene")
+
+
+@pytest.fixture(scope="module")
+def done(project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CompressResult]:
+    folder = tmp_path_factory.mktemp("done")
+    return folder, compress_project(project, folder)
 
 
 def test_no_cameras_at_all(tmp_path: Path, done: tuple[Path, CompressResult], project: Path) -> None:

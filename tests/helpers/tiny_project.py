@@ -10,10 +10,12 @@ from PIL import Image
 
 from flexgs_edge.cameras.inria import inria_json
 from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.commands.compress import compress
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.kernels.open_backend import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.open_scene import open_scene
 from synthetic import look_from, make_camera, random_scene
 
@@ -55,3 +57,9 @@ def make_project(folder: Path, photos: bool = True, degree: int = 1) -> Path:
     if photos:
         write_photos(folder / "images", scene, cameras)
     return folder
+
+
+def compress_project(project: Path, folder: Path) -> CompressResult:
+    """The scene of a project, compressed against its photos to `a.fgs` in a folder, with its scores in `s.npy`."""
+    scores = str(folder / "s.npy")
+    return compress(project / "point_cloud.ply", folder / "a.fgs", max_drop=2.0, save_scores=scores, **FAST)

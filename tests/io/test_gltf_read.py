@@ -19,6 +19,11 @@ from flexgs_edge.scene.source import Planes, Rows
 from gltf_files import EXTENSION, GltfBuilder, own, planes, splat_arrays
 
 
+@pytest.fixture
+def builder() -> GltfBuilder:
+    return GltfBuilder()
+
+
 def expected(arrays: dict[str, np.ndarray], degree: int = 0) -> Planes:
     """What the attributes of `splat_arrays` mean."""
     wide = {name: values.astype(np.float64).T for name, values in arrays.items()}

@@ -13,6 +13,11 @@ from flexgs_edge.scene.check import check_scene
 from gltf_files import EXTENSION, GltfBuilder, own, splat_arrays
 
 
+@pytest.fixture
+def builder() -> GltfBuilder:
+    return GltfBuilder()
+
+
 def test_what_holds_no_gaussians(builder: GltfBuilder, tmp_path: Path) -> None:
     path = tmp_path / "a.glb"
     positions = {"attributes": {"POSITION": builder.accessor(np.zeros((3, 3), np.float32))}}

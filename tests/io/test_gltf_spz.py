@@ -15,6 +15,11 @@ from flexgs_edge.scene.source import Rows
 from gltf_files import EXTENSION, GltfBuilder, own, planes, splat_arrays
 
 
+@pytest.fixture
+def builder() -> GltfBuilder:
+    return GltfBuilder()
+
+
 class Spz(DecodedSource):
     """Stands for the reader of `.spz`: three rows that tell their axes apart."""
 
