@@ -45,6 +45,7 @@ AGAIN = 3
 LINE: dict[str, Any] = {"offline": False, "latency": 20, "downloadThroughput": 1.25e6, "uploadThroughput": 1.25e6}
 """10 Mbit/s; the latency is in milliseconds."""
 POSES = 30
+"""Poses whose frames are timed."""
 PAUSE = 3.0
 """Seconds between two pages."""
 NODE = """

@@ -82,14 +82,14 @@ def compress(
     with ExitStack() as stack:
         bench = None if run.views is None else stack.enter_context(open_bench(run, options.cluster))
         _foresee(run, opened=True)
-        read = run if bench is None or options.method != "paper" else _read_often(run, bench)
+        ready = run if bench is None or options.method != "paper" else _read_often(run, bench)
         if run.output.format is not None:
-            made = foreign.compress(read, bench, scores)
+            made = foreign.compress(ready, bench, scores)
         elif options.method == "paper":
-            made = paper.compress(read, bench, scores)
+            made = paper.compress(ready, bench, scores)
         else:
             assert bench is not None  # the plan has refused such runs without views
-            made = best.compress(read, bench)
+            made = best.compress(ready, bench)
         result = _result(run, bench, made)
     if run.reporter is not None:
         if run.output.path is not None:
