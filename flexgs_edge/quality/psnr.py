@@ -7,7 +7,7 @@ Images are clamped to [0, 1] and compared as floats, over all pixels and channel
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -18,12 +18,18 @@ from flexgs_edge.errors import InputError
 ROWS, BANDS = 128, 2
 """Image rows of one step of the squared error, and steps that run in parallel. They bound the f64 copies to a few MB
 for pictures of any height."""
+_BANDS = ThreadPoolExecutor(BANDS, "bands")
 MSE_FLOOR = 1e-12
 """Smallest MSE in a difference of two PSNRs; smaller ones (120 dB) are beyond the precision of float32 renders."""
 
 
 def mse(image: np.ndarray, reference: np.ndarray) -> float:
     """Mean squared error of two [H, W, 3] images clamped to [0, 1], summed in float64."""
+    return mse_later(image, reference)()
+
+
+def mse_later(image: np.ndarray, reference: np.ndarray) -> Callable[[], float]:
+    """As `mse`, in threads while the caller does something else. The function that it returns waits for the figure."""
     if image.shape != reference.shape:
         raise InputError(f"images of {_shape(reference)} and {_shape(image)} cannot be compared: sizes must be equal")
 
@@ -33,8 +39,8 @@ def mse(image: np.ndarray, reference: np.ndarray) -> float:
         return float(np.square(a, out=a).sum())
 
     # NumPy releases the interpreter's lock. Bands are added in their order, so the sum does not depend on the threads.
-    with ThreadPoolExecutor(BANDS) as pool:
-        return sum(pool.map(band, range(0, image.shape[0], ROWS))) / max(image.size, 1)
+    errors = _BANDS.map(band, range(0, image.shape[0], ROWS))
+    return lambda: sum(errors) / max(image.size, 1)
 
 
 def psnr(error: float) -> float | None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
-from flexgs_edge.quality.psnr import drop, mean_psnr, modelled_drop, mse, psnr
+from flexgs_edge.quality.psnr import drop, mean_psnr, modelled_drop, mse, mse_later, psnr
 from flexgs_edge.quality.ssim import modelled_ssim_drop
 
 Distance = Callable[[np.ndarray, np.ndarray], float | None]
@@ -339,11 +339,13 @@ def compare_view(
     """
     if photo is not None and original_error is None:
         original_error = mse(original, photo)
+    error = mse_later(image, original)
+    photo_error = None if photo is None else mse_later(image, photo)
     similar = _three(ssims, image, original, photo, original_ssim)
     view = ViewQuality(
         name=name,
-        error=mse(image, original),
-        photo_error=None if photo is None else mse(image, photo),
+        error=error(),
+        photo_error=photo_error() if photo_error else None,
         original_error=None if photo is None else original_error,
         ssim_original=similar[0],
         ssim_photo=similar[1],

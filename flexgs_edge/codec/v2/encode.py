@@ -146,7 +146,7 @@ def encode_grid(
     storage : Storage
         Holds the symbols: two or three bytes a code beside the grid.
     threads : int, optional
-        Chunks that NumPy codes at once. Default: as many as suit this machine.
+        Groups that are fitted at once, and chunks that NumPy codes at once. Default: as many as suit this machine.
     """
     cells, low, depth = cells_of(grid, storage)
     layers = np.bincount(grid.layer, minlength=1).tolist()
@@ -157,7 +157,9 @@ def encode_grid(
     for chunk in sample:
         _walk(grid, cells, chunk, depth, fit)
     fit.put_away()
-    groups = [fit_group(kind, samples) for kind, samples in zip(kinds, fit.samples, strict=True)]
+    # Each takes memory, so that there is one at a time where arrays lie in files.
+    at_once = threads or (1 if storage.spills else thread_count(len(kinds)))
+    groups = list(in_order(lambda pair: fit_group(*pair), zip(kinds, fit.samples, strict=True), at_once))
     del fit
     if storage.spills:
         trim_heap()  # the threads below have heaps of their own, beside what the fit has left

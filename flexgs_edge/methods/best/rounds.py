@@ -293,7 +293,8 @@ class PruneRounds:
             found = cost_parts(scene.sh_degree, scene.count, self.storage)
             for rows, (costs, normal) in both.parts():
                 put_costs(found, rows, costs)
-                step_colours(planes, degrees, rows, normal.values())
+                for some, values in normal.parts(rows.start):
+                    step_colours(planes, degrees, some, values)
             return found
         finally:
             both.release()

@@ -5,6 +5,7 @@ Each round back-projects the residual images to the Gaussians' colours (SIRT). G
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -83,7 +84,8 @@ def refit_colours(
                 for camera, view in zip(renderer.in_turn(scene, [cameras[view] for view in part]), part, strict=True):
                     normal.add_view(renderer.residual_sums(scene, camera, original.references[view]), camera)
                 for rows, (sums,) in normal.parts():
-                    step_colours(planes, degrees, rows, sums.values(), bands)
+                    for some, values in sums.parts(rows.start):
+                        step_colours(planes, degrees, some, values, bands)
             finally:
                 normal.release()
             scene.refresh(*fields)
@@ -119,12 +121,13 @@ class _ChunkNormal:
             sums.shape[1], part.blocks, renderer.camera_array, chunk.means, sums, self._array,
         )  # fmt: skip
 
-    def values(self) -> np.ndarray:
-        """[K + 1, 4, n] f32 sums for each basis function: residuals of three channels, and weight."""
-        values = np.empty((*self._array.shape[1:3], self._count), np.float32)
+    def parts(self, base: int) -> Iterator[tuple[slice, np.ndarray]]:
+        """Yield rows of the scene, where the chunk begins at row `base`, and their sums, valid until the next step.
+
+        The sums are [K + 1, 4, rows] f32, for each basis function: residuals of three channels, and weight.
+        """
         for rows, planes in planes_of(self._renderer.backend, self._array, self._count):
-            values[..., rows] = planes.reshape(*values.shape[:2], -1)
-        return values
+            yield slice(base + rows.start, base + rows.stop), planes.reshape(*self._array.shape[1:3], -1)
 
     def release(self) -> None:
         if self._array is not None:
@@ -161,7 +164,8 @@ def step_colours(
     rest = planes["sh_rest"].reshape(3, count, -1)
     stepped = np.empty((3, count, rows.stop - rows.start), np.float32)
     copy_rows(rest, rows, stepped)
-    for k in range(len(normal) - 1):
-        moved = np.where(degrees[rows] >= degree_of[k], np.float32(RELAX_SH) / weight[k + 1], np.float32(0))
-        stepped[:, k] += normal[k + 1, :3] * moved
+    share = np.where(
+        degrees[rows] >= degree_of[: len(normal) - 1, None], np.float32(RELAX_SH) / weight[1:], np.float32(0)
+    )
+    stepped[:, : len(share)] += normal[1:, :3].swapaxes(0, 1) * share
     put_rows(rest, rows, stepped)
