@@ -23,8 +23,8 @@ from flexgs_edge.report.file_results import DecompressResult
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.decoding import ahead, decode_bytes, decoded_once, decoder
 from flexgs_edge.run.inputs import CheckedScene, ScenePlace, load_scene, scene_info
-from flexgs_edge.run.open_bench import run_info
 from flexgs_edge.run.open_scene import is_fgs, scene_file
+from flexgs_edge.run.spent import run_info
 from flexgs_edge.scene.source import SceneSource
 
 WRITE_COPIES = 3

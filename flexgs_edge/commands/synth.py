@@ -21,7 +21,7 @@ from flexgs_edge.report.file_results import SynthResult
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.companions import companions_of
 from flexgs_edge.run.inputs import load_scene
-from flexgs_edge.run.open_bench import run_info
+from flexgs_edge.run.spent import run_info
 from flexgs_edge.scene.parts import MOST_PARTS, PartsSource
 from flexgs_edge.scene.source import SceneSource
 

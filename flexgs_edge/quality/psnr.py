@@ -29,7 +29,10 @@ def mse(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def mse_later(image: np.ndarray, reference: np.ndarray) -> Callable[[], float]:
-    """As `mse`, in threads while the caller does something else. The function that it returns waits for the figure."""
+    """As `mse`, in threads while the caller does something else. The function that it returns waits for the figure.
+
+    Neither image may change before.
+    """
     if image.shape != reference.shape:
         raise InputError(f"images of {_shape(reference)} and {_shape(image)} cannot be compared: sizes must be equal")
 

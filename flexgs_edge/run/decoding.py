@@ -18,7 +18,7 @@ from flexgs_edge.memory.heap import trim_heap
 from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.open_bench import BUILD_BYTES, RUNTIME_BYTES, counted_backend
+from flexgs_edge.run.counted_backend import BUILD_BYTES, RUNTIME_BYTES, counted_backend
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
 

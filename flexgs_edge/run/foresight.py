@@ -8,8 +8,8 @@ from typing import Any
 from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.cameras.order import in_picture
 from flexgs_edge.render.fit import DEFAULT, GUESS, ViewSize, compact_bytes, padded, streamed_bytes, view_bytes
+from flexgs_edge.run.counted_backend import BUILD_BYTES, RUNTIME_BYTES
 from flexgs_edge.run.judge import work_bytes
-from flexgs_edge.run.open_bench import BUILD_BYTES, RUNTIME_BYTES
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.sample import some_positions
 

@@ -1,4 +1,4 @@
-"""Code chunks in parallel threads: each chunk is a stream of its own, and NumPy releases the interpreter's lock."""
+"""Code chunks and fit groups in parallel threads: none needs another, and NumPy releases the interpreter's lock."""
 
 from __future__ import annotations
 
