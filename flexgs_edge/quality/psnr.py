@@ -29,9 +29,9 @@ def mse(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def mse_later(image: np.ndarray, reference: np.ndarray) -> Callable[[], float]:
-    """As `mse`, in threads while the caller does something else. The function that it returns waits for the figure.
+    """As `mse`, in threads beside what the caller does next. The returned function waits for the result.
 
-    Neither image may change before.
+    Until then, neither image may change.
     """
     if image.shape != reference.shape:
         raise InputError(f"images of {_shape(reference)} and {_shape(image)} cannot be compared: sizes must be equal")
@@ -42,8 +42,8 @@ def mse_later(image: np.ndarray, reference: np.ndarray) -> Callable[[], float]:
         return float(np.square(a, out=a).sum())
 
     # NumPy releases the interpreter's lock. Bands are added in their order, so the sum does not depend on the threads.
-    errors = _BANDS.map(band, range(0, image.shape[0], ROWS))
-    return lambda: sum(errors) / max(image.size, 1)
+    errors = [_BANDS.submit(band, top) for top in range(0, image.shape[0], ROWS)]
+    return lambda: sum(error.result() for error in errors) / max(image.size, 1)
 
 
 def psnr(error: float) -> float | None:

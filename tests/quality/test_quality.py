@@ -30,7 +30,8 @@ def test_mse_is_that_of_clamped_images_in_float64(height: int) -> None:
 def test_mse_in_threads_is_that_of_its_images_whatever_is_asked_for_between() -> None:
     pairs = [images(seed) for seed in range(8)]
     later = [psnr.mse_later(a, b) for a, b in pairs]
-    assert [found() for found in reversed(later)] == [psnr.mse(a, b) for a, b in reversed(pairs)]
+    for _ in range(2):
+        assert [found() for found in reversed(later)] == [psnr.mse(a, b) for a, b in reversed(pairs)]
     with pytest.raises(InputError, match="cannot be compared"):
         psnr.mse_later(pairs[0][0], pairs[0][1][:-1])
 
