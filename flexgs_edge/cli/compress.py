@@ -123,6 +123,12 @@ Several scenes:
 @shared_options.select_option
 @shared_options.drawing_options
 @shared_options.base_psnr_option
+@option(
+    VIEWS,
+    "--trust-views",
+    is_flag=True,
+    help="Go on where the photos do not show what the scene shows from their cameras. Default: stop, and name the likely cause.",
+)
 @shared_options.drop_invalid_option
 @option(
     EFFORT,

@@ -18,6 +18,7 @@ from flexgs_edge.methods.foreign import method as foreign
 from flexgs_edge.methods.paper import method as paper
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import CompressResult
+from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.decoding import read_often
 from flexgs_edge.run.doubts import doubts
 from flexgs_edge.run.foresight import foresee
@@ -82,6 +83,8 @@ def compress(
     with ExitStack() as stack:
         bench = None if run.views is None else stack.enter_context(open_bench(run, options.cluster))
         _foresee(run, opened=True)
+        if bench is not None:
+            run = check_views(run, bench, options.trust_views)
         ready = run if bench is None or options.method != "paper" else _read_often(run, bench)
         if run.output.format is not None:
             made = foreign.compress(ready, bench, scores)

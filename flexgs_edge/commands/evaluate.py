@@ -12,6 +12,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.lpips import Lpips
 from flexgs_edge.report.results import EvaluateResult
+from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes, foresee
 from flexgs_edge.run.inputs import scene_info
@@ -78,7 +79,7 @@ def evaluate(
     with ExitStack() as stack:
         bench = stack.enter_context(open_bench(run))
         foresee(run, opened=True, search=needed)
-        renderer = bench.renderer
+        run, renderer = check_views(run, bench, trusted=True), bench.renderer
         distance: Lpips | None = None
         if lpips:  # first, because packages or weights may be missing
             with clock.stage("lpips"):
@@ -104,6 +105,7 @@ def evaluate(
             quality=quality,
             quality_views="held-out" if views.held_out else "training",
             run=bench_info(run, bench),
+            warnings=run.doubts,
         )
     if reporter is not None:
         reporter.read_contents(input)

@@ -268,6 +268,7 @@ class EvaluateResult:
     quality: Quality
     quality_views: str
     run: RunInfo
+    warnings: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
@@ -279,6 +280,7 @@ class EvaluateResult:
             "views": self.views.to_json(),
             "quality": quality_json(self.quality),
             "quality_views": self.quality_views,
+            "warnings": list(self.warnings),
             "run": self.run.to_json(),
         }
 
@@ -290,6 +292,7 @@ class EvaluateResult:
             *view_lines(self.views),
         ]
         lines += quality_lines(self.quality, f"{len(self.quality.views)} {self.quality_views} views")
+        lines += [line("warning", words) for words in self.warnings]
         lines += ["", *_view_table(self.quality.views)]
         return text([*lines, "", *run_lines(self.run)])
 

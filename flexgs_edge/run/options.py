@@ -190,6 +190,8 @@ class CompressOptions(ViewOptions):
         Quantization groups per channel (`paper`). Default: one group for about 512 rows.
     base_psnr : float
         Assumed PSNR of the original against its photos, for the modelled drop, dB.
+    trust_views : bool
+        Go on with cameras and photos that do not fit the scene. Default: raise `InputError`.
     effort : {"fast", "balanced", "max"}
         More effort makes smaller files and takes longer. `balanced` (from 10 000 Gaussians) and `max` also distil (`best`,
         `.fgs`). `thorough` has become `max`. Default: `balanced`.
@@ -246,6 +248,7 @@ class CompressOptions(ViewOptions):
     bits: str = "paper"
     groups: int | None = None
     base_psnr: float = DEFAULT_BASE_PSNR
+    trust_views: bool = False
     effort: str = "balanced"
     best_effort: bool = False
     unseen: str = "keep"
