@@ -1,57 +1,71 @@
-"""What a file keeps beside its target: no view breaks, structure stays, and other poses look alike.
+"""What a file keeps beside its target: no view breaks, structure stays, and generated poses look alike.
 
-A target is about the mean of the views that decide. The promise adds bounds that a mean would hide: on the worst view, on
-the SSIM that is lost, and on made poses, where no given camera stood.
+A target is about the mean of the views that decide. The promise adds bounds that a mean would hide: on the worst view, on the
+SSIM that is lost, and on generated poses, where no given camera stood. Bounds follow from the target, not from what was reached.
+Each is used to a *share*: what was measured over what is allowed. A result holds if no share is above 1.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import Figure, Measurement, Target, log_loss
 
 WORST_TIMES, WORST_MORE = 1.5, 0.2
-"""The worst view may lose `WORST_TIMES` times the mean and `WORST_MORE` dB."""
+"""The worst view may lose `WORST_TIMES` times the drop that the target allows in the mean, and `WORST_MORE` dB."""
 SSIM_PER_DB = 0.015
 """SSIM that may be lost for each dB of the target. The paper's method loses 0.010 to 0.019 at 1 dB:
 docs/results/tuning.md#ssim_per_db"""
 LEAST_SSIM = 1e-4
 """Least SSIM that a target allows to lose; rounding alone loses a part of it."""
 MADE_GAP = 3.0
-"""Made poses may have this much less fidelity than the views that decide, dB: twice their squared error."""
+"""Generated poses may have this much less fidelity than the views that decide, dB: twice their squared error."""
 
 
-class Part(Protocol):
-    """One bound of the promise."""
+class Part(ABC):
+    """One bound of the promise.
 
-    @property
-    def name(self) -> str:
-        """What it is about, in two words."""
+    Attributes
+    ----------
+    name : str
+        What it is about, in two words.
+    option : str
+        The option that moves or lifts it.
+    """
 
-    @property
-    def option(self) -> str:
-        """The option that moves or lifts it."""
+    name: str
+    option: str
 
+    @abstractmethod
     def found(self, measurement: Measurement) -> float | None:
         """The figure that it bounds; `None` if it was not measured."""
 
+    @abstractmethod
     def allowed(self, measurement: Measurement) -> float:
         """The bound of that figure."""
 
-    def excess(self, measurement: Measurement) -> float | None:
-        """By how much the bound is missed, as `Target.excess`; `None` if its figure was not measured."""
-
+    @abstractmethod
     def report(self, measurement: Measurement) -> str:
         """The figure and its bound in words."""
 
+    def share(self, measurement: Measurement) -> float | None:
+        """What was measured over what is allowed; `None` if the figure was not measured."""
+        found = self.found(measurement)
+        return None if found is None else found / self.allowed(measurement)
+
+    def excess(self, measurement: Measurement) -> float | None:
+        """Log of the share; `None` if the figure was not measured."""
+        share = self.share(measurement)
+        return None if share is None else log_loss(share, 1.0)
+
 
 @dataclass(frozen=True)
-class WorstView:
-    """No view loses more than `limit` dB, or without a limit than `WORST_TIMES` the mean and `WORST_MORE` dB."""
+class WorstView(Part):
+    """No view loses more than `limit` dB. Without a limit, the bound follows the mean: a target for the size allows no drop."""
 
     figure: Figure
     limit: float | None = None
@@ -66,23 +80,20 @@ class WorstView:
         return None if measurement.worst is None else measurement.worst.loss(self.figure)
 
     def allowed(self, measurement: Measurement) -> float:
-        return WORST_TIMES * (measurement.usual or 0.0) + WORST_MORE if self.limit is None else self.limit
-
-    def excess(self, measurement: Measurement) -> float | None:
-        found = self.found(measurement)
-        if found is None or self.limit is not None:
-            return None if found is None else log_loss(found, self.limit or 0.0)
-        # Worst view over bound would hardly change with compression. What it loses beyond the mean's share changes as the
-        # mean does, but varies by itself too: half of it keeps a search from overshooting.
-        return log_loss(found - WORST_TIMES * (measurement.usual or 0.0), WORST_MORE) / 2
+        return worst_allowed(measurement.usual or 0.0) if self.limit is None else self.limit
 
     def report(self, measurement: Measurement) -> str:
         found = self.found(measurement)
         return f"worst view {'-' if found is None else f'{found:.3f}'} of {self.allowed(measurement):.3f} dB"
 
 
+def worst_allowed(drop: float) -> float:
+    """The drop of the worst view, dB, that goes with a drop in the mean."""
+    return WORST_TIMES * drop + WORST_MORE
+
+
 @dataclass(frozen=True)
-class MeanSsim:
+class MeanSsim(Part):
     """The views lose at most `limit` of SSIM in the mean."""
 
     limit: float
@@ -99,17 +110,14 @@ class MeanSsim:
     def allowed(self, measurement: Measurement) -> float:
         return self.limit
 
-    def excess(self, measurement: Measurement) -> float | None:
-        return None if measurement.ssim_drop is None else log_loss(measurement.ssim_drop, self.limit)
-
     def report(self, measurement: Measurement) -> str:
         found = measurement.ssim_drop
         return f"SSIM lost {'-' if found is None else f'{found:.4f}'} of {self.limit:.3g}"
 
 
 @dataclass(frozen=True)
-class MadePoses:
-    """Made poses have at most `gap` dB less fidelity than the views that decide."""
+class MadePoses(Part):
+    """Generated poses have at most `gap` dB less fidelity than the views that decide."""
 
     gap: float = MADE_GAP
     name = "made poses"
@@ -120,9 +128,6 @@ class MadePoses:
 
     def allowed(self, measurement: Measurement) -> float:
         return self.gap
-
-    def excess(self, measurement: Measurement) -> float | None:
-        return None if measurement.made_gap is None else (measurement.made_gap - self.gap) * (math.log(10.0) / 10.0)
 
     def report(self, measurement: Measurement) -> str:
         found = measurement.made_gap
@@ -263,6 +268,8 @@ class KeptPart:
         The figure and its bound in words.
     found, allowed : float or None
         The figure, `None` if it was not measured, and its bound.
+    share : float or None
+        The figure over its bound.
     held : bool
         Whether the bound holds; True for a figure that was not measured.
     """
@@ -271,6 +278,7 @@ class KeptPart:
     words: str
     found: float | None
     allowed: float
+    share: float | None
     held: bool
 
 
@@ -283,11 +291,14 @@ class KeptPromise:
     parts : tuple of KeptPart
         In the order of the promise.
     decided : str
-        Name of the part that is nearest to its bound or farthest beyond, or `target`.
+        Name of the part of which the largest share is used, or `target`.
+    share : float
+        The largest share of all, the target's included.
     """
 
     parts: tuple[KeptPart, ...]
     decided: str
+    share: float
 
     @property
     def held(self) -> bool:
@@ -307,9 +318,11 @@ def kept_promise(target: Target | None, size: int, measurement: Measurement | No
                 part.report(measurement),
                 part.found(measurement),
                 part.allowed(measurement),
+                part.share(measurement),
                 (part.excess(measurement) or 0.0) <= 0.0,
             )
             for part in target.parts
         ),
         "target" if decides is None else decides.name,
+        math.exp(max(excesses(target, size, measurement))),
     )

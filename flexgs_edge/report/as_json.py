@@ -45,8 +45,15 @@ def promise_json(promise: KeptPromise | None) -> dict[str, Any] | None:
     return {
         "held": promise.held,
         "decided": promise.decided,
+        "share": rounded(promise.share),
         "parts": [
-            {"name": part.name, "found": rounded(part.found, 5), "allowed": rounded(part.allowed, 5), "held": part.held}
+            {
+                "name": part.name,
+                "found": rounded(part.found, 5),
+                "allowed": rounded(part.allowed, 5),
+                "share": rounded(part.share),
+                "held": part.held,
+            }
             for part in promise.parts
         ],
     }

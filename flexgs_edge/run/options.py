@@ -12,7 +12,16 @@ from flexgs_edge.codec.v2.header import PREVIEW_MOST
 from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, MAX_VIEW_WIDTH
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.promise import LEAST_SSIM, SSIM_PER_DB, MadePoses, MeanSsim, Part, WorstView, promised
+from flexgs_edge.goals.promise import (
+    LEAST_SSIM,
+    SSIM_PER_DB,
+    MadePoses,
+    MeanSsim,
+    Part,
+    WorstView,
+    promised,
+    worst_allowed,
+)
 from flexgs_edge.goals.steps import REFINE_STEPS
 from flexgs_edge.goals.target import Figure, MaxDrop, MaxSize, MinFidelity, Target, min_ratio
 from flexgs_edge.io.reading import Reading, Writing
@@ -173,7 +182,7 @@ class CompressOptions(ViewOptions):
         What holds beside the target: bounds on the worst view, on SSIM and on made poses (`whole`), or nothing (`mean`).
         Default: `whole`.
     max_worst_drop : float or "none", optional
-        Largest drop of any single deciding view, dB. Default: 1.5 times their mean and 0.2 dB.
+        Largest drop of any single deciding view, dB. Default: 1.5 times the drop that the target allows in the mean, and 0.2 dB.
     max_ssim_drop : float or "none", optional
         Largest loss of SSIM, mean over the deciding views. Default: 0.015 for each dB that the target allows.
     max_size : int, optional
@@ -391,7 +400,7 @@ class CompressOptions(ViewOptions):
         if isinstance(self.max_worst_drop, (int, float)):
             parts.append(WorstView(figure, self.max_worst_drop))
         elif whole and self.max_worst_drop is None:
-            parts.append(WorstView(figure))
+            parts.append(WorstView(figure, None if allowed is None else worst_allowed(allowed)))
         if isinstance(self.max_ssim_drop, (int, float)):
             parts.append(MeanSsim(self.max_ssim_drop))
         elif whole and self.max_ssim_drop is None and allowed is not None:

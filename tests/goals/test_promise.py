@@ -29,7 +29,7 @@ from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.options import CompressOptions
 
-PARTS = (WorstView("drop"), MeanSsim(0.015), MadePoses())
+PARTS = (WorstView("drop", 1.7), MeanSsim(0.015), MadePoses())
 GOOD = Measurement(0.8, 40.0, 0.8, Measurement(1.3, 38.0, 1.2), usual=0.8, ssim_drop=0.01, made_gap=1.0)
 
 
@@ -37,7 +37,7 @@ def test_all_parts_hold_or_the_point_misses() -> None:
     target = Promised(MaxDrop(1.0), PARTS)
     assert target.excess(1, GOOD) == pytest.approx(math.log(0.8)) and target.decides(1, GOOD) is None
     for changed, part in (
-        ({"worst": Measurement(1.5, 30.0, 1.5)}, PARTS[0]),
+        ({"worst": Measurement(1.75, 30.0, 1.75)}, PARTS[0]),
         ({"ssim_drop": 0.016}, PARTS[1]),
         ({"made_gap": 3.1}, PARTS[2]),
     ):
@@ -54,17 +54,14 @@ def test_all_parts_hold_or_the_point_misses() -> None:
     assert kept is not None and kept.decided == "target" and kept.held
 
 
-def test_the_worst_view_misses_by_what_it_loses_beyond_the_mean() -> None:
-    """Its ratio to the mean hardly changes with compression, so that a search could not aim by it."""
-    part = WorstView("drop")
-    for mean, worst, excess in (
-        (0.8, 1.4, 0.0),
-        (0.8, 1.6, math.log(2)),
-        (0.4, 0.7, -math.log(2)),
-        (1.0, 1.2, math.log(0.02)),
-    ):
-        found = replace(GOOD, usual=mean, worst=Measurement(worst, 30.0, worst))
-        assert part.excess(found) == pytest.approx(excess / 2), (mean, worst)
+def test_shares_are_what_was_measured_over_what_is_allowed() -> None:
+    """A bound follows from the target: what the mean has reached changes nothing."""
+    for mean in (0.1, 0.8):
+        found = replace(GOOD, usual=mean, drop=mean)
+        assert [part.share(found) for part in PARTS] == pytest.approx([1.3 / 1.7, 0.01 / 0.015, 1 / 3])
+        assert PARTS[0].excess(found) == pytest.approx(math.log(1.3 / 1.7))
+    kept = kept_promise(Promised(MaxDrop(1.0), PARTS), 1, GOOD)
+    assert kept is not None and kept.share == pytest.approx(0.8) and kept.parts[0].share == pytest.approx(1.3 / 1.7)
 
 
 def test_a_view_breaks_where_its_bound_is_missed() -> None:
@@ -84,7 +81,7 @@ def test_what_was_not_measured_does_not_decide() -> None:
     assert "SSIM" not in target.report(1, found) and "made poses" not in target.report(1, found)
     kept = kept_promise(target, 1, found)
     assert kept is not None
-    assert kept.parts[1] == KeptPart("SSIM lost", "SSIM lost - of 0.015", None, 0.015, True)
+    assert kept.parts[1] == KeptPart("SSIM lost", "SSIM lost - of 0.015", None, 0.015, None, True)
     assert promised(MaxDrop(1.0), ()) == MaxDrop(1.0) and kept_promise(MaxDrop(1.0), 1, GOOD) is None
 
 
@@ -102,7 +99,7 @@ def test_a_size_holds_whatever_the_promise_says() -> None:
     assert in_the_way(target, 900, broken).startswith("the made poses stand")
 
 
-def test_the_worst_view_follows_a_mean_where_gains_count_as_nothing() -> None:
+def test_with_a_size_the_worst_view_follows_a_mean_where_gains_count_as_nothing() -> None:
     views = (ViewQuality("a", 1e-4, 2e-3, 1e-3), ViewQuality("b", 1e-4, 0.9e-3, 1e-3))
     found = measurement_of(Quality(views))
     assert found.usual == pytest.approx(10 * math.log10(2) / 2) and (found.drop or 9) < (found.usual or 0)
@@ -138,13 +135,15 @@ def test_options_make_the_parts(words: dict[str, Any], names: list[str]) -> None
     assert [part.name for part in target.parts] == names if isinstance(target, Promised) else names == []
 
 
-def test_the_ssim_that_may_be_lost_follows_the_target() -> None:
-    def limit(**words: Any) -> float:
+def test_bounds_follow_the_target() -> None:
+    def limits(**words: Any) -> list[float]:
         target = CompressOptions(**words).target("drop", 1)
-        assert isinstance(target, Promised) and isinstance(target.parts[1], MeanSsim)
-        return target.parts[1].limit
+        assert isinstance(target, Promised)
+        return [part.allowed(GOOD) for part in target.parts]
 
-    assert limit() == SSIM_PER_DB and limit(max_drop=0.5) == SSIM_PER_DB / 2
-    assert limit(min_fidelity=38.0) == pytest.approx(SSIM_PER_DB * modelled_drop(mse_of_psnr(38.0)))
+    assert limits() == [1.7, SSIM_PER_DB, 3.0] and limits(max_drop=0.5) == [0.95, SSIM_PER_DB / 2, 3.0]
+    drop = modelled_drop(mse_of_psnr(38.0))
+    assert limits(min_fidelity=38.0) == pytest.approx([1.5 * drop + 0.2, SSIM_PER_DB * drop, 3.0])
+    assert limits(max_size=1000) == pytest.approx([1.5 * 0.8 + 0.2, 3.0])
     with pytest.raises(InputError, match="fixed rates leave nothing to search"):
         CompressOptions(method="paper", prune_rate=0.1, sh_rate=0.1, max_ssim_drop=0.01)

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.goals.line import AIM, next_point
-from flexgs_edge.goals.promise import bounds_ssim, excesses, means
+from flexgs_edge.goals.promise import bounds_ssim, excesses
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
@@ -35,9 +35,6 @@ ABOVE = 0.02
 """How far above a size we aim, since results that are too large can be landed: docs/results/tuning.md#landing"""
 CLOSE_SIZE = 0.003
 """A candidate that is smaller than asked by no more than this ends the search."""
-ROOM = 0.1
-"""How far below what is asked the means must be for a result to lose Gaussians although its worst view misses:
-docs/results/tuning.md#room"""
 NEAR_MISS, FINER = 0.07, (0.8, 0.64)
 """Largest log by which a descent's result may miss to be tried with finer steps of its constant colours, and factors of these:
 docs/results/tuning.md#near_miss"""
@@ -233,22 +230,15 @@ class GridSearch(GridResults):
         """The answer without the Gaussians that it could do without."""
         self.rounds.let_go()  # a landing goes back to none of them
         steps = list(found.steps)
-        best = self._thinned(found.chosen, found.product, target, target, steps)
+        best = self._thinned(found.chosen, found.product, target, steps)
         return replace(found, product=best[1], chosen=best[0], steps=tuple(steps))
 
     def _mended(
         self, missed: Candidate, product: GridScene, target: Target, tried: list[Candidate]
     ) -> tuple[Candidate, GridScene] | None:
-        """With fewer Gaussians, if only the worst view misses while the means are far better than asked; else with finer colours.
-
-        The bound on the worst view grows with the mean, so that a finer result would miss it as well.
-        """
-        if target.limit_bytes is not None:
-            return None
-        if means(target).excess(missed.size, missed.measurement) <= -ROOM:
-            step, grid = self._thinned(missed, product, target, means(target), tried)
-            return (step, grid) if step.holds else None
-        return self._with_finer(missed, product, target, tried) if self.steps and missed.excess <= NEAR_MISS else None
+        if target.limit_bytes is None and self.steps and missed.excess <= NEAR_MISS:
+            return self._with_finer(missed, product, target, tried)
+        return None
 
     def _with_finer(
         self, missed: Candidate, product: GridScene, target: Target, tried: list[Candidate]
@@ -284,9 +274,9 @@ class GridSearch(GridResults):
         return step
 
     def _thinned(
-        self, chosen: Candidate, grid: GridScene, target: Target, goal: Target, steps: list[Candidate]
+        self, chosen: Candidate, grid: GridScene, target: Target, steps: list[Candidate]
     ) -> tuple[Candidate, GridScene]:
-        """The best of a result and what is left of it when the cheapest Gaussians go until `goal` hardly holds."""
+        """The best of a result and what is left of it when the cheapest Gaussians go until the target hardly holds."""
         best = chosen, grid
 
         def attempt(smaller: GridScene) -> list[float]:
@@ -296,9 +286,9 @@ class GridSearch(GridResults):
             step = self._variant(mended, chosen, target, steps, started)
             if better(step, best[0], target):
                 best = step, mended
-            return excesses(goal, step.size, step.measurement)
+            return excesses(target, step.size, step.measurement)
 
-        found = excesses(goal, chosen.size, chosen.measurement)
+        found = excesses(target, chosen.size, chosen.measurement)
         if max(found) >= -NEAR_QUALITY:
             return best
         try:

@@ -90,12 +90,10 @@ def test_the_worst_view_stops_a_search() -> None:
         adapt(Uneven(3), bounded(MaxDrop(1.2), 0.1))
 
 
-def test_the_usual_bound_of_the_worst_view_follows_the_mean() -> None:
-    """3 times the mean is within 1.5 times and 0.2 dB up to a mean of 0.133 dB; the least that can be had is 0.2."""
-    with pytest.raises(TargetError, match=r"worst view 0\.600 of 0\.500 dB"):
-        adapt(Uneven(3), bounded(MaxDrop(1.2), None))
-    held = adapt(Uneven(2), bounded(MaxDrop(1.2), None), "max").chosen.measurement
-    assert held is not None and held.drop is not None and 0.3 < held.drop <= 0.4
+def test_an_odd_view_does_not_drive_a_search_to_the_floor() -> None:
+    """The worst view may lose 1.5 times what the mean is allowed, and 0.2 dB, however little the mean loses."""
+    held = adapt(Uneven(3), bounded(MaxDrop(1.2), 2.0), "max").chosen.measurement
+    assert held is not None and held.drop is not None and 0.5 < held.drop <= 2.0 / 3
 
 
 def test_the_worst_view_in_words() -> None:

@@ -131,12 +131,12 @@ def asking(world: World, target: Target) -> Any:
     return finder
 
 
-PROMISED = Promised(MaxDrop(1.0), (WorstView("drop"),))
+PROMISED = Promised(MaxDrop(1.0), (WorstView("drop", 1.7),))
 
 
 def test_candidates_in_a_row_that_break_a_view_ask_for_poses() -> None:
     with pytest.raises(PosesLacking) as caught:
-        asking(Breaking(2.4), PROMISED).run(PROMISED)
+        asking(Breaking(40.0), PROMISED).run(PROMISED)
     assert caught.value.views == (2,) and len(caught.value.steps) == BROKEN
     assert all(broken_views(PROMISED, step.measurement) == [2] for step in caught.value.steps)
 
@@ -151,7 +151,7 @@ class Freeing(KnownSearch):
 
 
 def test_a_search_that_asks_frees_its_products() -> None:
-    world, rounds = Breaking(2.4), FakeRounds()
+    world, rounds = Breaking(40.0), FakeRounds()
     world.rounds = rounds
     finder = Freeing(rounds, world.size_of, world.measure, EFFORT, refit=False)  # type: ignore[arg-type]
     finder.world, finder.asks = world, True
@@ -162,7 +162,7 @@ def test_a_search_that_asks_frees_its_products() -> None:
 
 def test_a_search_with_a_result_that_holds_does_not_ask() -> None:
     """Two candidates break a view. With one that holds before them, the search keeps that one."""
-    world = Breaking(2.4)
+    world = Breaking(40.0)
     finder = asking(world, PROMISED)
     found = search(powers(), MaxDrop(0.5), best_effort=True).chosen
     holding = replace(found, excess=-0.5, measurement=replace(found.measurement, losses=(0.1, 0.1, 0.1)))
@@ -181,8 +181,8 @@ def broken_steps(world: World) -> list[Any]:
     [
         (Breaking(1.2), PROMISED),
         (powers(), PROMISED),
-        (Breaking(2.4), MaxDrop(1.0)),
-        (Breaking(2.4), Promised(MaxSize(3000, "drop"), (WorstView("drop"),))),
+        (Breaking(40.0), MaxDrop(1.0)),
+        (Breaking(40.0), Promised(MaxSize(3000, "drop"), (WorstView("drop", 1.7),))),
     ],
 )
 def test_others_do_not_ask(world: World, target: Target) -> None:
