@@ -19,6 +19,7 @@ from unittest import mock
 import numpy as np
 
 from benchmarks.harness import SCENES, Timer, check
+from benchmarks.moved_scene import Similarity
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.inria import inria_json
 from flexgs_edge.cameras.read import read_cameras
@@ -32,7 +33,6 @@ from flexgs_edge.methods.best.method import grid_search
 from flexgs_edge.progress import Progress
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.studies.stability.moved_scene import Similarity
 
 LEAST_SAME, MOST_BYTES = 0.99, 0.02
 """Least share of equal kept Gaussians, and largest relative difference of the bytes."""

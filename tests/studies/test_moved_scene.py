@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from benchmarks.invariance import LEAST_SAME, MOST_BYTES, compare
+from benchmarks.moved_scene import Similarity, turn_of_band
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.methods.best.choose_steps import probe_slopes
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.studies.stability.moved_scene import Similarity, turn_of_band
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, random_scene
 from tiny_project import make_project

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import math
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +19,6 @@ from flexgs_edge.cli.study.rate import RATIOS, command
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import min_ratio
-from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.io.exchange import read_foreign, write_foreign
 from flexgs_edge.methods.best.allocation import BitModel, choose
 from flexgs_edge.methods.best.costs import RemovalCosts
@@ -31,15 +28,12 @@ from flexgs_edge.methods.paper.prune import ranks_from_order
 from flexgs_edge.progress import SILENT
 from flexgs_edge.report.plots import LineChart, Series, draw, picture
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.studies.rate import ablations, coders
+from flexgs_edge.studies.rate import ablations
 from flexgs_edge.studies.rate import study as rate
 from flexgs_edge.studies.rate.curves import Curve
 from flexgs_edge.studies.rate.points import best_points, paper_points
 from flexgs_edge.studies.rate.study import RateStudy, study_rate
-from flexgs_edge.studies.rate.trade import CODERS
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene
-from synthetic import random_scene
 from tiny_project import COUNT, make_project
 
 pytestmark = pytest.mark.usefixtures("short_searches")
@@ -110,30 +104,14 @@ def test_paper_searches_every_ratio_that_its_bits_alone_miss(studied: StudyScene
 
 def test_every_variant_is_there_and_keeps_to_the_ratio(study: tuple[RateStudy, Path], studied: StudyScene) -> None:
     rows = [row for row in rows_of(study, "rate") if row["method"] == "best"]
-    assert [row["variant"] for row in rows] == ["whole", *CODERS, "whole", "gs ranks", "no refit", "full SH"]
+    assert [row["variant"] for row in rows] == ["whole", "whole", "gs ranks", "no refit", "full SH"]
     assert [row["effort"] for row in rows if row["variant"] == "whole"] == ["fast", "max"]
     for row in rows:
-        if row["variant"] not in CODERS:
-            assert float(str(row["ratio"])) >= RATIO
-    sizes = [row["size"] for row in rows if row["variant"] not in CODERS]
+        assert float(str(row["ratio"])) >= RATIO
+    sizes = [row["size"] for row in rows]
     assert len(set(sizes)) == len(sizes), "nothing was taken away somewhere"
     names = [variant.name for variant in ablations.parts_of(studied.orders["gs"], 0, False)]
     assert names == ["gs ranks", "one pass", "no refit"], "no SH, nothing to choose of them"
-
-
-def test_a_coder_changes_the_size_alone(study: tuple[RateStudy, Path]) -> None:
-    rows = rows_of(study, "rate")
-    whole, _ = (row for row in rows if row["variant"] == "whole" and row["method"] == "best")
-    recoded = [row for row in rows if row["variant"] in CODERS]
-    assert {row["wanted_ratio"] for row in recoded} == {RATIO}
-    same = ("kept", "psnr", "ssim", "flip", "drop", "fidelity")
-    assert all(row[name] == whole[name] for row in recoded for name in same)
-    for row in rows_of(study, "parts"):
-        if row["variant"] in CODERS:
-            (size,) = (r["size"] for r in recoded if r["variant"] == row["variant"])
-            assert row["more_bytes"] == pytest.approx(
-                100 * (float(str(size)) / float(str(whole["size"])) - 1), abs=0.01
-            )
 
 
 def test_the_whole_method_costs_nothing_against_itself(study: tuple[RateStudy, Path]) -> None:
@@ -245,32 +223,6 @@ def test_choosing_among_all_degrees_is_the_methods_own_choice() -> None:
     assert set(degrees[weight2 > 0]) == {top}
     # Gaussians that must bring all their SH along are worth keeping less often.
     assert 0 < full.sum() < keep.sum() < count
-
-
-def test_coders_sizes() -> None:
-    count = 600
-    planes = random_scene(count, 12, 1).read(slice(0, count), list(FIELD))
-    steps = StepSizes(position=0.01, scale=0.1, rotation=0.05, opacity=0.2, dc=0.05, sh=(0.1,))
-    degrees = (np.arange(count) % 2).astype(np.uint8)
-    grid, _ = to_grid(planes, degrees, steps, np.zeros(3))
-    sizes = coders.plane_sizes(grid)
-    every = [*grid.position, *grid.scale, *grid.rotation, grid.opacity, *grid.dc, *grid.sh[0], grid.sh_degrees]
-    bits = [math.ceil(len(plane) * math.ceil(math.log2(int(np.ptp(plane.astype(int))) + 1)) / 8) for plane in every]
-    assert len(every) == 23 and sizes["fixed bits"] == sum(bits)
-    entropy = 0.0
-    for plane in every:
-        both = plane.tolist(), [0, *np.diff(plane.astype(int)).tolist()]
-        entropy += min(-sum(n * math.log2(n / len(v)) for n in Counter(v).values()) / 8 for v in both)
-    assert sizes["order-0 entropy"] == pytest.approx(entropy, abs=1)
-    assert sizes["order-0 entropy"] < sizes["zlib"] < sizes["fixed bits"]
-    assert sizes["order-0 entropy"] < sizes["lzma"], "random values repeat nothing"
-
-
-def test_bytes_of_a_coder_hold_the_integers() -> None:
-    values = np.array([-3, 70000, 5, -3], np.int64)
-    data = np.frombuffer(coders._byte_planes(values), np.uint8).reshape(3, 4)
-    assert np.array_equal((data * np.array([[1], [256], [65536]])).sum(axis=0) - 3, values)
-    assert coders._entropy_bytes(np.array([7, 7, 9, 9])) == 4 / 8 and coders._entropy_bytes(np.full(9, 3)) == 0
 
 
 def test_a_curve_reads_power_laws_and_ends_at_its_points() -> None:

@@ -1,4 +1,4 @@
-"""`study speed` on a tiny scene: what is drawn less exactly, scored from fewer views, estimated, run whole; and its front."""
+"""`study speed` on a tiny scene: what is drawn less exactly, scored from fewer views, run whole; and its front."""
 
 from __future__ import annotations
 
@@ -31,13 +31,12 @@ from flexgs_edge.studies.speed.drawing import HalfPrecision, LowerDegree
 from flexgs_edge.studies.speed.front import front
 from flexgs_edge.studies.speed.scoring import spearman
 from flexgs_edge.studies.speed.study import SpeedStudy, study_speed
-from flexgs_edge.studies.speed.timing import slope
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene
 from synthetic import look_from, make_camera, random_scene
-from tiny_project import COUNT, VIEWS, make_project
+from tiny_project import COUNT, make_project
 
 OPTIONS = CompressOptions(method="best", holdout=4, effort="fast", max_drop=4.0)
-KEYS = ["drawing", "scoring", "stability", "sampling", "scaling", "presets"]
+KEYS = ["drawing", "scoring", "stability", "presets"]
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +50,7 @@ def study(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[t
     with pytest.MonkeyPatch.context() as patch:
         # best is tested by its own tests, and takes seconds here, nearly all of them the coder's tables.
         patch.setattr("flexgs_edge.studies.speed.presets.PRESETS", (("paper", "fast"), ("paper", "balanced")))
-        yield study_speed(project / "point_cloud.ply", out, OPTIONS, repeats=1, trials=5), out
+        yield study_speed(project / "point_cloud.ply", out, OPTIONS, repeats=1), out
 
 
 @pytest.fixture(scope="module")
@@ -129,20 +128,6 @@ def test_all_views_are_the_reference_of_a_few(study: tuple[SpeedStudy, Path], st
     assert whole["drop"] == pytest.approx(found.measurement.drop, abs=1e-4)
 
 
-def test_estimates_of_everything_are_exact_and_shares_are_kept(
-    study: tuple[SpeedStudy, Path], studied: StudyScene
-) -> None:
-    rows = rows_of(study, "sampling")
-    for row in rows:
-        assert row["trials"] == 5
-        if row["asked"] == 1.0:
-            assert (row["covered"], row["half_width"], row["rms"]) == (5, 0.0, 0.0)
-    costs = [row["ms"] for row in rows if row["known"] == "nothing"]
-    assert costs == sorted(costs)
-    found = studied.search.chosen.measurement
-    assert found is not None and f"fidelity {found.fidelity:.3f} dB" in study[0].scene.experiments[3].question
-
-
 def test_presets_are_runs_of_compress(study: tuple[SpeedStudy, Path], project: Path) -> None:
     row, other = rows_of(study, "presets")
     assert (other["method"], other["effort"]) == ("paper", "balanced") and float(str(other["seconds"])) > 0
@@ -151,22 +136,9 @@ def test_presets_are_runs_of_compress(study: tuple[SpeedStudy, Path], project: P
     assert made.quality is not None and row["drop"] == pytest.approx(made.quality.drop, abs=1e-4)
 
 
-def test_scaling_has_every_amount(study: tuple[SpeedStudy, Path]) -> None:
-    rows = rows_of(study, "scaling")
-    amounts = {
-        kind: [row["amount"] for row in rows if row["kind"] == kind] for kind in ("Gaussians", "pixels", "views")
-    }
-    assert amounts == {
-        "Gaussians": [COUNT // 8, COUNT // 4, COUNT // 2, COUNT],
-        "pixels": [10 * 8, 20 * 15, 40 * 30, 80 * 60],
-        "views": [4, VIEWS - 3],
-    }
-    assert all(float(str(row["ms"])) > 0 for row in rows)
-
-
 def test_only_the_parts_asked_for_are_made(project: Path, tmp_path: Path) -> None:
-    found = study_speed(project / "point_cloud.ply", tmp_path / "out", OPTIONS, parts=["scaling"], repeats=1)
-    assert [experiment.key for experiment in found.scene.experiments] == ["scaling"]
+    found = study_speed(project / "point_cloud.ply", tmp_path / "out", OPTIONS, parts=["drawing"], repeats=1)
+    assert [experiment.key for experiment in found.scene.experiments] == ["drawing"]
     assert len(list((tmp_path / "out").iterdir())) == 5
 
 
@@ -176,7 +148,6 @@ def test_only_the_parts_asked_for_are_made(project: Path, tmp_path: Path) -> Non
         ({"parts": ["drawing", "sleeping"]}, "--parts sleeping: expected one or more of drawing, scoring"),
         ({"parts": []}, "expected one or more of"),
         ({"repeats": 0}, "--repeats 0: expected 1 or more"),
-        ({"trials": 0}, "--trials 0: expected 1 or more"),
     ],
 )
 def test_words_are_checked_before_any_work(tmp_path: Path, words: dict[str, object], said: str) -> None:
@@ -241,8 +212,7 @@ def test_ranks_share_their_mean_where_values_are_equal() -> None:
     assert spearman(np.array([-np.inf, -np.inf, 5.0]), np.array([0.0, 0.0, 1e9])) == 1.0
 
 
-def test_exponents_and_fronts() -> None:
-    assert slope([2, 4, 8], [5 * 2**0.5, 5 * 4**0.5, 5 * 8**0.5]) == pytest.approx(0.5)
+def test_fronts() -> None:
     assert front([3, 1, 2, 2], [9, 1, 5, 4]) == [True, True, True, False] and front([], []) == []
     assert front([1, 2], [float("inf"), float("inf")]) == [True, False]
 
@@ -277,15 +247,15 @@ def test_the_command_line_hands_on_what_it_is_told(
         "-o",
         str(tmp_path / "out"),
         "--parts",
-        "drawing, scaling",
-        "--trials",
-        "9",
+        "drawing, scoring",
+        "--repeats",
+        "3",
         "-q",
     ]
     with pytest.raises(SystemExit) as left:
         app.main([*words, "--json", "-"])
     assert left.value.code == 0
-    assert told == {"parts": ("drawing", "scaling"), "repeats": 5, "trials": 9, "max_drop": 1.0, "scene": "a.ply"}
+    assert told == {"parts": ("drawing", "scoring"), "repeats": 3, "max_drop": 1.0, "scene": "a.ply"}
     assert json.loads(capsys.readouterr().out)["command"] == "study speed"
 
 
@@ -297,4 +267,4 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(option.help and option.help.endswith(".") for option in options)
     defaults = {option.name: option.default for option in options}
     assert PARTS.convert(defaults["parts"], None, None) == speed.PARTS
-    assert (defaults["repeats"], defaults["trials"]) == (speed.REPEATS, speed.TRIALS)
+    assert defaults["repeats"] == speed.REPEATS

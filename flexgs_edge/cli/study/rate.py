@@ -84,7 +84,7 @@ def command(
       - both methods of compress, at several ratios
       - the whole scene as .spz, .sog and .compressed.ply
       - --method best without each of its parts: measured costs, measuring
-        again, the refit, the SH degree of each Gaussian, the context coder;
+        again, the refit, the SH degree of each Gaussian;
         where searches descend, also parts of the descents
 
     The same views judge every file: held-out photos where there are some. Results appear in DIR when all is done: open

@@ -30,7 +30,7 @@ PARTS = PartsType()
     "Parts",
     "--parts",
     type=PARTS,
-    default="drawing,scoring,sampling,presets,scaling",
+    default="drawing,scoring,presets",
     show_default=True,
     help="What to measure. Fewer parts are faster.",
 )
@@ -45,21 +45,12 @@ PARTS = PartsType()
 )
 @help_page.option(
     "Parts",
-    "--trials",
-    metavar="N",
-    type=int,
-    default=200,
-    show_default=True,
-    help="Random samples of each size, for sampling. More is slower, more exact.",
-)
-@help_page.option(
-    "Parts",
     "--max-drop",
     metavar="DB",
     type=float,
     default=1.0,
     show_default=True,
-    help="Loss of PSNR that whole runs and searches aim at.",
+    help="Loss of PSNR that whole runs aim at.",
 )
 @shared_options.study_options
 def command(
@@ -67,7 +58,6 @@ def command(
     output: str,
     parts: tuple[str, ...],
     repeats: int,
-    trials: int,
     json_path: str | None,
     quiet: bool,
     **options: Any,
@@ -79,16 +69,14 @@ def command(
                 faint splats left out, half precision, small pictures
       scoring   time of scoring against the quality at one size, by the
                 number of views scored
-      sampling  fidelity estimated from a part of each view
       presets   time of whole runs of compress against the ratio reached
-      scaling   time by number of Gaussians, pixels and views
 
     Results appear in DIR when all is done: open DIR/index.html. Times are those of this machine: close other programs.
 
     \b
     Examples:
       flexgs-edge study speed point_cloud.ply -o speed
-      flexgs-edge study speed point_cloud.ply -o speed --parts drawing,scaling
+      flexgs-edge study speed point_cloud.ply -o speed --parts drawing,scoring
       flexgs-edge study speed scene.ply -o speed --max-drop 0.5 --resolution 800
     """
     progress = talk.start(quiet, json_path, options["force"])
@@ -96,5 +84,5 @@ def command(
     from flexgs_edge.studies.speed.study import study_speed
 
     made = CompressOptions(**options)
-    result = study_speed(scene, output, made, progress, parts=parts, repeats=repeats, trials=trials)
+    result = study_speed(scene, output, made, progress, parts=parts, repeats=repeats)
     talk.emit(result.to_text(), result.to_json(), json_path, options["force"])

@@ -32,13 +32,10 @@ def command(scene: str, output: str, quick: bool, json_path: str | None, quiet: 
     """Find where methods break on a scene.
 
     \b
-      bits, groups, strays   fewer bits, other groups of rows, stray values
       pruning, views, halves more removed; scores from few views, or one side
       heldout, distance,     the worst view; cameras nearer, farther, between
       poses                  and above the path; other lenses and sizes
-      moves                  scenes moved far away, scaled, turned
       generations            compressed again and again
-      search                 searches on rough, flat and noisy curves
 
     Compares both methods with simple baselines: plain rounding, removing Gaussians or SH alone, simple scores. A method breaks
     where it loses far too much PSNR or ends in an error. Results appear in DIR when all is done: open DIR/index.html.

@@ -28,7 +28,6 @@ from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.run.settings import make_settings, settings_room
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.studies.rate.ablations import WHOLE, Variant
-from flexgs_edge.studies.rate.coders import coder_sizes
 from flexgs_edge.studies.result_tables import Cell, Column, columns
 from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 from flexgs_edge.units import format_size
@@ -169,9 +168,7 @@ def _paper_point(studied: StudyScene, ratio: float | None, choice: Choice, secon
     return _said(RatePoint("paper", variant, effort, ratio, evaluator.size(choice), kept, quality, seconds))
 
 
-def best_points(
-    studied: StudyScene, variant: Variant, effort: str, ratios: Sequence[float], recode: Sequence[float] = ()
-) -> Found:
+def best_points(studied: StudyScene, variant: Variant, effort: str, ratios: Sequence[float]) -> Found:
     """Points of `--method best`, whole or without a part. All ratios share their rounds, the weakest compression first.
 
     Parameters
@@ -184,8 +181,6 @@ def best_points(
         Effort of the searches.
     ratios : sequence of float
         PLY bytes over file bytes, one search for each.
-    recode : sequence of float
-        Ratios whose grids are also sized in other coders.
     """
     run, source = studied.run, studied.run.source
     options = replace(studied.run.options, effort=effort, refit=variant.refit, best_effort=True)
@@ -213,18 +208,10 @@ def best_points(
                 quality = _judged_source(studied, grid)
                 point = RatePoint("best", variant.name, effort, ratio, size, grid.count, quality, seconds)
                 found += Found((_said(point),))
-                if ratio in recode:
-                    found += Found(_recoded(grid, point))
             else:
                 found += Found((), (f"best ({variant.name}, {effort}) at {ratio:g}x",))
             started = time.perf_counter()
     return found
-
-
-def _recoded(grid: GridScene, point: RatePoint) -> tuple[RatePoint, ...]:
-    """Points of the same grid in other coders, with other sizes and the same quality."""
-    sizes = coder_sizes(grid, point.size)
-    return tuple(replace(point, variant=name, size=size, seconds=None) for name, size in sizes.items())
 
 
 def peer_points(studied: StudyScene, folder: Path) -> Found:

@@ -124,8 +124,7 @@ def _experiments(
     distilled: Sequence[float],
 ) -> list[Experiment]:
     effort = studied.run.options.effort
-    recode = ablations if ablation_effort == effort else ()
-    found = best_points(studied, WHOLE, effort, ratios, recode) + paper_points(studied, ratios)
+    found = best_points(studied, WHOLE, effort, ratios) + paper_points(studied, ratios)
     if distilled:
         try:
             found += best_points(studied, WHOLE, MAX, distilled)
@@ -137,7 +136,7 @@ def _experiments(
     descends = distil_steps(options, 1, source.count) > 0
     variants = parts_of(studied.orders["gs"], source.sh_degree, descends) if ablations else ()
     if ablations and ablation_effort != effort:
-        found += best_points(studied, WHOLE, ablation_effort, ratios, ablations)
+        found += best_points(studied, WHOLE, ablation_effort, ratios)
     for variant in variants:
         found += best_points(studied, variant, ablation_effort, ablations)
     made = [trade.rate(studied, found.points, found.missing, effort)]

@@ -12,12 +12,6 @@ from flexgs_edge.studies.rate.points import MAX, RatePoint, loss_of, point_colum
 from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
 from flexgs_edge.studies.study_scene import FIGURES, StudyScene
 
-CODERS = {
-    "order-0 entropy": "a bound for coders that code each integer by itself, without their tables",
-    "lzma": "lzma (Python's, preset 9) on each plane, instead of the context coder",
-    "zlib": "zlib (level 9) on each plane, instead of the context coder",
-    "fixed bits": "as many bits a value as each plane's range needs, instead of the context coder",
-}
 FIDELITY_WORDS = "fidelity: PSNR against the original's renders"
 
 
@@ -168,7 +162,7 @@ def parts(
     whole = _points(points, "best", WHOLE.name, effort)
     curve = _curve(studied, whole)
     modelled = _modelled(whole)
-    known = {**{variant.name: variant.words for variant in (WHOLE, *variants)}, **CODERS}
+    known = {variant.name: variant.words for variant in (WHOLE, *variants)}
     rows: list[dict[str, Cell]] = []
     for name, words in known.items():
         for point in _points(points, "best", name, effort):
@@ -189,8 +183,7 @@ def parts(
         "parts",
         "Each part earns its place",
         f"best with one part taken away at a time, at the effort {effort}, compared with the whole method at that effort. "
-        "Power laws join the whole method's points. Other coders code the same integers, so quality is equal; each plane is "
-        "coded alone, as it is or as differences along the curve. A dash means beyond the whole method's points. Drops of a few "
+        "Power laws join the whole method's points. A dash means beyond the whole method's points. Drops of a few "
         "hundredths of a dB are mostly chance; the modelled drop is then the steadier figure.",
         table,
         BarChart(

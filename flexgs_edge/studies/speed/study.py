@@ -1,4 +1,4 @@
-"""`study speed`: how much accuracy speed costs in drawing, scoring, measuring and whole runs, and how times grow."""
+"""`study speed`: how much accuracy speed costs in drawing, scoring and whole runs."""
 
 from __future__ import annotations
 
@@ -18,17 +18,14 @@ from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.page import study_page
 from flexgs_edge.studies.speed.drawing import drawing
 from flexgs_edge.studies.speed.presets import presets
-from flexgs_edge.studies.speed.sampling import sampling
-from flexgs_edge.studies.speed.scaling import scaling
 from flexgs_edge.studies.speed.scoring import scoring
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
 from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
 
-PARTS = ("drawing", "scoring", "sampling", "presets", "scaling")
+PARTS = ("drawing", "scoring", "presets")
 REPEATS = 5
-TRIALS = 200
 
 
 class SpeedStudy(WrittenStudy):
@@ -44,7 +41,6 @@ def study_speed(
     progress: Progress = SILENT,
     parts: Sequence[str] = PARTS,
     repeats: int = REPEATS,
-    trials: int = TRIALS,
     **words: Any,
 ) -> SpeedStudy:
     """Measure speed against accuracy on a scene and write it to a folder.
@@ -65,8 +61,6 @@ def study_speed(
         Names in `PARTS`. Default: all.
     repeats : int
         Rounds of timing. The shortest time counts.
-    trials : int
-        How many samples of tiles to draw for each share.
     **words
         Single options, by their names in `CompressOptions`.
 
@@ -76,14 +70,14 @@ def study_speed(
         `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
     """
     options = replace(options or CompressOptions(), **words)
-    _check(parts, repeats, trials)
+    _check(parts, repeats)
     # Matplotlib is loaded before the memory is planned, so that its bytes count as taken.
     require_matplotlib()
     check_folder(output, options.force)
     with atomic_folder(output, options.force) as folder:
         (name,) = scene_names([scene])
         with open_study_scene(scene, name, replace(options, method="paper"), progress) as studied:
-            found = SceneStudy.of(studied, _on_bench(studied, parts, repeats, trials))
+            found = SceneStudy.of(studied, _on_bench(studied, parts, repeats))
         if "presets" in parts:
             # These runs need the memory of the scene above, which is free by now.
             found = replace(found, experiments=(*found.experiments, presets(scene, options, progress)))
@@ -94,27 +88,24 @@ def study_speed(
 
 
 _INTRO = (
-    "The cost of less work: drawing views less exactly, scoring Gaussians from fewer views, measuring a part of the pixels, "
-    "and searching less. The Pareto front joins points that no other point beats in time and accuracy. Times are wall times "
+    "The cost of less work: drawing views less exactly, scoring Gaussians from fewer views, and searching less. "
+    " The Pareto front joins points that no other point beats in time and accuracy. Times are wall times "
     "of this run on the device named below. Everything but times, and the fronts that they decide, is equal in every run."
 )
 
 
-def _check(parts: Sequence[str], repeats: int, trials: int) -> None:
+def _check(parts: Sequence[str], repeats: int) -> None:
     unknown = [part for part in parts if part not in PARTS]
     if unknown or not parts:
         raise InputError(f"--parts {','.join(unknown or parts)}: expected one or more of {', '.join(PARTS)}")
-    for word, value in (("--repeats", repeats), ("--trials", trials)):
-        if value < 1:
-            raise InputError(f"{word} {value}: expected 1 or more")
+    if repeats < 1:
+        raise InputError(f"--repeats {repeats}: expected 1 or more")
 
 
-def _on_bench(studied: StudyScene, parts: Sequence[str], repeats: int, trials: int) -> list[Experiment]:
+def _on_bench(studied: StudyScene, parts: Sequence[str], repeats: int) -> list[Experiment]:
     makers: dict[str, Callable[[], list[Experiment]]] = {
         "drawing": lambda: [drawing(studied, repeats)],
         "scoring": lambda: scoring(studied),
-        "sampling": lambda: [sampling(studied, trials)],
-        "scaling": lambda: [scaling(studied, repeats)],
     }
     made: list[Experiment] = []
     for part, make in makers.items():

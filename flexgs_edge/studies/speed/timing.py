@@ -43,15 +43,6 @@ def stage_seconds(renderer: Renderer, scene: DeviceScene, cameras: Sequence[Came
         backend.profile = None
 
 
-def slope(x: Sequence[float], y: Sequence[float]) -> float:
-    """The exponent of y as a power of x, from the least-squares slope of their logarithms.
-
-    >>> round(slope([1, 2, 4, 8], [3, 6, 12, 24]), 6)
-    1.0
-    """
-    return float(np.polyfit(np.log(np.asarray(x, float)), np.log(np.asarray(y, float)), 1)[0])
-
-
 def median(values: Sequence[float]) -> float:
     """The median of at least one number."""
     return float(np.median(np.asarray(values)))

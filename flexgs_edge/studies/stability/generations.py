@@ -137,7 +137,7 @@ def _again(studied: StudyScene, source: SceneSource, size: int) -> Whole:
     found = kept_as_it_is(run, studied.bench, coder, studied.judge, settings_known=False)
     if found is not None:
         grid, _ = found
-        return Whole(grid, coded_size(grid, {}), 0.0, np.arange(grid.count), 0, True)
+        return Whole(grid, coded_size(grid, {}), 0.0, np.arange(grid.count), True)
     with walked(studied, source, studied.views.of(studied.views.train)) as path:
         return search(studied, path, target)
 

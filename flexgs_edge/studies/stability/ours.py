@@ -1,4 +1,4 @@
-"""Runs the method best for experiments: at a target, or at a known multiplier."""
+"""Runs the method best for experiments: at a target."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.codec.v2.container import coded_size
-from flexgs_edge.goals.target import MaxDrop, Measurement, Target
+from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.methods.best.grid_coder import GridCoder
@@ -39,8 +39,6 @@ class Whole:
         Squared error that a bit is worth.
     rows : np.ndarray
         [n] i64, rows of the scene that were kept, ascending.
-    pixels : int
-        Scored pixels of all poses. Squared errors are sums over them, so the multiplier grows with their number.
     reached : bool
         Whether the target holds.
     """
@@ -49,21 +47,12 @@ class Whole:
     size: int
     multiplier: float
     rows: np.ndarray
-    pixels: int
     reached: bool
 
     @property
     def source(self) -> MemorySource:
         """The decoded scene of its file."""
         return MemorySource(from_grid(self.grid), origin=self.grid.origin)
-
-
-class FixedSearch(GridSearch):
-    """A search that can also use a given multiplier. Where a search stops is partly chance, but a candidate is not."""
-
-    def at(self, multiplier: float) -> GridScene:
-        """The first candidate at a multiplier."""
-        return self._whole(multiplier, MaxDrop(1.0, "modelled drop"))[1]
 
 
 @contextmanager
@@ -82,11 +71,6 @@ def walked(
         yield rounds
 
 
-def scored_pixels(rounds: PruneRounds) -> int:
-    """Number of scored pixels in all poses of the rounds."""
-    return sum(camera.width * camera.height for camera in rounds.original.cameras)
-
-
 def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: Judge | None = None) -> Whole:
     """Search for a target; the closest candidate if none meets it."""
     judge = judge or studied.judge
@@ -97,25 +81,17 @@ def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: Judg
     return _whole(made, found.product, multiplier, found.reached)
 
 
-def whole_at(studied: StudyScene, rounds: PruneRounds, judge: Judge, multiplier: float) -> Whole:
-    """The candidate at a multiplier, without a search."""
-    made = _search(studied, rounds, judge, rounds.original.bench.renderer)
-    with studied.run.clock.stage("search"):
-        grid = made.at(multiplier)
-    return _whole(made, grid, multiplier, True)
-
-
-def _search(studied: StudyScene, rounds: PruneRounds, judge: Judge, renderer: Renderer) -> FixedSearch:
+def _search(studied: StudyScene, rounds: PruneRounds, judge: Judge, renderer: Renderer) -> GridSearch:
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=rounds.original.origin)) as scene:
             return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))
 
     options = replace(studied.run.options, refit=True)
-    made = grid_search(options, GridCoder(renderer), FixedSearch)(rounds, measure, lambda step: None)
-    assert isinstance(made, FixedSearch)
+    made = grid_search(options, GridCoder(renderer))(rounds, measure, lambda step: None)
+    assert isinstance(made, GridSearch)
     return made
 
 
-def _whole(made: FixedSearch, grid: GridScene, multiplier: float, reached: bool) -> Whole:
+def _whole(made: GridSearch, grid: GridScene, multiplier: float, reached: bool) -> Whole:
     rows = made.rounds.scene_rows(made.kept(multiplier).rows)
-    return Whole(grid, coded_size(grid, {}), multiplier, rows, scored_pixels(made.rounds), reached)
+    return Whole(grid, coded_size(grid, {}), multiplier, rows, reached)

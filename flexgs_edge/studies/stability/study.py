@@ -19,15 +19,12 @@ from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.page import study_page
-from flexgs_edge.studies.stability import bits, removal
+from flexgs_edge.studies.stability import removal
 from flexgs_edge.studies.stability.amounts import FULL, QUICK, Amounts
 from flexgs_edge.studies.stability.contenders import Contenders
 from flexgs_edge.studies.stability.generations import generations
 from flexgs_edge.studies.stability.heldout import held_out
-from flexgs_edge.studies.stability.moves import moves
 from flexgs_edge.studies.stability.ours import Whole, search, walked
-from flexgs_edge.studies.stability.searches import searches
-from flexgs_edge.studies.stability.strays import strays
 from flexgs_edge.studies.stability.unseen_poses import poses
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
 from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_scene
@@ -38,8 +35,8 @@ EFFORT = "fast"
 """Effort of all searches. The study makes many, and breaks show at every effort."""
 
 
-COPIES = 6
-"""Copies of the scene's planes that moving it holds at once: as they are, in float64, turned, in float32."""
+COPIES = 4
+"""Copies of the scene's planes that compressing it again holds at once."""
 
 
 @dataclass(frozen=True)
@@ -142,12 +139,6 @@ def _along_the_path(
     with part("results at the target"):
         ours = search(studied, path, studied.target)
         contenders = Contenders(studied, ours, guarded)
-    with part("bits"):
-        made += [
-            bits.rounding(studied, ours, amounts),
-            bits.groups(studied, ours, amounts),
-            strays(studied, ours, amounts),
-        ]
     with part("views"):
         made.append(removal.views(studied, amounts))
         if amounts.halves and (sides := removal.halves(studied, ours)) is not None:
@@ -156,12 +147,9 @@ def _along_the_path(
         made.append(held_out(studied, path, contenders, amounts))
     with part("poses"):
         made += poses(studied, contenders, amounts)
-    with part("moves"):
-        made.append(moves(studied, ours, amounts, place))
     with part("generations"):
         made.append(generations(studied, path, ours, amounts, place))
     # This comes last, because it prunes until nothing is left.
     with part("pruning"):
-        made.insert(3, removal.pruning(studied, path, amounts))
-    made.append(searches(EFFORT))
+        made.insert(0, removal.pruning(studied, path, amounts))
     return made
