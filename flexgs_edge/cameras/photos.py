@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from PIL import Image
 
 
-SUFFIXES = (".jpg", ".jpeg", ".png")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
+"""What photos may hold, whatever their names. Pillow hands PostScript to Ghostscript, which runs what a file says."""
 _SHOWN = 5
 # Errors of Pillow for damaged files, besides OSError (the base of its errors for truncated and unknown files).
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, OverflowError)
@@ -60,7 +62,7 @@ class Photos:
         Parameters
         ----------
         images_dir : path
-            Folder of .jpg, .jpeg or .png files.
+            Folder of JPEG, PNG, WebP or TIFF files.
         cameras : sequence of Camera
             Names are file names with or without extension.
         background : sequence of float, optional
@@ -155,7 +157,7 @@ class Photos:
             return _colours(self._arrays[index], self.background)
         path = self.paths[index]
         try:
-            with Image.open(path) as image:
+            with Image.open(path, formats=_FORMATS) as image:
                 image.load()
                 return _pixels(image, self.background, path)
         except InputError:  # a ValueError too, and said already what is wrong
@@ -208,13 +210,29 @@ def _match(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
 
 def photo_size(path: Path) -> Size:
     """Size in the header of a photo file; nothing is decoded."""
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=_FORMATS) as image:
             return image.size
+    except UnidentifiedImageError as error:
+        raise InputError(
+            f"{path}: not a photo that can be read: expected a whole JPEG, PNG, WebP or TIFF file, found {_content(path)}"
+        ) from error
     except (*_DAMAGED, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: not a photo that can be read ({error})") from error
+
+
+def _content(path: Path) -> str:
+    """The first bytes of a file, and the format that Pillow knows by them; no reader is started."""
+    from PIL import Image
+
+    with open(path, "rb") as file:
+        head = file.read(16)
+    Image.init()
+    tests = [(name, accept) for name, (_, accept) in Image.OPEN.items() if accept is not None and len(head) == 16]
+    name = next((name for name, accept in tests if accept(head) is True), None)
+    return f"{head!r} at its start" + (f", as {name} has" if name else "")
 
 
 def _scale_to(sizes: list[Size], paths: list[Path], cameras: Sequence[Camera]) -> tuple[list[Camera], str | None]:

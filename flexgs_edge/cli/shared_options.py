@@ -69,7 +69,7 @@ images_option = option(
     VIEWS,
     "--images",
     metavar="DIR",
-    help="Photos, named after the cameras. none: no photos. Default: images/ beside the scene.",
+    help="Photos (JPEG, PNG, WebP, TIFF), named after the cameras. none: no photos. Default: images/ beside the scene.",
 )
 holdout_option = option(
     VIEWS,

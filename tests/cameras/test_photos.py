@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import os
+import time
+import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -222,6 +226,69 @@ def test_a_text_file_named_like_a_photo(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_text("hello")
     with pytest.raises(InputError, match=r"a\.jpg: not a photo that can be read"):
         Photos.open(tmp_path, cameras("a"))
+
+
+POSTSCRIPT = b"""%!PS-Adobe-3.0 EPSF-3.0
+%%BoundingBox: 0 0 12 8
+(pwned) (w) file closefile
+showpage
+"""
+
+
+def others() -> dict[str, bytes]:
+    """A picture of 12x8 pixels in every format that Pillow writes here, but those of photos, and PostScript by hand."""
+    Image.init()
+    found = {"PostScript": POSTSCRIPT}
+    for kind in sorted(set(Image.SAVE) - {"JPEG", "MPO", "PNG", "WEBP", "TIFF"}):  # MPO: a JPEG with more behind it
+        for mode in ("RGB", "P", "1"):
+            # A kind of pixels that it has not, a writer that is not there; formats that Pillow will leave out.
+            with suppress(OSError, ValueError), warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)
+                out = io.BytesIO()
+                Image.new(mode, (12, 8)).save(out, kind)
+                found[kind] = out.getvalue()
+                break
+    return found
+
+
+@pytest.mark.parametrize("kind", others())
+def test_only_four_formats_are_photos(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By content, whatever the name; no other reader of Pillow is started, and so no other program."""
+
+    def started(*_: object, **__: object) -> None:
+        raise AssertionError("started")
+
+    for other, (_, accept) in Image.OPEN.items():
+        if other not in ("JPEG", "PNG", "WEBP", "TIFF"):
+            monkeypatch.setitem(Image.OPEN, other, (started, accept))  # type: ignore[arg-type]
+    monkeypatch.setattr("subprocess.Popen", started)
+    (tmp_path / "a.png").write_bytes(others()[kind])
+    start = time.process_time()
+    with pytest.raises(InputError, match=r"a\.png: .*expected a whole JPEG, PNG, WebP or TIFF file, found b'"):
+        Photos.open(tmp_path, cameras("a"))
+    assert time.process_time() - start < 1
+
+
+def test_what_a_photo_is_not_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(POSTSCRIPT)
+    with pytest.raises(InputError, match="found b'%!PS-Adobe-3.0 E' at its start, as EPS has"):
+        Photos.open(tmp_path, cameras("a"))
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".tif", ".TIFF"])
+def test_webp_and_tiff_are_photos(suffix: str, tmp_path: Path) -> None:
+    Image.fromarray(pixels()).save(tmp_path / f"a{suffix}", **({"lossless": True} if suffix == ".webp" else {}))
+    found = Photos.open(tmp_path, cameras("a")).load(0)
+    np.testing.assert_array_equal(found, pixels().astype(np.float32) / np.float32(255))
+
+
+def test_what_is_no_file_is_no_photo(tmp_path: Path) -> None:
+    """A pipe without a writer would be waited for."""
+    os.mkfifo(tmp_path / "a.png")
+    (tmp_path / "b.png").symlink_to("/dev/zero")
+    (tmp_path / "c.png").symlink_to(tmp_path / "c.png")
+    with pytest.raises(InputError, match="no photo for 3 of 3 cameras"):
+        Photos.open(tmp_path, cameras("a", "b", "c"))
 
 
 def test_nothing_is_decoded_when_opening(tmp_path: Path) -> None:
