@@ -114,6 +114,7 @@ Several scenes:
 @option(REACH, "--best-effort", is_flag=True, help="If the target cannot be met, write the closest result.")
 @shared_options.reading_options
 @shared_options.photos_options
+@shared_options.exposure_option
 @option(
     VIEWS,
     "--views-margin/--no-views-margin",

@@ -26,6 +26,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
 )
 @shared_options.report_option
 @shared_options.photos_options
+@shared_options.exposure_option
 @shared_options.reading_options
 @shared_options.drawing_options
 @shared_options.base_psnr_option

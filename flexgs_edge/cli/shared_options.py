@@ -71,6 +71,15 @@ images_option = option(
     metavar="DIR",
     help="Photos (JPEG, PNG, WebP, TIFF), named after the cameras. none: no photos. Default: images/ beside the scene.",
 )
+exposure_option = option(
+    VIEWS,
+    "--exposure",
+    type=click.Choice(["fit", "none"]),
+    default="fit",
+    show_default=True,
+    help="fit: bring photos of another exposure or white balance than the scene's to the scene's before they are compared. "
+    "none: compare them as they are.",
+)
 holdout_option = option(
     VIEWS,
     "--holdout",
@@ -187,7 +196,14 @@ run_options = stack(memory_option, device_option, write_options)
 photos_options = stack(cameras_option, images_option, holdout_option)
 """Options for cameras, photos and held-out views."""
 study_options = stack(
-    reading_options, photos_options, select_option, drawing_options, base_psnr_option, drop_invalid_option, run_options
+    reading_options,
+    photos_options,
+    exposure_option,
+    select_option,
+    drawing_options,
+    base_psnr_option,
+    drop_invalid_option,
+    run_options,
 )
 """Options of every study."""
 results_option = option(

@@ -43,7 +43,8 @@ class Measurement:
     Parameters
     ----------
     drop : float or None
-        Drop against the photos; `None` without photos.
+        Drop against the photos, where a view that gains counts as 0, and one that its photo cannot judge by its modelled
+        drop; `None` without photos.
     fidelity : float or None
         PSNR against the original's renders; `None` if they are identical.
     modelled_drop : float

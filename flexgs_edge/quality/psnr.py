@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from statistics import median
 
 import numpy as np
 
@@ -21,6 +22,8 @@ for pictures of any height."""
 _BANDS = ThreadPoolExecutor(BANDS, "bands")
 MSE_FLOOR = 1e-12
 """Smallest MSE in a difference of two PSNRs; smaller ones (120 dB) are beyond the precision of float32 renders."""
+BLIND_DROP = 1.0
+"""A photo that would not show a larger drop than this does not judge its view, dB: see `far_bases`."""
 
 
 def mse(image: np.ndarray, reference: np.ndarray) -> float:
@@ -113,6 +116,43 @@ def fidelity_for_drop(decibel: float, base_psnr: float = DEFAULT_BASE_PSNR) -> f
     """
     error = error_for_drop(decibel, base_psnr)
     return psnr(error) if error > 0.0 else None
+
+
+def contrast(image: np.ndarray) -> float:
+    """Mean squared error of a picture of one colour, the mean, against an [H, W, 3] image."""
+    return float(image.var(axis=(0, 1), dtype=np.float64).mean())
+
+
+def far_bases(
+    original_errors: Sequence[float], contrasts: Sequence[float], base_psnr: float = DEFAULT_BASE_PSNR
+) -> list[float | None]:
+    """For views that their photos cannot judge, the base of the modelled drop by which they count; `None` for the others.
+
+    A photo cannot judge if a picture of one colour would lose less than `BLIND_DROP` against it, or if an error that costs
+    this much there is larger than that of the original in the usual view.
+
+    Parameters
+    ----------
+    original_errors : sequence of float
+        Mean squared error of the original against the photo of each view.
+    contrasts : sequence of float
+        `contrast` of each photo.
+    base_psnr : float
+        Largest base, dB, and the base if most photos do not show what their cameras saw.
+
+    >>> [base and round(base, 1) for base in far_bases([1e-3, 1e-3, 2e-2, 1e-3], [3e-2, 3e-2, 3e-2, 1e-3])]
+    [None, None, 30.0, 30.0]
+    """
+    times = float(10.0 ** (BLIND_DROP / 10.0))
+    seen = [error * times < most for error, most in zip(original_errors, contrasts, strict=True)]
+    least = mse_of_psnr(base_psnr)
+    known = [error for error, clear in zip(original_errors, seen, strict=True) if clear]
+    usual = max(median(known), least) if 2 * len(known) > len(seen) else least
+    base = min(-10.0 * math.log10(usual), base_psnr)
+    return [
+        None if clear and error * (times - 1.0) <= usual else base
+        for error, clear in zip(original_errors, seen, strict=True)
+    ]
 
 
 def _shape(image: np.ndarray) -> str:

@@ -48,6 +48,10 @@ class ViewQuality:
         FLIP of the same three pairs, mean over the pixels.
     coverage : float
         Share of the picture that the original covers, 0 to 1: the mean over the pixels of its accumulated alpha.
+    far_base : float or None
+        Base of the modelled drop by which the view counts, dB, if the original is far from its photo (`far_bases`).
+    exposure : tuple of float or None
+        Stops of red, green and blue by which the photo was brightened to the exposure of the original.
     """
 
     name: str
@@ -64,6 +68,8 @@ class ViewQuality:
     flip_photo: float | None = None
     original_flip: float | None = None
     coverage: float = 1.0
+    far_base: float | None = None
+    exposure: tuple[float, ...] | None = None
 
     @property
     def covered_error(self) -> float | None:
@@ -96,6 +102,21 @@ class ViewQuality:
         if self.photo_error is None or self.original_error is None:
             return None
         return drop(self.original_error, self.photo_error)
+
+    @property
+    def loss(self) -> float | None:
+        """The drop that counts, dB: against the photo, or modelled if the original is far from it; `None` without a photo."""
+        return self.drop if self.far_base is None else modelled_drop(self.error, self.far_base)
+
+    @property
+    def ssim_loss(self) -> float | None:
+        """The SSIM lost that counts, as `loss`; at least 0."""
+        if self.original_ssim is None or self.ssim_photo is None or self.ssim_original is None:
+            return None
+        modelled = self.far_base is not None
+        return (
+            modelled_ssim_drop(1.0 - self.ssim_original) if modelled else max(self.original_ssim - self.ssim_photo, 0.0)
+        )
 
 
 @dataclass(frozen=True)
@@ -198,7 +219,7 @@ class Quality:
     @property
     def losses(self) -> list[float | None]:
         """The drop of each view that decides: against the photo, else modelled; `None` for views with hardly any coverage."""
-        drops = [view.drop for view in self.views]
+        drops = [view.loss for view in self.views]
         if None not in drops:
             return drops
         least = LEAST_COVERAGE * self.coverage if self.covered_decides else 0.0
@@ -210,9 +231,11 @@ class Quality:
 
     @property
     def ssim_drop(self) -> float | None:
-        """SSIM lost against the photos, mean over the views; modelled without photos; `None` if not measured."""
-        if self.original_ssim is not None and self.ssim_photo is not None:
-            return self.original_ssim - self.ssim_photo
+        """SSIM lost, mean over the views: `ViewQuality.ssim_loss`; modelled without photos; `None` if not measured."""
+        lost = [view.ssim_loss for view in self.views]
+        known = [loss for loss in lost if loss is not None]
+        if known:
+            return math.fsum(known) / len(known)
         if self.ssim_original is None:
             return None
         shared = 1.0 - self.ssim_original
@@ -250,7 +273,7 @@ class Quality:
 
         If covered figures decide, views with hardly any coverage come last (`LEAST_COVERAGE`).
         """
-        drops = [view.drop for view in self.views]
+        drops = [view.loss for view in self.views]
         if None not in drops:
             losses = [drop or 0.0 for drop in drops]
         elif not self.covered_decides:
@@ -298,7 +321,7 @@ class Quality:
 
     @property
     def worst(self) -> ViewQuality | None:
-        """The view with the largest drop (with photos) or the lowest fidelity (without); `None` without views."""
+        """The view with the largest loss (with photos) or the lowest fidelity (without); `None` without views."""
         return self.views[self.by_loss[0]] if self.views else None
 
 

@@ -85,6 +85,7 @@ def quality_json(quality: Quality) -> dict[str, Any]:
     worst, worst_flip = quality.worst, quality.worst_flip
     return {
         "drop": rounded(quality.drop),
+        "usual_drop": rounded(quality.usual_drop),
         "fidelity": rounded(quality.fidelity),
         "modelled_drop": rounded(quality.modelled_drop),
         "coverage": rounded(quality.coverage, 6),
@@ -127,6 +128,9 @@ def _view_json(view: ViewQuality) -> dict[str, Any]:
     return {
         "name": view.name,
         "drop": rounded(view.drop),
+        "loss": rounded(view.loss),
+        "far_base": rounded(view.far_base),
+        "exposure": None if view.exposure is None else [round(stops, 3) for stops in view.exposure],
         "fidelity": rounded(view.fidelity),
         "coverage": rounded(view.coverage, 6),
         "covered_fidelity": rounded(view.covered_fidelity),

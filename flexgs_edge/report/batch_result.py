@@ -131,7 +131,7 @@ def _quality(result: CompressResult) -> str:
     if result.decided_by == "fidelity":
         return f"fidelity {decibel(quality.fidelity)}{'' if quality.fidelity is None else ' dB'}{missed}"
     if quality.drop is not None and result.decided_by != "modelled drop":
-        return f"drop {decibel(quality.drop)} dB{missed}"
+        return f"drop {decibel(quality.usual_drop)} dB{missed}"
     return f"modelled drop {quality.modelled_drop:.3f} dB{missed}"
 
 

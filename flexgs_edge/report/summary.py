@@ -11,6 +11,10 @@ if TYPE_CHECKING:  # so that `trim` and `verify` start without kernels
     from flexgs_edge.quality.view_quality import Quality
 
 
+FAR_SHOWN = 4
+"""Names of views that one line shows."""
+
+
 def scene_lines(label: str, scene: SceneInfo) -> list[str]:
     """Describe an input scene and its notes."""
     lines = [line(label, f"{scene.path}: {scene.count} Gaussians, SH degree {scene.sh_degree}")]
@@ -57,6 +61,7 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
                 f"{decibel(quality.psnr)} dB{also} (mean, {where})",
             )
         )
+        lines += _photo_lines(quality)
     identical = f", {quality.identical} views identical" if quality.identical and quality.fidelity is not None else ""
     unit = "" if quality.fidelity is None else " dB"
     also = "" if quality.ssim_original is None else f", SSIM {similar(quality.ssim_original)}"
@@ -74,12 +79,41 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
     lines.append(line("covered", covered_words(quality)))
     worst = quality.worst
     if worst is not None:
-        drop = "" if worst.drop is None else f"drop {decibel(worst.drop)} dB, "
+        kind = "drop" if worst.far_base is None else "modelled drop"
+        drop = "" if worst.loss is None else f"{kind} {worst.loss:.3f} dB, "
         covered = f", {decibel(worst.covered_fidelity)}{unit} covered" if quality.covered_decides else ""
         lines.append(line("worst view", f"{worst.name}: {drop}fidelity {decibel(worst.fidelity)}{unit}{covered}"))
     seen = quality.worst_flip
     if seen is not None:
         lines.append(line("worst FLIP", f"{similar(seen.flip_original)} against the original's render, {seen.name}"))
+    return lines
+
+
+def _photo_lines(quality: Quality) -> list[str]:
+    """What was done to photos of another exposure, and which views do not count by their photo."""
+    lines, total = [], len(quality.views)
+    stops = [stop for view in quality.views for stop in view.exposure or ()]
+    if stops:
+        lines.append(
+            line(
+                "exposure",
+                f"{len(stops) // 3} of {total} photos were brought to the exposure of the original ({min(stops):+.2f} to "
+                f"{max(stops):+.2f} stops); --exposure none compares them as they are",
+            )
+        )
+    far = [view for view in quality.views if view.far_base is not None]
+    counted = quality.usual_drop or 0.0
+    if far:
+        shown = ", ".join(view.name for view in far[:FAR_SHOWN]) + (", ..." if len(far) > FAR_SHOWN else "")
+        lines.append(
+            line(
+                "counted",
+                f"{counted:.3f} dB. The original is far from its photo in {len(far)} of {total} views ({shown}), where a photo "
+                f"shows no loss, so these count by their modelled drop from {far[0].far_base:.1f} dB",
+            )
+        )
+    elif quality.drop is not None and counted - quality.drop >= 0.001:
+        lines.append(line("counted", f"{counted:.3f} dB: a view that gains counts as 0"))
     return lines
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from math import log2
 
 import numpy as np
 
@@ -13,8 +14,9 @@ from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import Covered, Measurement, Target
 from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.quality.exposure import exposure_gains, with_gains
 from flexgs_edge.quality.flip import flip_bytes, flip_maps, flips
-from flexgs_edge.quality.psnr import mse
+from flexgs_edge.quality.psnr import contrast, far_bases, mse
 from flexgs_edge.quality.ssim import ssim_bytes, ssims
 from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view, with_flip
 from flexgs_edge.render.device_scene import DeviceScene
@@ -59,7 +61,7 @@ class Judge:
     indices : sequence of int
         The views to compare.
     with_photos : bool
-        Also compare with the photos, if there are any.
+        Also compare with the photos, if there are any: at the exposure of the original, unless the run says otherwise.
     base_psnr : float
         PSNR of the original that the modelled drop starts from, dB.
     reports : bool
@@ -82,6 +84,7 @@ class Judge:
         self.source = source
         self.cameras = views.of(indices)
         self.photos = views.photos if with_photos else None
+        self._fits_exposure = views.fits_exposure
         self.covered_decides = views.photos is None
         self._automatic = views.cameras_from == AUTO_CAMERAS
         self.base_psnr = base_psnr
@@ -90,7 +93,9 @@ class Judge:
         self._budget = budget
         self._kept: dict[tuple[str, int], np.ndarray] = {}
         self._away: dict[tuple[str, int], np.ndarray] = {}
+        self._gains: list[np.ndarray | None] = []
         self._original_error: list[float] = []
+        self._far_bases: list[float | None] = []
         self._original_ssim: dict[int, float | None] = {}
         self._coverage: list[float] = []
         self._coarse_error: dict[int, float] = {}
@@ -117,7 +122,8 @@ class Judge:
         InputError
             When no view sees any Gaussian.
         """
-        self._original_error, self._original_ssim, self._coverage = [], {}, []
+        self._original_error, self._original_ssim, self._coverage, self._gains = [], {}, [], []
+        contrasts: list[float] = []
         self._coarse_error, self._known = {}, {}
         cameras = progress.track(self.renderer.in_turn(scene, self.cameras), "drawing the original", len(self.cameras))
         for i, camera in enumerate(cameras):
@@ -126,9 +132,12 @@ class Judge:
             self._coverage.append(self.renderer.drawn_coverage())
             self._keep(("original", i), image)
             if self.photos is not None:
-                photo = _planes(self.photos.load(self.indices[i]))
+                photo, gains = self._fitted(i, image)
+                self._gains.append(gains)
+                contrasts.append(contrast(photo))
                 self._original_error.append(mse(image, photo))
                 self._keep(("photo", i), photo)
+        self._far_bases = far_bases(self._original_error, contrasts, self.base_psnr)
         if not any(self._coverage):
             raise self._nothing_seen()
 
@@ -169,12 +178,22 @@ class Judge:
         self._reserved -= freed
         self._budget.give(freed)
 
-    def photos_that_decide(self, target: Target) -> Callable[[int], np.ndarray] | None:
-        """What loads the photo of a view, by its place, if the drop against photos decides; else `None`."""
-        photos = self.photos
-        if photos is None or target.figure != "drop":
+    def photos_that_decide(self, target: Target) -> Callable[[int, np.ndarray], np.ndarray] | None:
+        """What loads the photo of a view, by its place and a coarse render of the original; `None` if no photos decide.
+
+        The render has every n-th pixel of the view, and so has the photo, which is fitted to its exposure.
+        """
+        if self.photos is None or target.figure != "drop":
             return None
-        return lambda place: photos.load(self.indices[place])
+        return lambda place, image: self._fitted(place, image)[0]
+
+    def _fitted(self, i: int, image: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Photo of view `indices[i]` at the exposure of `image`, a render of the original, and its gains if it was changed."""
+        assert self.photos is not None
+        step = -(-self.cameras[i].height // image.shape[0])
+        photo = _planes(self.photos.load(self.indices[i])[::step, ::step])
+        gains = exposure_gains(image, photo) if self._fits_exposure else None
+        return with_gains(photo, gains), gains
 
     @property
     def kept(self) -> int:
@@ -224,6 +243,7 @@ class Judge:
             found.append(compare_view(name, image, *references, error, similar, ssims, lpips, coverage, flips))
             if ssims:
                 self._original_ssim[i] = found[-1].original_ssim
+            found[-1] = self._as_counted(found[-1], i)
         made = None if known is None else known.made
         if known is None and self.made is not None:
             made = self.made.quality(scene)
@@ -240,8 +260,17 @@ class Judge:
         few = [camera.every(ESTIMATE_STEP) for camera in self.cameras]
         for i, camera in enumerate(self.renderer.in_turn(scene, few)):
             image = self.renderer.render(scene, camera)
-            found.append(compare_view(self.cameras[i].name, image, *self._coarse(i), coverage=self._coverage[i]))
+            view = compare_view(self.cameras[i].name, image, *self._coarse(i), coverage=self._coverage[i])
+            found.append(self._as_counted(view, i))
         return Quality(tuple(found), self.base_psnr, self.covered_decides)
+
+    def _as_counted(self, view: ViewQuality, i: int) -> ViewQuality:
+        """The quality of view `indices[i]` with what its photo is worth."""
+        if self.photos is None:
+            return view
+        gains = self._gains[i]
+        exposure = None if gains is None else tuple(log2(gain) for gain in gains)
+        return replace(view, far_base=self._far_bases[i], exposure=exposure)
 
     def _coarse(self, i: int) -> tuple[np.ndarray, np.ndarray | None, float | None]:
         """References of an estimate: original and photo at its pixels, and the mean squared error between them."""
@@ -323,7 +352,7 @@ class Judge:
         if self.photos is None:
             return None
         held = self._held(("photo", i))
-        return self.photos.load(self.indices[i]) if held is None else held
+        return with_gains(self.photos.load(self.indices[i]), self._gains[i]) if held is None else held
 
 
 def _coarse_pixels(camera: Camera) -> int:
@@ -348,7 +377,8 @@ def measurement_of(quality: Quality) -> Measurement:
 
 def _means(quality: Quality) -> Measurement:
     covered = Covered(quality.covered_fidelity, quality.covered_modelled_drop) if quality.covered_decides else None
-    return Measurement(quality.drop, quality.fidelity, quality.modelled_drop, covered=covered)
+    drop = None if quality.drop is None else quality.usual_drop
+    return Measurement(drop, quality.fidelity, quality.modelled_drop, covered=covered)
 
 
 def _planes(image: np.ndarray) -> np.ndarray:

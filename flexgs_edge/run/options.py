@@ -41,6 +41,7 @@ EFFORT_WORDS = tuple(REFINE_STEPS)
 RETIRED_EFFORTS = {"thorough": "max"}
 """Words for `--effort` that are still accepted, and what they became."""
 SELECTS = ("test", "train")
+EXPOSURES = ("fit", "none")
 PROMISES = ("whole", "mean")
 NONE = "none"
 """Lifts a bound of the promise."""
@@ -93,6 +94,8 @@ class ViewOptions:
         Use the poses of cameras with lens distortion, without their photos. Default: raise `InputError` for them.
     images : str, optional
         Folder of photos, or `none`. Default: `images/` beside the scene.
+    exposure : {"fit", "none"}
+        Fit the photos to the exposure and white balance of the original, where they differ, or not. Default: `fit`.
     holdout : int
         Hold out every n-th view in order of name; 0 holds out none.
     resolution : int
@@ -125,6 +128,7 @@ class ViewOptions:
     cameras: str | None = None
     ignore_distortion: bool = False
     images: str | None = None
+    exposure: str = "fit"
     holdout: int = DEFAULT_HOLDOUT
     resolution: int = MAX_VIEW_WIDTH
     near: float | None = None
@@ -143,6 +147,8 @@ class ViewOptions:
         if self.resolution < 1:
             raise InputError(f"--resolution {self.resolution}: expected a width of at least 1 pixel")
         split_views(0, self.holdout)
+        if self.exposure not in EXPOSURES:
+            raise InputError(f"--exposure {self.exposure}: expected {' or '.join(EXPOSURES)}")
         if self.near is not None and not 0.0 < self.near < float("inf"):
             raise InputError(f"--near {self.near:g}: expected a distance above 0 in scene units")
         if self.background is not None and not all(0.0 <= c <= 1.0 for c in self.background):

@@ -45,6 +45,8 @@ class ViewSet:
         How automatic cameras were placed, and which views were scaled or lost their distortion.
     near : float or None
         Largest near plane that does not cut off what automatic views show, scene units.
+    fits_exposure : bool
+        Photos are fitted to the exposure of the original before they are compared.
     """
 
     cameras: list[Camera]
@@ -55,6 +57,7 @@ class ViewSet:
     images_path: Path | None
     notes: tuple[str, ...] = ()
     near: float | None = None
+    fits_exposure: bool = True
 
     def of(self, indices: Sequence[int]) -> list[Camera]:
         """The cameras at `indices`."""
@@ -167,7 +170,8 @@ def find_views(
     else:
         cameras, notes = photos.cameras, notes + photos.notes
     train, held_out = split_views(len(cameras), options.holdout)
-    return ViewSet(list(cameras), photos, train, held_out, os.fspath(place), images, notes)
+    fits = options.exposure == "fit"
+    return ViewSet(list(cameras), photos, train, held_out, os.fspath(place), images, notes, fits_exposure=fits)
 
 
 def _automatic_views(options: ViewOptions, source: SceneSource) -> ViewSet:

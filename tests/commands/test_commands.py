@@ -94,9 +94,10 @@ def test_json_has_every_documented_key_and_no_infinity(done: tuple[Path, Compres
         "decision_views", "search", "sensitivity", "quality", "quality_views", "scores_saved", "run",
     }  # fmt: skip
     assert set(record["quality"]) == {
-        "drop", "fidelity", "modelled_drop", "base_psnr", "psnr", "original_psnr", "ssim", "original_ssim", "ssim_fidelity",
-        "lpips", "original_lpips", "lpips_fidelity", "flip", "original_flip", "flip_fidelity", "worst_flip",
-        "coverage", "covered_fidelity", "covered_modelled_drop", "covered_decides", "identical_views", "made", "worst", "views",
+        "drop", "usual_drop", "fidelity", "modelled_drop", "base_psnr", "psnr", "original_psnr", "ssim",
+        "original_ssim", "ssim_fidelity", "lpips", "original_lpips", "lpips_fidelity", "flip", "original_flip",
+        "flip_fidelity", "worst_flip", "coverage", "covered_fidelity", "covered_modelled_drop", "covered_decides",
+        "identical_views", "made", "worst", "views",
     }  # fmt: skip
     assert set(record["run"]) == {
         "seconds", "stages", "startup_ms", "compile_ms", "memory_limit", "peak_memory", "peak_anonymous", "scratch", "device",

@@ -102,7 +102,9 @@ def test_a_size_holds_whatever_the_promise_says() -> None:
 def test_with_a_size_the_worst_view_follows_a_mean_where_gains_count_as_nothing() -> None:
     views = (ViewQuality("a", 1e-4, 2e-3, 1e-3), ViewQuality("b", 1e-4, 0.9e-3, 1e-3))
     found = measurement_of(Quality(views))
-    assert found.usual == pytest.approx(10 * math.log10(2) / 2) and (found.drop or 9) < (found.usual or 0)
+    assert (
+        found.drop == found.usual == pytest.approx(10 * math.log10(2) / 2) and (Quality(views).drop or 9) < found.usual
+    )
     assert WorstView("drop").allowed(found) == pytest.approx(1.5 * found.usual + 0.2)  # type: ignore[operator]
     without = measurement_of(Quality(tuple(ViewQuality(view.name, view.error) for view in views)))
     assert without.usual == pytest.approx(modelled_drop(1e-4))

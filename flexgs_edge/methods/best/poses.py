@@ -57,7 +57,7 @@ def scored_poses(
     source: SceneSource,
     covered_decides: bool = False,
     deciding: Sequence[Camera] = (),
-    photo: Callable[[int], np.ndarray] | None = None,
+    photo: Callable[[int, np.ndarray], np.ndarray] | None = None,
     lost: Sequence[int] = (),
 ) -> ScoredPoses:
     """Choose as many poses as the effort scores. Each next pose is the one that adds most to what those before it see.
@@ -81,7 +81,7 @@ def scored_poses(
     deciding : sequence of Camera
         The views that decide.
     photo : callable, optional
-        The photo of one of these ([H, W, 3] f32) by its place, if photos decide. Poses then get pixels by
+        The photo of one of these ([H, W, 3] f32) by its place and a render, if photos decide. Poses then get pixels by
         `view_weights`. Default: alike.
     lost : sequence of int
         Places, among the views that decide, of those that lost too much, in one search or in several. They get poses beside
@@ -106,7 +106,7 @@ def scored_poses(
     errors = None
     if photo is not None:
         drop = options.max_drop or DEFAULT_MAX_DROP
-        errors = KnownErrors(deciding, base_errors(renderer, source, deciding, photo), drop)
+        errors = KnownErrors(deciding, base_errors(renderer, source, deciding, photo, options.base_psnr), drop)
     if not fine:
         steps = sampling_steps(chosen, source.count * plan.pixels)
         if errors is not None:

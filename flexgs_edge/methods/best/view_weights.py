@@ -20,7 +20,8 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.nearness import squared_distances
 from flexgs_edge.cameras.order import in_picture
-from flexgs_edge.quality.psnr import mse
+from flexgs_edge.constants import DEFAULT_BASE_PSNR
+from flexgs_edge.quality.psnr import contrast, far_bases, mse, mse_of_psnr
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.original import Original
@@ -76,9 +77,13 @@ class KnownErrors:
 
 
 def base_errors(
-    renderer: Renderer, source: SceneSource, cameras: Sequence[Camera], photo: Callable[[int], np.ndarray]
+    renderer: Renderer,
+    source: SceneSource,
+    cameras: Sequence[Camera],
+    photo: Callable[[int, np.ndarray], np.ndarray],
+    base_psnr: float = DEFAULT_BASE_PSNR,
 ) -> np.ndarray:
-    """[n] f64, mean squared error of the original against the photo of each view.
+    """[n] f64, mean squared error of the original against the photo of each view, or that of `far_bases`.
 
     Parameters
     ----------
@@ -89,16 +94,21 @@ def base_errors(
     cameras : sequence of Camera
         The views that decide.
     photo : callable
-        The photo of a view by its place in `cameras`, [H, W, 3] f32 in [0, 1].
+        The photo of a view, [H, W, 3] f32 in [0, 1], by its place in `cameras` and a render of this size.
+    base_psnr : float
+        As for `far_bases`.
     """
-    errors = []
+    errors, contrasts = [], []
     with renderer.load(source) as scene:
         coarse = [camera.every(STEP) for camera in cameras]
         for place, camera in enumerate(renderer.in_turn(scene, coarse)):
             image = np.clip(renderer.render(scene, camera), 0.0, 1.0)
-            errors.append(mse(image, np.ascontiguousarray(photo(place)[::STEP, ::STEP])))
+            seen = photo(place, image)
+            errors.append(mse(image, seen))
+            contrasts.append(contrast(seen))
     renderer.release()
-    return np.array(errors)
+    bases = far_bases(errors, contrasts, base_psnr)
+    return np.array([error if base is None else mse_of_psnr(base) for error, base in zip(errors, bases, strict=True)])
 
 
 def view_weights(slopes: np.ndarray, rare: np.ndarray) -> np.ndarray:

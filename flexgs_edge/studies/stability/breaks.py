@@ -61,8 +61,8 @@ class Outcome:
 
 def view_loss(studied: StudyScene, view: ViewQuality) -> float:
     """Loss of one view in dB, in the figure that decides: its drop against the photo, or its modelled drop."""
-    if studied.plan.figure == "drop" and view.drop is not None:
-        return view.drop
+    if studied.plan.figure == "drop" and view.loss is not None:
+        return view.loss
     error = view.covered_error or 0.0 if studied.judge.covered_decides else view.error
     return modelled_drop(error, studied.run.options.base_psnr)
 
