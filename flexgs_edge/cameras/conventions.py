@@ -49,6 +49,8 @@ class Convention:
             rotation, center = rotation.T, camera.translation
         if self.opengl:
             rotation = matrix_product(_OPENGL, rotation)
+        if self.opengl and self.inverse:  # the reader's change of axes stood on the other side
+            rotation, center = matrix_product(rotation, _OPENGL), matrix_product(_OPENGL, center)
         rotation = matrix_product(rotation, self.turn.T)
         mirrored = float(np.linalg.det(self.turn)) < 0
         if mirrored:  # a mirrored world is the mirrored picture of a turned camera

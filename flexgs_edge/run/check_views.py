@@ -40,7 +40,7 @@ SURE = 3.0
 """Other photos fit better if they do so by this many standard errors of the mean difference."""
 MOST_SHIFT = 8
 """Photos of cameras up to so many places away are tried where a view has the wrong one."""
-TURN_VIEWS, TURN_ROWS = 6, 1 << 28
+TURN_VIEWS, TURN_ROWS = 4, 1 << 28
 """Other conventions are tried on at most so many views, and on fewer where these would draw more Gaussians than this."""
 
 _Pictures = list[np.ndarray]

@@ -27,25 +27,37 @@ _SAMPLE_VIEWS = 64
 
 
 def frame_doubts(views: ViewSet, scene: CheckedScene) -> tuple[str, ...]:
-    """Warn if a scene that was turned from another frame lies behind the cameras that belong to it.
+    """Warn if the scene lies behind the cameras, or out of sight of most: a sample of positions and cameras tells.
 
-    Files of phones often break the rule of their format. A sample of positions and cameras tells. Cameras around a scene tell
-    nothing, as it lies before some of them either way.
+    Files of phones often break the rule of their format. Cameras around a scene tell nothing of that, as it lies before some of
+    them either way.
     """
-    if scene.frame == RDF or views.cameras_from == AUTO_CAMERAS:
+    if views.cameras_from == AUTO_CAMERAS:
         return ()
     means = some_positions(scene.source, _SAMPLE_ROWS)
     behind = np.ones(means.shape[1], bool)
-    for camera in views.cameras[:: -(-len(views.cameras) // _SAMPLE_VIEWS)]:
-        behind &= product(camera.rotation[2:], means)[0] + camera.translation[2] <= 0
+    cameras = views.cameras[:: -(-len(views.cameras) // _SAMPLE_VIEWS)]
+    blind = 0
+    for camera in cameras:
+        x, y, z = product(camera.rotation, means) + camera.translation[:, None]
+        behind &= z <= 0
+        depth = np.maximum(z, 0.0)
+        across, down = camera.fx * x + camera.cx * depth, camera.fy * y + camera.cy * depth
+        inside = (across > 0) & (across < camera.width * depth) & (down > 0) & (down < camera.height * depth)
+        blind += not inside.any()
     share = float(behind.mean())
-    if share <= BEHIND_SHARE:
-        return ()
-    return (
-        f"{100 * share:.0f} % of the Gaussians lie behind all {len(views.cameras)} cameras of {views.cameras_from}. The file's "
-        f"axes were read as {scene.frame.name} (x, y, z) and turned into RDF. Give the right ones with --frame, such as "
-        "--frame RDF for a file in the cameras' own frame.",
-    )
+    if scene.frame != RDF and share > BEHIND_SHARE:
+        return (
+            f"{100 * share:.0f} % of the Gaussians lie behind all {len(views.cameras)} cameras of {views.cameras_from}. The "
+            f"file's axes were read as {scene.frame.name} (x, y, z) and turned into RDF. Give the right ones with --frame, such as "
+            "--frame RDF for a file in the cameras' own frame.",
+        )
+    if 2 * blind > len(cameras):
+        return (
+            f"{blind} of {len(cameras)} compared cameras of {views.cameras_from} have nothing of the scene in sight: they look "
+            "away from it or are far from it. Are the cameras in the scene's frame?",
+        )
+    return ()
 
 
 def doubts(
