@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -112,6 +113,19 @@ class Camera:
     def moved(self, origin: np.ndarray) -> Camera:
         """The same view for a scene whose positions are relative to `origin` ([3] f64, world)."""
         return replace(self, translation=self.translation + product(self.rotation, np.asarray(origin, np.float64)))
+
+
+def distinct_names(names: Sequence[str]) -> list[str]:
+    """Append `#` and the place in the list to every name that appears more than once, since names order the views.
+
+    >>> distinct_names(["a", "b", "a"])
+    ['a#0', 'b', 'a#2']
+    """
+    result = list(names)
+    while len(set(result)) < len(result):
+        count = Counter(result)
+        result = [f"{name}#{place}" if count[name] > 1 else name for place, name in enumerate(result)]
+    return result
 
 
 def split_views(count: int, holdout: int = DEFAULT_HOLDOUT) -> tuple[list[int], list[int]]:

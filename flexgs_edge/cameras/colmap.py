@@ -6,14 +6,14 @@ import math
 import os
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 import numpy as np
 
-from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.json_values import MAX_SIDE, check_names
+from flexgs_edge.cameras.camera import Camera, distinct_names
+from flexgs_edge.cameras.json_values import MAX_SIDE
 from flexgs_edge.errors import FormatError, InputError
 
 
@@ -64,6 +64,7 @@ UNDISTORT = (
 """Command that makes a pinhole model and matching photos from a distorted one; `{model}` is the folder."""
 QUATERNION_TOLERANCE = 1e-2
 """Largest |norm - 1| of a quaternion. COLMAP normalises what it reads; other writers keep 4 digits or more."""
+MODEL_FOLDERS = ("0", "sparse/0", "sparse", "colmap/sparse/0")
 _NAME_LIMIT = 4096
 _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I4d3dI")
@@ -99,8 +100,8 @@ class _Image:
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder of cameras and images: `folder` itself, or its `0`, `sparse/0` or `sparse`; None if there is none."""
-    for place in (folder, folder / "0", folder / "sparse" / "0", folder / "sparse"):
+    """The folder of cameras and images: `folder` itself, or one of MODEL_FOLDERS in it; None if there is none."""
+    for place in (folder, *(folder / inside for inside in MODEL_FOLDERS)):
         if any((place / f"{stem}{kind}").is_file() for stem in ("images", "cameras") for kind in _KINDS):
             return place
     return None
@@ -143,8 +144,11 @@ def read_colmap(path: str | os.PathLike[str], ignore_distortion: bool = False) -
     images = _read(image_file, _binary_images if kind == ".bin" else _text_images)
     if not images:
         raise FormatError(f"{image_file}: the model has no images")
-    check_names(image_file, [image.name for image in images], "images", "name")
-    return [_camera(image_file, lens_file, image, lenses, ignore_distortion) for image in images]
+    names = distinct_names([image.name for image in images])
+    return [
+        replace(_camera(image_file, lens_file, image, lenses, ignore_distortion), name=name)
+        for image, name in zip(images, names)
+    ]
 
 
 def _read(path: Path, parse: Callable[[Path, BinaryIO, int], _T]) -> _T:

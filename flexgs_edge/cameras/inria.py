@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.json_values import Entry, check_names, kind, load_json
+from flexgs_edge.cameras.camera import Camera, distinct_names
+from flexgs_edge.cameras.json_values import Entry, kind, load_json
 from flexgs_edge.errors import FormatError
 from flexgs_edge.small_matrices import product
 
@@ -18,6 +19,7 @@ def read_inria(path: str | os.PathLike[str]) -> list[Camera]:
     """Read INRIA's cameras.json in the file's order.
 
     The file has no principal point, so it is the middle of the image: (W - 1) / 2, with integer pixel centres.
+    The reference program drops folders and what follows the first dot from names: equal ones get `#` and their place.
 
     Raises
     ------
@@ -38,8 +40,8 @@ def cameras_of_list(path: Path, entries: Any) -> list[Camera]:
     if not entries:
         raise FormatError(f"{path}: the list of cameras is empty")
     cameras = [_camera(Entry(f"{path}: camera {index}", entry)) for index, entry in enumerate(entries)]
-    check_names(path, [camera.name for camera in cameras], "cameras", "img_name")
-    return cameras
+    names = distinct_names([camera.name for camera in cameras])
+    return [replace(camera, name=name) for camera, name in zip(cameras, names)]
 
 
 def inria_json(cameras: Sequence[Camera]) -> str:

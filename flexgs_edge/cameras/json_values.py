@@ -141,16 +141,6 @@ class Entry:
             raise self.fail(key, "a rotation (determinant 1)", "a reflection (determinant -1)")
 
 
-def check_names(path: Path, names: list[str], entries: str, key: str) -> None:
-    """Raise `FormatError` if a name appears twice, since names find photos and order the views."""
-    first: dict[str, int] = {}
-    for index, name in enumerate(names):
-        if first.setdefault(name, index) != index:
-            raise FormatError(
-                f"{path}: {entries} {first[name]} and {index}: {key} {name!r} appears twice; names must differ"
-            )
-
-
 def _shape(value: Any, depth: int) -> tuple[int, ...] | None:
     """Shape of lists nested `depth` levels deep; None if they are deeper or ragged, which NumPy would raise on."""
     if not isinstance(value, list):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,11 +37,11 @@ class Photos:
     Attributes
     ----------
     cameras : list of Camera
-        In the given order, scaled to the photos (and to the width limit).
+        Those with photos, in the given order, scaled to the photos (and to the width limit).
     paths : list of Path
         The photo of each camera (for messages, where they are arrays).
     notes : tuple of str
-        Notes on photos that were scaled, for the summary.
+        Notes on photos that were scaled or are missing, for the summary.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class Photos:
         background: Sequence[float] = (0.0, 0.0, 0.0),
         max_width: int | None = None,
     ) -> Photos:
-        """Find the photo of every camera, and check its size.
+        """Find the photo of every camera, and check its size. A few cameras without photos are left out (see `notes`).
 
         Parameters
         ----------
@@ -73,12 +74,20 @@ class Photos:
         Raises
         ------
         InputError
-            If the folder or a photo is missing or damaged, or sizes do not match the cameras.
+            If the folder or half of the photos are missing, a photo is damaged, photos cannot be told apart, or sizes do
+            not match the cameras.
         """
         folder = Path(images_dir)
         _refuse_bent(folder, cameras)
-        paths = _match(folder, cameras)
-        return cls._of_sizes(paths, [photo_size(path) for path in paths], cameras, background, max_width)
+        found = _match(folder, cameras)
+        kept = [(path, camera) for path, camera in zip(found, cameras) if path is not None]
+        paths, cameras = [path for path, _ in kept], [camera for _, camera in kept]
+        photos = cls._of_sizes(paths, [photo_size(path) for path in paths], cameras, background, max_width)
+        if len(kept) < len(found):
+            photos.notes += (
+                f"{len(found) - len(kept)} of {len(found)} cameras left out: {folder} has no photo of them",
+            )
+        return photos
 
     @classmethod
     def of_arrays(
@@ -175,35 +184,51 @@ def _refuse_bent(place: Path, cameras: Sequence[Camera]) -> None:
         )
 
 
-def _match(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
-    """The photo of each camera: by file name, by name without extension, or by the camera's name without extension."""
+def _match(folder: Path, cameras: Sequence[Camera]) -> list[Path | None]:
+    """The photo of each camera, by name: as it is, without extension, or up to the first dot.
+
+    None where there is none, for less than half of the cameras.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of photos")
     deep = any("/" in camera.name for camera in cameras)
     by_name: dict[str, Path] = {}
     by_stem: dict[str, list[Path]] = {}
+    by_start: dict[str, list[Path]] = {}  # the reference program keeps of a name what precedes its first dot
     for path in sorted(folder.rglob("*") if deep else folder.iterdir()):
         if path.suffix.lower() in SUFFIXES and path.is_file():
             name = path.relative_to(folder).as_posix()
             by_name[name] = path
             by_stem.setdefault(name[: -len(path.suffix)], []).append(path)
-    found: list[Path] = []
+            by_start.setdefault(name.split(".")[0], []).append(path)
+    found: list[Path | None] = []
     missing: list[str] = []
     for camera in cameras:
         name = camera.name
         stem = name[: -len(Path(name).suffix)] if Path(name).suffix.lower() in SUFFIXES else name
-        choice = [by_name[name]] if name in by_name else by_stem.get(name) or by_stem.get(stem) or []
+        choice = (
+            [by_name[name]] if name in by_name else by_stem.get(name) or by_stem.get(stem) or by_start.get(name) or []
+        )
         if len(choice) > 1:
             names = ", ".join(path.name for path in choice)
-            raise InputError(f"{folder}: camera {name!r} has more than one photo ({names}); keep one")
-        found.extend(choice)
+            raise InputError(
+                f"{folder}: camera {name!r} has more than one photo ({names}); keep one, or use --images none"
+            )
+        found.append(choice[0] if choice else None)
         if not choice:
             missing.append(name)
-    if missing:
+    twins = [name for name in missing if re.search(r"#[0-9]+$", name)]
+    if twins:
+        raise InputError(
+            f"{folder}: the photos of {len(twins)} of {len(cameras)} cameras cannot be told apart, since their file gives some "
+            f"the same name: {', '.join(twins[:_SHOWN])}; use --images none to take the poses alone, or cameras whose names "
+            "differ (transforms.json or a COLMAP model of the same frame)"
+        )
+    if 2 * len(missing) >= len(cameras):
         more = f" and {len(missing) - _SHOWN} more" if len(missing) > _SHOWN else ""
         raise InputError(
             f"{folder}: no photo for {len(missing)} of {len(cameras)} cameras: {', '.join(missing[:_SHOWN])}{more}; "
-            f"expected files named after the cameras, ending in {', '.join(SUFFIXES)}"
+            f"expected files named after the cameras, ending in {', '.join(SUFFIXES)}; --images none leaves photos out"
         )
     return found
 

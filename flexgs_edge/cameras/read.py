@@ -12,6 +12,8 @@ from flexgs_edge.cameras.json_values import load_json
 from flexgs_edge.cameras.transforms import cameras_of_frames
 from flexgs_edge.errors import InputError
 
+NERF_SYNTHETIC = "transforms_train.json"
+JSON_NAMES = ("cameras.json", "transforms.json", NERF_SYNTHETIC)
 SUPPORTED = (
     "INRIA's cameras.json (any .json file with a list of cameras), NeRF's or nerfstudio's transforms.json, "
     "a COLMAP model (cameras and images, .bin or .txt), or a folder that holds one of them"
@@ -19,9 +21,9 @@ SUPPORTED = (
 
 
 def find_cameras(folder: str | os.PathLike[str]) -> Path | None:
-    """The camera file in a folder: cameras.json, else transforms.json, else the folder of a COLMAP model, else None."""
+    """The camera file in a folder: one of JSON_NAMES in their order, else the folder of a COLMAP model, else None."""
     place = Path(folder)
-    for name in ("cameras.json", "transforms.json"):
+    for name in JSON_NAMES:
         if (place / name).is_file():
             return place / name
     return find_model(place)
@@ -34,7 +36,7 @@ def read_cameras(path: str | os.PathLike[str], ignore_distortion: bool = False) 
     ----------
     path : path
         INRIA's cameras.json, a transforms.json, a file of a COLMAP model, or a folder that holds one of these (a COLMAP
-        model also in its `sparse/0`).
+        model also in its `sparse/0` or `colmap/sparse/0`).
     ignore_distortion : bool, optional
         Take the poses of distorted lenses; such cameras cannot be compared with photos.
 
@@ -50,7 +52,7 @@ def read_cameras(path: str | os.PathLike[str], ignore_distortion: bool = False) 
         found = find_cameras(place)
         if found is None:
             raise InputError(
-                f"{path}: no cameras.json, transforms.json or COLMAP model in this folder; supported: {SUPPORTED}"
+                f"{path}: no {', '.join(JSON_NAMES)} or COLMAP model in this folder; supported: {SUPPORTED}"
             )
         place = found
     if not place.exists():

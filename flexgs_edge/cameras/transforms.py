@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.json_values import Entry, check_names, kind, load_json
+from flexgs_edge.cameras.camera import Camera, distinct_names
+from flexgs_edge.cameras.json_values import Entry, kind, load_json
 from flexgs_edge.cameras.photos import SUFFIXES, photo_size
 from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.small_matrices import product
@@ -70,8 +70,7 @@ def cameras_of_frames(path: Path, value: Any, ignore_distortion: bool = False) -
         raise top.fail("frames", "a list of frames", "an empty one" if frames == [] else kind(frames))
     entries = [Entry(f"{path}: frame {index}", frame) for index, frame in enumerate(frames)]
     paths = [_file_path(entry) for entry in entries]
-    names = _without_shared_folder(paths)
-    check_names(path, names, "frames", "file_path")
+    names = distinct_names(_without_shared_folder(paths))
     frame_change = _Similarity.beside(path, top)
     return [
         _camera(path, top, entry, file_path, name, frame_change, ignore_distortion)

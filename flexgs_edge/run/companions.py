@@ -10,7 +10,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from flexgs_edge.cameras.read import find_cameras
+from flexgs_edge.cameras.read import NERF_SYNTHETIC, find_cameras
 from flexgs_edge.io.model_folder import Companions, find_companions
 
 LOG = logging.getLogger("flexgs_edge")
@@ -22,6 +22,8 @@ def companions_of(path: str | os.PathLike[str]) -> Companions:
     if found.cameras is None:
         folder = Path(path) if Path(path).is_dir() else Path(path).parent
         found = replace(found, cameras=find_cameras(folder))
+        if found.images is None and found.cameras == folder / NERF_SYNTHETIC and (folder / "train").is_dir():
+            found = replace(found, images=folder / "train")
     for what, place in (("cameras", found.cameras), ("photos", found.images)):
         if place is not None:
             LOG.info("found %s beside the scene: %s", what, place)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from flexgs_edge.cameras.auto import automatic_rig
-from flexgs_edge.cameras.camera import Camera, limit_width, split_views
+from flexgs_edge.cameras.camera import Camera, distinct_names, limit_width, split_views
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.errors import InputError
@@ -83,17 +83,15 @@ class GivenViews:
     cameras_from: str = MEMORY
 
     def in_order_of_name(self) -> GivenViews:
-        """Return a copy with cameras, and their photos, in order of name. Raises `InputError` if two names are equal."""
+        """Return a copy with cameras, and their photos, in order of name; equal names are made distinct."""
         cameras, images = self.cameras or (), self.images
         if not cameras:
             raise InputError("cameras: expected at least one camera, found none")
-        order = sorted(range(len(cameras)), key=lambda i: cameras[i].name)
-        for i, j in zip(order, order[1:]):
-            if cameras[i].name == cameras[j].name:
-                raise InputError(f"cameras: {i} and {j} are both called {cameras[i].name!r}; names must differ")
+        names = distinct_names([camera.name for camera in cameras])
+        order = sorted(range(len(cameras)), key=lambda i: names[i])
         if images is not None and len(images) == len(order):  # `Photos` reports another number
             images = [images[i] for i in order]
-        return replace(self, cameras=[cameras[i] for i in order], images=images)
+        return replace(self, cameras=[replace(cameras[i], name=names[i]) for i in order], images=images)
 
 
 def find_views(

@@ -145,7 +145,10 @@ def test_the_sample_by_file_and_by_folder() -> None:
         ("cameras.xml", "unknown kind of camera file; supported: INRIA"),
         ("half", "expected cameras and images, both .bin or both .txt; found cameras.bin only"),
         ("half/cameras.bin", "found cameras.bin only"),
-        ("empty", "no cameras.json, transforms.json or COLMAP model in this folder; supported: INRIA"),
+        (
+            "empty",
+            "no cameras.json, transforms.json, transforms_train.json or COLMAP model in this folder; supported: INRIA",
+        ),
     ],
 )
 def test_paths_that_are_no_cameras(tmp_path: Path, name: str, words: str) -> None:

@@ -95,7 +95,6 @@ NAN, INF = float("nan"), float("inf")
         ({"rotation": np.zeros((3, 3)).tolist()}, r"rotation: expected an orthonormal matrix .* off by 1"),
         ({"rotation": (np.array(TURN) * 1.002).tolist()}, "rotation: expected an orthonormal matrix .* off by 0.004"),
         ({"rotation": (-np.array(TURN)).tolist()}, "rotation: expected a rotation .* found a reflection"),
-        ({"img_name": "a"}, "cameras 0 and 1: img_name 'a' appears twice"),
     ],
 )
 def test_a_bad_value_is_named_with_its_place(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
@@ -127,6 +126,19 @@ def test_files_that_are_no_list_of_cameras(tmp_path: Path, text: bytes, words: s
     with pytest.raises(FormatError, match=words) as caught:
         read_inria(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("names", "read"),
+    [
+        (["r_0", "r_1", "r_0"], ["r_0#0", "r_0#2", "r_1"]),
+        (["a", "a", "a#1"], ["a#0", "a#1#1", "a#1#2"]),
+        (["a", "b", "a#1"], ["a", "a#1", "b"]),
+    ],
+)
+def test_repeated_names_get_their_place_in_the_file(tmp_path: Path, names: list[str], read: list[str]) -> None:
+    path = write(tmp_path / "cameras.json", [entry(name) for name in names])
+    assert [camera.name for camera in read_cameras(path)] == read
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:

@@ -63,7 +63,7 @@ def test_poses_come_back(tmp_path: Path, text: bool) -> None:
         )  # fmt: skip
 
 
-@pytest.mark.parametrize("place", [".", "0", "sparse", "sparse/0"])
+@pytest.mark.parametrize("place", [".", "0", "sparse", "sparse/0", "colmap/sparse/0"])
 @pytest.mark.parametrize("text", [False, True])
 def test_the_model_is_found_in_its_folders(tmp_path: Path, place: str, text: bool) -> None:
     write_colmap(tmp_path / place, *colmap_records(cameras()), text)
@@ -168,7 +168,6 @@ NAN = float("nan")
         ([LENS], [], "the model has no images"),
         ([LENS], [(*IMAGE[:3], 2, "a")], "image 'a': camera 2 is not in cameras"),
         ([LENS, LENS], [IMAGE], "a second camera 1"),
-        ([LENS], [IMAGE, IMAGE], "images 0 and 1: name 'left/a.jpg' appears twice"),
         ([(1, "PINHOLE", 0, 48, LENS[4])], [IMAGE], "size: expected 1 to 65535 pixels a side, found 0x48"),
         ([(1, "PINHOLE", 64, 70000, LENS[4])], [IMAGE], "size: .* found 64x70000"),
         (
@@ -258,3 +257,8 @@ def test_a_real_model(scenes_dir: Path) -> None:
         np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12)
     # Neighbouring photos of one room: the cameras stand near each other and look the same way.
     assert np.linalg.norm(read[0].center - read[1].center) < 5 and read[0].rotation[2] @ read[1].rotation[2] > 0.5
+
+
+def test_repeated_images_get_their_place(tmp_path: Path) -> None:
+    write_colmap(tmp_path, [LENS], [IMAGE, IMAGE])
+    assert [camera.name for camera in read_cameras(tmp_path)] == ["left/a.jpg#0", "left/a.jpg#1"]

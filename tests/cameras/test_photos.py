@@ -67,6 +67,28 @@ def test_missing_photos_are_counted_and_named(tmp_path: Path) -> None:
         Photos.open(tmp_path / "none", cameras("a"))
 
 
+def test_a_few_cameras_without_photos_are_left_out(tmp_path: Path) -> None:
+    for name in "acd":
+        save(tmp_path / f"{name}.png")
+    photos = Photos.open(tmp_path, cameras(*"abcd"))
+    assert [camera.name for camera in photos.cameras] == ["a", "c", "d"] and len(photos) == 3
+    assert photos.notes == (f"1 of 4 cameras left out: {tmp_path} has no photo of them",)
+    with pytest.raises(InputError, match="no photo for 2 of 4 cameras: b, e.*--images none"):
+        Photos.open(tmp_path, cameras(*"abce"))
+
+
+def test_names_cut_at_their_first_dot(tmp_path: Path) -> None:
+    save(tmp_path / "a.b.jpg")
+    assert Photos.open(tmp_path, cameras("a")).paths[0].name == "a.b.jpg"
+    save(tmp_path / "a.c.jpg")
+    with pytest.raises(
+        InputError, match=r"'a' has more than one photo \(a.b.jpg, a.c.jpg\); keep one, or use --images none"
+    ):
+        Photos.open(tmp_path, cameras("a"))
+    with pytest.raises(InputError, match="photos of 2 of 3 cameras cannot be told apart.*a#0, a#2; use --images none"):
+        Photos.open(tmp_path, cameras("a#0", "a.b.jpg", "a#2"))
+
+
 def test_two_photos_for_one_camera(tmp_path: Path) -> None:
     save(tmp_path / "a.png")
     save(tmp_path / "a.jpg")

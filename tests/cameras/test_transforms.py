@@ -216,7 +216,6 @@ NAN = float("nan")
     ("changes", "words"),
     [
         ({"file_path": 3}, "frame 1: file_path: expected a name, found 3"),
-        ({"file_path": "images/a.jpg"}, "frames 0 and 1: file_path 'a.jpg' appears twice"),
         ({"transform_matrix": None}, "frame 1: transform_matrix: expected 3 x 4 finite numbers"),
         ({"transform_matrix": MATRIX[:2]}, "transform_matrix: expected 3 x 4 finite numbers"),
         ({"transform_matrix": [*MATRIX[:3], [0, 0, 0, 2]]}, "expected 0 0 0 1 as the last row, found 0 0 0 2"),
@@ -284,3 +283,8 @@ def test_a_real_file_with_distortion(scenes_dir: Path) -> None:
         ours = by_name[Path(theirs.name).stem]
         np.testing.assert_allclose(ours.center, theirs.center, atol=1e-4)
         np.testing.assert_allclose(ours.rotation, theirs.rotation, atol=1e-4)
+
+
+def test_repeated_photos_get_the_place_of_their_frame(tmp_path: Path) -> None:
+    path = write(tmp_path, document(frame(), frame("images/b.jpg"), frame()))
+    assert [camera.name for camera in read_transforms(path)] == ["a.jpg#0", "b.jpg", "a.jpg#2"]
