@@ -46,15 +46,21 @@ def exposure_gains(image: np.ndarray, photo: np.ndarray) -> np.ndarray | None:
     if not squares.all():
         return None
     gains: np.ndarray = (target * light).sum(axis=(0, 1)) / squares
-    fitted = mse(image, with_gains(photo, gains))
+    fitted = mse(image, with_gains(photo, gains, image))
     return gains if drop(fitted, mse(image, photo)) >= LEAST_GAIN else None
 
 
-def with_gains(photo: np.ndarray, gains: np.ndarray | None) -> np.ndarray:
-    """The photo times its gains, [H, W, 3] f32, sRGB in [0, 1], channel by channel in memory; `None` leaves it as it is."""
+def with_gains(photo: np.ndarray, gains: np.ndarray | None, image: np.ndarray) -> np.ndarray:
+    """The photo times its gains, [H, W, 3] f32, sRGB in [0, 1], channel by channel in memory; `None` leaves it as it is.
+
+    A clipped value tells only that there was at least so much light. Where `image`, the original, is brighter, it stands.
+    """
     if gains is None:
         return photo
-    planes = [_encoded(_linear(photo[..., c]) * gains[c]) for c in range(3)]
+    planes = []
+    for c, gain in enumerate(gains):
+        fitted = _encoded(_linear(photo[..., c]) * gain)
+        planes.append(np.where(photo[..., c] >= BRIGHT, np.maximum(fitted, image[..., c]), fitted))
     return np.stack(planes).transpose(1, 2, 0)
 
 

@@ -193,7 +193,7 @@ class Judge:
         step = -(-self.cameras[i].height // image.shape[0])
         photo = _planes(self.photos.load(self.indices[i])[::step, ::step])
         gains = exposure_gains(image, photo) if self._fits_exposure else None
-        return with_gains(photo, gains), gains
+        return with_gains(photo, gains, image), gains
 
     @property
     def kept(self) -> int:
@@ -235,7 +235,8 @@ class Judge:
         images = self.bench.images(scene, self.cameras)
         for i, image in enumerate(progress.track(images, "comparing views", len(self.cameras))):
             error, similar = self._original_error[i] if self.photos is not None else None, self._original_ssim.get(i)
-            references = self.original(i), self._photo(i)
+            original = self.original(i)
+            references = original, self._photo(i, original)
             if known is not None:
                 found.append(with_flip(known.views[i], image, *references, self._flips))
                 continue
@@ -282,7 +283,7 @@ class Judge:
         if self.photos is None:
             return original, None, None
         if photo is None:
-            found = self._photo(i)
+            found = self._photo(i, self.original(i))
             assert found is not None
             photo = _planes(found[every])
             self._keep(("coarse photo", i), photo)
@@ -318,8 +319,8 @@ class Judge:
 
     def images(self, scene: DeviceScene, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Render of `scene`, render of the original and photo of view `indices[i]`, each [H, W, 3] f32 in [0, 1]."""
-        image = _planes(self.renderer.render(scene, self.cameras[i]))
-        return image, _planes(self.original(i)), self._photo(i)
+        image, original = _planes(self.renderer.render(scene, self.cameras[i])), _planes(self.original(i))
+        return image, original, self._photo(i, original)
 
     def _keep(self, key: tuple[str, int], image: np.ndarray) -> None:
         if image.nbytes <= self._left:
@@ -348,11 +349,12 @@ class Judge:
             self._keep(("original", i), held)
         return held
 
-    def _photo(self, i: int) -> np.ndarray | None:
+    def _photo(self, i: int, original: np.ndarray) -> np.ndarray | None:
+        """The photo of view `indices[i]` as it is compared; `original` is the original's render."""
         if self.photos is None:
             return None
         held = self._held(("photo", i))
-        return with_gains(self.photos.load(self.indices[i]), self._gains[i]) if held is None else held
+        return with_gains(self.photos.load(self.indices[i]), self._gains[i], original) if held is None else held
 
 
 def _coarse_pixels(camera: Camera) -> int:

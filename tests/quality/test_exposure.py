@@ -17,13 +17,13 @@ STOPS = np.array([-1.0, -0.4, 0.7])
 def picture(noise: float) -> tuple[np.ndarray, np.ndarray]:
     """A render and its even photo, [96, 128, 3]."""
     y, x = np.mgrid[:96, :128][..., None]
-    image = np.float32(0.5) + np.float32(0.3) * np.sin(x / 9 + y / 7 + np.arange(3)).astype(np.float32)
+    image = np.float32(0.4) + np.float32(0.3) * np.sin(x / 9 + y / 7 + np.arange(3)).astype(np.float32)
     return image, np.clip(image + noise * RNG.standard_normal(image.shape), 0, 1).astype(np.float32)
 
 
 def exposed(photo: np.ndarray, stops: np.ndarray) -> np.ndarray:
     """The photo in 8 bits at another exposure and white balance."""
-    return np.round(with_gains(photo, 2.0**stops) * 255).astype(np.float32) / 255
+    return np.round(with_gains(photo, 2.0**stops, np.zeros_like(photo)) * 255).astype(np.float32) / 255
 
 
 @pytest.mark.parametrize("stops", [STOPS, -0.7 * STOPS, np.full(3, 0.7)])
@@ -32,15 +32,23 @@ def test_a_fitted_photo_is_the_even_one(stops: np.ndarray) -> None:
     taken = exposed(photo, stops)
     gains = exposure_gains(image, taken)
     assert gains is not None and np.log2(gains) == pytest.approx(-stops, abs=0.06)
-    even, fitted = mse(image, photo), mse(image, with_gains(taken, gains))
+    even, fitted = mse(image, photo), mse(image, with_gains(taken, gains, image))
     assert drop(even, fitted) == pytest.approx(0.0, abs=0.2) and mse(image, taken) > 4 * even
+
+
+def test_a_clipped_pixel_tells_only_that_there_was_as_much_light() -> None:
+    image, photo = picture(0.0)
+    taken = exposed(photo, np.full(3, 1.5))
+    assert (taken == 1.0).mean() > 0.1
+    fitted = with_gains(taken, exposure_gains(image, taken), image)
+    assert mse(image, fitted) < 1e-5 and mse(0.5 * image, fitted) == pytest.approx(mse(0.5 * image, photo), rel=0.01)
 
 
 def test_even_and_clipped_photos_stay_as_they_are() -> None:
     image, photo = picture(0.03)
     assert exposure_gains(image, photo) is None
     assert exposure_gains(image, exposed(photo, np.full(3, 0.05))) is None
-    assert with_gains(photo, None) is photo
+    assert with_gains(photo, None, image) is photo
     for flat in (np.zeros_like(photo), np.ones_like(photo)):
         assert exposure_gains(image, flat) is None
     assert exposure_gains(image, (photo > 0.5).astype(np.float32)) is None  # a mask
