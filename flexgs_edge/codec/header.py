@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from flexgs_edge.errors import FormatError, InputError, brief
+from flexgs_edge.scene.contraction import LARGEST, Contraction
 
 PREAMBLE_BYTES = 36
 MAX_COUNT = 2**32 - 1
@@ -74,6 +75,19 @@ def checked_origin(value: object) -> tuple[float, float, float]:
     if isinstance(value, list) and len(value) == 3 and all(type(v) is float and math.isfinite(v) for v in value):
         return (value[0], value[1], value[2])
     raise HeaderError(f"origin: wanted three finite numbers with a decimal point, got {shown(value)}")
+
+
+def checked_contraction(value: object) -> Contraction:
+    """Check the contraction of a header; raises `HeaderError`."""
+    if isinstance(value, dict) and sorted(value) == ["centre", "radius"] and isinstance(value["centre"], list):
+        numbers = [*value["centre"], value["radius"]]
+        known = len(numbers) == 4 and all(type(number) is float and abs(number) <= LARGEST for number in numbers)
+        if known and value["radius"] >= 1 / LARGEST:
+            return Contraction.from_json(value)
+    raise HeaderError(
+        "contraction: wanted an object with centre (three numbers with a decimal point, within +-2^126) and radius (2^-126 to "
+        f"2^126), got {shown(value)}"
+    )
 
 
 def shown(value: object) -> str:

@@ -25,7 +25,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.packed.bitspec import BitSpec
-from flexgs_edge.packed.quantize import quantize_scene
+from flexgs_edge.packed.quantize import far_contraction, quantize_scene
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import ViewResult
 from flexgs_edge.run.inputs import scene_info
@@ -145,7 +145,8 @@ def _coded(run: Run[ViewOptions], path: str | os.PathLike[str]) -> Iterator[Path
     source = run.source
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="flexgs-view-")))
-        has_sh = nonzero_sh(source)
-        quantized = quantize_scene(source, np.flatnonzero(has_sh), np.flatnonzero(~has_sh), FINE)
+        has_sh, contraction = nonzero_sh(source), far_contraction(source)
+        rows = np.flatnonzero(has_sh), np.flatnonzero(~has_sh)
+        quantized = quantize_scene(source, *rows, FINE, contraction=contraction)
         write_container(folder / "scene.fgs", quantized, {})
         yield folder / "scene.fgs"

@@ -10,6 +10,7 @@ import numpy as np
 
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
+from flexgs_edge.scene.contraction import Contraction
 
 POSITION_BITS = 21
 """A scene is at most 2^21 cells wide on each axis; three coordinates fill a Morton index of 63 bits."""
@@ -37,6 +38,8 @@ class StepSizes:
         Of the luma of SH coefficients, one for each degree from 1.
     chroma : float, optional
         Factor by which the steps of the two chroma planes are larger.
+    contraction : Contraction, optional
+        Of the positions that the grid holds. Default: they are not contracted.
     """
 
     position: float
@@ -46,9 +49,10 @@ class StepSizes:
     dc: float
     sh: tuple[float, ...] = ()
     chroma: float = 1.5
+    contraction: Contraction | None = None
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
+        for name, value in self._numbers().items():
             numbers = value if name == "sh" else (value,)
             with np.errstate(over="ignore"):  # a file may contain 1e300
                 rounded = tuple(float(np.float32(number)) for number in numbers)
@@ -62,12 +66,17 @@ class StepSizes:
 
     def to_json(self) -> dict[str, Any]:
         """The fields as JSON values."""
-        return {**asdict(self), "sh": list(self.sh)}
+        contraction = {} if self.contraction is None else {"contraction": self.contraction.to_json()}
+        return {**self._numbers(), "sh": list(self.sh), **contraction}
+
+    def _numbers(self) -> dict[str, Any]:
+        return {name: value for name, value in asdict(self).items() if name != "contraction"}
 
     @classmethod
     def from_json(cls, record: Mapping[str, Any]) -> StepSizes:
         """Inverse of `to_json`."""
-        return cls(**{**record, "sh": tuple(record["sh"])})
+        contraction = Contraction.from_json(record["contraction"]) if "contraction" in record else None
+        return cls(**{**record, "sh": tuple(record["sh"]), "contraction": contraction})
 
     def colour(self, luma: float) -> np.ndarray:
         """[3] f32, the steps of Y, Co and Cg, given the step of luma."""

@@ -65,7 +65,7 @@ def to_grid(
     top = int(degrees.max(initial=0))
     if len(steps.sh) < top or planes["sh_rest"].shape[0] < 3 * sh_rest_count(top):
         raise InputError(f"SH degree {top} asked for: expected a step and coefficients for each degree up to it")
-    position, order = _along_curve(planes["means"], steps.position, layer, storage)
+    position, order = _along_curve(planes["means"], steps, layer, storage)
     scale, rotation, dc = (storage.empty((3, count), np.int32) for _ in range(3))
     opacity = storage.empty((count,), np.int32)
     ordered = OrderedPlanes(planes, order, storage)
@@ -99,14 +99,15 @@ def to_grid(
 
 
 def _along_curve(
-    means: np.ndarray, step: float, layer: np.ndarray | None, storage: Storage
+    means: np.ndarray, steps: StepSizes, layer: np.ndarray | None, storage: Storage
 ) -> tuple[np.ndarray, np.ndarray]:
     """Position codes [3, n] i32 in their new order, and that order [n] i64: by layer, then along the Morton curve."""
     count = means.shape[1]
     codes = storage.empty((3, count), np.int32)
     low, high = np.full((3, 1), CODE_LIMIT), np.full((3, 1), -CODE_LIMIT)
     for part, (values,) in read_ahead(count, means):
-        some = _codes("means", values, step, np.arange(part.start, part.stop))
+        values = values if steps.contraction is None else steps.contraction.contract(values)
+        some = _codes("means", values, steps.position, np.arange(part.start, part.stop))
         put_rows(codes, part, some)
         low, high = (
             np.minimum(low, some.min(axis=1, keepdims=True)),
@@ -114,7 +115,7 @@ def _along_curve(
         )
     if count and (high - low).max() >= 1 << POSITION_BITS:
         raise InputError(
-            f"means: the scene is {int((high - low).max())} position steps of {step:g} wide, expected less than "
+            f"means: the scene is {int((high - low).max())} position steps of {steps.position:g} wide, expected less than "
             f"2^{POSITION_BITS}: take a larger step or remove far outliers"
         )
     keys = storage.empty((count,), np.uint64)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.grid.grid_scene import GridScene, row_places
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.memory.rows import put_rows, read_ahead, read_rows
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
@@ -51,7 +52,7 @@ def from_grid(
 
     All operations are float32, each is rounded once, and none is fused. A value is code * step. Quaternions have
     w = sqrt(max(0, 1 - ((x*x + y*y) + z*z))). Colours take h = Cg * 0.5, c = Co * 0.5, t = Y - h, and then
-    red = t + c, green = Y + h, blue = t - c.
+    red = t + c, green = Y + h, blue = t - c. Positions are then expanded, if they are contracted (`Contraction`).
 
     Returns
     -------
@@ -60,7 +61,7 @@ def from_grid(
     """
     steps = grid.step_sizes
     makers = {
-        "means": lambda: _values(_part(grid.position, rows), steps.position),
+        "means": lambda: _means(_part(grid.position, rows), steps),
         "sh_dc": lambda: _rgb(_part(grid.dc, rows)[:, None], steps.colour(steps.dc))[:, 0],
         "sh_rest": lambda: _sh_rest(grid, rows),
         "opacity_logits": lambda: _values(_part(grid.opacity, rows)[None], steps.opacity),
@@ -112,6 +113,11 @@ def _spread_bands(grid: GridScene, degrees: np.ndarray, bands: Sequence[np.ndarr
 def _values(codes: np.ndarray, step: float) -> np.ndarray:
     values: np.ndarray = codes.astype(np.float32) * np.float32(step)
     return values
+
+
+def _means(codes: np.ndarray, steps: StepSizes) -> np.ndarray:
+    means = _values(codes, steps.position)
+    return means if steps.contraction is None else steps.contraction.expand(means)
 
 
 def _quats(xyz: np.ndarray) -> np.ndarray:

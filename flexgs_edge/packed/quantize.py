@@ -20,16 +20,17 @@ from flexgs_edge.constants import GROUP_ROWS
 from flexgs_edge.errors import InputError
 from flexgs_edge.packed.bitpack import pack_into, plane_bytes, unpack
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.scene.contraction import LARGEST, Contraction, densest
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.rotations import normalize_quats
+from flexgs_edge.scene.sample import SAMPLE_ROWS, some_positions
 
 if TYPE_CHECKING:
     from flexgs_edge.scene.source import SceneSource
 
 
-LARGEST = 2.0**126
-"""Largest magnitude that can be coded. A range is at most twice as wide and still fits float32, so nothing
-overflows."""
+FINER = 128
+"""Within the radius of a contraction, steps of 16 bits are this many times shorter than Gaussians are wide."""
 SMALLEST_STEP = 2.0**-126
 """Smallest normal float32. A range with a finer step counts as constant, since devices may flush the step to zero."""
 
@@ -112,6 +113,8 @@ class QuantizedScene:
         [3] f64, world: positions are relative to it.
     arrays : dict
         One `QuantizedArray` for each scene field; `sh_rest` has `sh_count` rows, the others have `count`.
+    contraction : Contraction, optional
+        Of the positions that the codes stand for. Default: they are not contracted.
     """
 
     count: int
@@ -119,6 +122,7 @@ class QuantizedScene:
     sh_degree: int
     origin: np.ndarray
     arrays: dict[str, QuantizedArray]
+    contraction: Contraction | None = None
 
     @property
     def bits(self) -> BitSpec:
@@ -232,6 +236,7 @@ def quantize_scene(
     bits: BitSpec = PAPER,
     groups: int | None = None,
     chunk_rows: int = 65536,
+    contraction: Contraction | None = None,
 ) -> QuantizedScene:
     """Quantize the chosen rows of a scene; the result does not depend on `chunk_rows`.
 
@@ -247,13 +252,18 @@ def quantize_scene(
         Groups per channel of every array; by default about one for 512 rows. 1 is plain round to nearest.
     chunk_rows : int
         Rows held in memory at a time, beside the packed result.
+    contraction : Contraction, optional
+        From `far_contraction`. Rows are then stored by distance, so that few groups hold near and far ones.
     """
     if source.sh_degree == 0 and len(rows_with_sh):
         rows_without_sh = np.sort(np.concatenate([rows_with_sh, rows_without_sh]))
         rows_with_sh = rows_with_sh[:0]
     count, sh_count = len(rows_with_sh) + len(rows_without_sh), len(rows_with_sh)
     degree = source.sh_degree if sh_count else 0
-    blocks = (rows_with_sh, rows_without_sh)
+    blocks = [rows_with_sh, rows_without_sh]
+    if contraction is not None:
+        with_sh, without_sh = (_by_distance(source, rows, contraction, chunk_rows) for rows in blocks)
+        blocks = [*with_sh[::-1], *without_sh]
     layouts = {field.name: (field.width(degree), bits.of(field.name)) for field in FIELDS}  # channels and bits
     rest = {"sh_rest": layouts.pop("sh_rest")}
 
@@ -261,6 +271,8 @@ def quantize_scene(
         planes = _read_blocks(source, blocks, part, names)
         if "quats" in planes:
             planes["quats"] = normalize_quats(planes["quats"])
+        if "means" in planes and contraction is not None:
+            planes["means"] = contraction.contract(planes["means"]).astype(np.float32)
         return planes
 
     try:
@@ -269,7 +281,41 @@ def quantize_scene(
     except InputError as error:
         raise InputError(f"{source.name}: {error}") from None
     arrays = {field.name: arrays[field.name] for field in FIELDS}
-    return QuantizedScene(count, sh_count, degree, np.array(source.origin, np.float64), arrays)
+    return QuantizedScene(count, sh_count, degree, np.array(source.origin, np.float64), arrays, contraction)
+
+
+def far_contraction(source: SceneSource, chunk_rows: int = 65536) -> Contraction | None:
+    """The contraction of a scene whose far Gaussians would take the precision of the others; None if it needs none.
+
+    It needs one if a step of 16 bits over the whole scene is longer than half of its Gaussians are wide (their middle axis). The
+    radius is the longest at which steps are `FINER` times shorter than that.
+
+    Parameters
+    ----------
+    source : SceneSource
+        A checked scene.
+    chunk_rows : int
+        Rows held in memory at a time.
+    """
+    low, high, widths, every = np.full(3, np.inf), np.full(3, -np.inf), [], max(source.count // SAMPLE_ROWS, 1)
+    for rows in source.chunks(chunk_rows):
+        planes = source.read(rows, ["means", "log_scales"])
+        low, high = np.minimum(low, planes["means"].min(axis=1)), np.maximum(high, planes["means"].max(axis=1))
+        widths.append(np.median(planes["log_scales"][:, -rows.start % every :: every], axis=0))
+    reach = 65535 * float(np.exp(np.median(np.concatenate(widths).astype(np.float64))))
+    if not (high - low).max() > reach:
+        return None
+    x, y, z = densest(some_positions(source) - source.origin[:, None]).tolist()
+    return Contraction((x, y, z), min(max(reach / (2 * FINER), 1 / LARGEST), LARGEST))
+
+
+def _by_distance(source: SceneSource, rows: np.ndarray, contraction: Contraction, chunk_rows: int) -> list[np.ndarray]:
+    """Split ascending rows by octaves of their distance from the centre, near ones first."""
+    octaves = np.empty(len(rows), np.int64)
+    for start in range(0, len(rows), chunk_rows):
+        part = slice(start, start + chunk_rows)
+        octaves[part] = contraction.octaves(source.read(rows[part], ["means"])["means"])
+    return [rows[octaves == octave] for octave in np.unique(octaves)]
 
 
 def _read_blocks(

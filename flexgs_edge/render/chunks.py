@@ -192,6 +192,7 @@ class QuantizedPlanes:
         self.count, self.sh_count, self.sh_degree = quantized.count, quantized.sh_count, quantized.sh_degree
         self.origin = quantized.origin
         self.bounds: dict[int, ChunkBounds] = {}  # no bounds: every view draws all chunks
+        self._contraction = quantized.contraction
         self._arrays: dict[str, tuple[QuantizedArray, Any, Any, Any]] = {}
         for name, array in quantized.arrays.items():
             # Three spare bytes: the kernel reads each code through a window of three bytes.
@@ -216,6 +217,9 @@ class QuantizedPlanes:
                 "dequantize", size, array.count, array.groups, array.bits, array.planes.shape[1], start, rows, stride,
                 codes, low, step, plane,
             )  # fmt: skip
+            if name == "means" and self._contraction is not None:
+                with self.backend.mapped(plane) as host:
+                    host[:, :rows] = self._contraction.expand(host[:, :rows])
 
     def close(self) -> None:
         """Free codes and ranges."""

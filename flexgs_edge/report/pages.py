@@ -168,7 +168,7 @@ def _compress_facts(result: CompressResult) -> list[tuple[str, object]]:
     facts.append(("kept", f"{kept} (prune rate {result.prune_rate:g}, SH rate {result.sh_rate:g})"))
     facts.append(("method", result.method + (f", score {result.score}" if result.score else "")))
     if result.steps is not None:
-        steps = (f"{name} {value:.3g}" for name, value in result.steps.items() if not isinstance(value, list))
+        steps = (f"{name} {value:.3g}" for name, value in result.steps.items() if isinstance(value, float))
         facts.append(("grid steps", ", ".join(steps)))
     elif result.bits:
         found = " (found by sensitivity)" if result.sensitivity else ""

@@ -207,7 +207,7 @@ class CompressResult:
                 line("format", f".{self.format}, SH degree {self.file_sh_degree}, rounded as that format does")
             )
         elif self.steps is not None:
-            steps = (f"{name} {value:.3g}" for name, value in self.steps.items() if not isinstance(value, list))
+            steps = (f"{name} {value:.3g}" for name, value in self.steps.items() if isinstance(value, float))
             lines.append(line("grid steps", ", ".join(steps)))
         else:
             bits = " ".join(f"{name}={bits}" for name, bits in self.bits.items())

@@ -10,7 +10,8 @@ import numpy as np
 
 from flexgs_edge.codec.open_fgs import file_version
 from flexgs_edge.codec.v2.container import write_grid
-from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
+from flexgs_edge.grid.position_grid import position_grid
+from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.report.material import Live
 from flexgs_edge.run.inputs import Options
@@ -85,6 +86,5 @@ def fine_steps(means: np.ndarray, log_scales: np.ndarray, sh_degree: int) -> Ste
     sh_degree : int
     """
     small = float(np.exp(np.percentile(log_scales.max(axis=0), 10)))
-    widest = float(np.ptp(means, axis=1).max())
-    position = max(small / 16, widest / 2 ** (POSITION_BITS - 1), 2.0**-80)
-    return StepSizes(position, 0.025, 0.005, 0.05, 0.01, (0.015,) * sh_degree)
+    position, contraction = position_grid(means, max(small / 16, 2.0**-70))
+    return StepSizes(position, 0.025, 0.005, 0.05, 0.01, (0.015,) * sh_degree, contraction=contraction)

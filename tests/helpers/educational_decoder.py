@@ -87,4 +87,21 @@ def decode(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
                 for channel in range(channels[name]):
                     product = np.float32(codes[name][channel][i]) * step[name][channel, group]
                     values[array][channel, i] = low[name][channel, group] + product
+    if "contraction" in header:
+        values["means"] = expanded(values["means"], header["contraction"])
     return header, values
+
+
+def expanded(means: np.ndarray, contraction: dict[str, Any]) -> np.ndarray:
+    """Positions, from contracted ones ([3, n] f32 both). Python's floats are binary64."""
+    centre, radius = contraction["centre"], contraction["radius"]
+    result = means.copy()
+    for i in range(means.shape[1]):
+        away = [float(means[axis, i]) - centre[axis] for axis in range(3)]
+        a = max(abs(value) for value in away) / radius
+        if a > 1:
+            k = min(int(a) - 1, 63)
+            for axis in range(3):
+                place = centre[axis] + away[axis] * ((a - k) * 2.0**k / a)
+                result[axis, i] = np.float32(min(max(place, -(2.0**126)), 2.0**126))
+    return result

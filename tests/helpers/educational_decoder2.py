@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from educational_decoder import expanded
+
 f32 = np.float32
 SCALES = ["scale x", "scale y", "scale z"]
 LISTED: dict[str, list[str]] = {
@@ -376,6 +378,9 @@ def decode(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             column += [np.sqrt(max(f32(0), f32(1) - ((x * x + y * y) + z * z))), x, y, z]
             columns.append(column)
     assert at == table
+    if "contraction" in steps:
+        means = expanded(np.array([column[:3] for column in columns], f32).T, steps["contraction"])
+        columns = [[*place, *column[3:]] for place, column in zip(means.T, columns, strict=True)]
     widths = {
         "means": 3,
         "sh_dc": 3,

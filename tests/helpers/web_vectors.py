@@ -23,6 +23,7 @@ from flexgs_edge.constants import CODE_LIMIT
 from flexgs_edge.grid.grid_scene import GridScene, row_places
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.scene.contraction import Contraction
 from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.fields import FIELD
 from quantized_scenes import make_scene, quantize_all
@@ -102,6 +103,11 @@ def random_grid(
     )
 
 
+def _contracted(grid: GridScene, radius: float) -> GridScene:
+    contraction = Contraction((0.03, -0.2, 1e-3), radius)
+    return replace(grid, step_sizes=replace(grid.step_sizes, contraction=contraction))
+
+
 KINDS: dict[str, tuple[Callable[[], GridScene], int]] = {
     "no rows": (lambda: random_grid(0, 0, 0), 65536),
     "no rows, degree 3": (lambda: random_grid(0, 3, 0), 65536),
@@ -121,8 +127,10 @@ KINDS: dict[str, tuple[Callable[[], GridScene], int]] = {
     "chunks of one row": (lambda: random_grid(20, 1, 6), 1),
     "degree 4, SH beyond the limit of a sum": (lambda: random_grid(290, 4, 8, sh=_near(40000)), 65536),
     "three chunks of 512 rows in two layers": (lambda: random_grid(1100, 2, 9, layers=2), 512),
+    "contracted": (lambda: _contracted(random_grid(400, 1, 14, low=-(2**13)), 0.7), 65536),
+    "contracted beyond all octaves": (lambda: _contracted(random_grid(300, 0, 21, low=-(2**20)), 1e-3), 65536),
 }
-"""The 18 kinds: the scene, and the most rows of a chunk."""
+"""The 20 kinds: the scene, and the most rows of a chunk."""
 
 PREVIEWED = "a preview before chunks of 256 rows"
 """A further file; its preview is that of 255 rows."""
@@ -132,6 +140,8 @@ PACKED: dict[str, tuple[int, int, BitSpec, int | None]] = {
     "version 1, degree 4, many groups": (23, 4, BitSpec(xyz=13, dc=8, scale=7, rot=9, opacity=16, rest=2), 7),
 }
 """Files of version 1: rows, degree, bits and groups."""
+PACKED_FAR = "version 1, contracted"
+"""A further file: the last one with contracted positions."""
 
 
 def write_all(folder: Path) -> dict[str, Path]:
@@ -148,6 +158,11 @@ def write_all(folder: Path) -> dict[str, Path]:
         files[name] = folder / _file_name(name)
         scene = quantize_all(make_scene(rows, degree), bits, groups)
         write_container(files[name], scene, SETTINGS, force=True)
+        if degree:
+            files[PACKED_FAR] = folder / _file_name(PACKED_FAR)
+            write_container(
+                files[PACKED_FAR], replace(scene, contraction=Contraction((0.5, -0.25, 0.1), 0.3)), SETTINGS, force=True
+            )
     return files
 
 

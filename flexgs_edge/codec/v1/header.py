@@ -12,6 +12,7 @@ from flexgs_edge.codec.header import (
     HeaderError,
     Section,
     canonical_json,
+    checked_contraction,
     checked_integer,
     checked_origin,
     parse_json,
@@ -22,6 +23,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.packed.bitpack import plane_bytes
 from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.packed.quantize import QuantizedScene, group_count
+from flexgs_edge.scene.contraction import Contraction
 from flexgs_edge.scene.fields import FIELD, FIELDS
 
 CHUNK_ROWS = 65536
@@ -54,6 +56,8 @@ class Header:
         How the file was made (JSON values).
     block : int
         Bytes of the padded header in the file.
+    contraction : Contraction or None
+        As in `QuantizedScene`.
     """
 
     count: int
@@ -64,6 +68,7 @@ class Header:
     groups: dict[str, int]
     settings: dict[str, Any]
     block: int = HEADER_MIN
+    contraction: Contraction | None = None
 
     @classmethod
     def of_scene(cls, scene: QuantizedScene, settings: Mapping[str, Any]) -> Header:
@@ -71,7 +76,7 @@ class Header:
         groups = {FIELD[name].bits: array.groups for name, array in scene.arrays.items()}
         x, y, z = (float(value) for value in scene.origin)
         counts = (scene.count, scene.sh_count, scene.sh_degree)
-        return cls(*counts, (x, y, z), scene.bits, groups, dict(settings), header_block(settings))
+        return cls(*counts, (x, y, z), scene.bits, groups, dict(settings), header_block(settings), scene.contraction)
 
     def rows(self, field: str) -> int:
         """Rows of the array of `field`."""
@@ -178,14 +183,18 @@ def encode_header(header: Header) -> bytes:
     """The bytes of a header, padded."""
     record = asdict(header)
     del record["block"]  # known from the preamble
+    if header.contraction is None:
+        del record["contraction"]
     return canonical_json(record).ljust(header.block)
 
 
 def decode_header(block: bytes) -> Header:
     """Read and check a padded header; raises `HeaderError` for everything that `encode_header` does not write."""
     record = parse_json(block)
-    if not isinstance(record, dict) or tuple(sorted(record)) != _KEYS:
-        raise HeaderError(f"wanted an object with the keys {', '.join(_KEYS)}, got {shown(record)}")
+    if not isinstance(record, dict) or tuple(sorted(record.keys() - {"contraction"})) != _KEYS:
+        raise HeaderError(
+            f"wanted an object with the keys {', '.join(_KEYS)} and perhaps contraction, got {shown(record)}"
+        )
     count = checked_integer("count", record["count"], 0, MAX_COUNT)
     sh_count = checked_integer("sh_count", record["sh_count"], 0, count)
     lowest, highest = (1, MAX_SH_DEGREE) if sh_count else (0, 0)
@@ -201,7 +210,9 @@ def decode_header(block: bytes) -> Header:
     settings = record["settings"]
     if not isinstance(settings, dict):
         raise HeaderError(f"settings: wanted an object, got {shown(settings)}")
-    return Header(count, sh_count, sh_degree, checked_origin(record["origin"]), bits, groups, settings, len(block))
+    contraction = checked_contraction(record["contraction"]) if "contraction" in record else None
+    origin = checked_origin(record["origin"])
+    return Header(count, sh_count, sh_degree, origin, bits, groups, settings, len(block), contraction)
 
 
 def _attributes(name: str, value: object) -> list[tuple[str, object]]:

@@ -13,12 +13,15 @@ from flexgs_edge.codec.v1.container import Container
 from flexgs_edge.codec.v1.header import CHUNK_ROWS
 from flexgs_edge.packed.bitpack import plane_bytes
 from flexgs_edge.packed.quantize import QuantizedArray, QuantizedScene, dequantize_part
+from flexgs_edge.scene.contraction import Contraction
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 
 
 class CodedSource(SceneSource):
     """A scene whose codes are dequantized when they are read."""
+
+    contraction: Contraction | None
 
     @abstractmethod
     def quantized(self) -> QuantizedScene:
@@ -38,6 +41,8 @@ class CodedSource(SceneSource):
             first, arrays = self._chunk(chunk)
             for field, plane in planes.items():
                 _fill(arrays[field], first, wanted, plane[:, place])
+                if field == "means" and self.contraction is not None:
+                    plane[:, place] = self.contraction.expand(plane[:, place])
         return planes
 
 
@@ -55,7 +60,7 @@ class QuantizedSource(CodedSource):
     def __init__(self, scene: QuantizedScene, name: str = "quantized scene") -> None:
         self.name, self.notes = name, ()
         self.count, self.sh_degree, self.sh_count = scene.count, scene.sh_degree, scene.sh_count
-        self.origin = scene.origin
+        self.origin, self.contraction = scene.origin, scene.contraction
         self._scene = scene
 
     def quantized(self) -> QuantizedScene:
@@ -90,7 +95,7 @@ class FgsSource(CodedSource):
         header = self.container.header
         self.name, self.notes = str(path), ()
         self.count, self.sh_degree, self.sh_count = header.count, header.sh_degree, header.sh_count
-        self.origin = np.array(header.origin, np.float64)
+        self.origin, self.contraction = np.array(header.origin, np.float64), header.contraction
         self.settings: dict[str, Any] = header.settings
         self._ranges = self.container.read_ranges()
         self._table = self.container.read_chunk_table()
@@ -112,7 +117,7 @@ class FgsSource(CodedSource):
             for name, part in self._cut(chunk, self.container.read_chunk(entry)).items():
                 start = chunk * (CHUNK_ROWS // 8) * part.bits
                 arrays[name].planes[:, start : start + part.planes.shape[1]] = part.planes
-        return QuantizedScene(self.count, self.sh_count, self.sh_degree, self.origin, arrays)
+        return QuantizedScene(self.count, self.sh_count, self.sh_degree, self.origin, arrays, self.contraction)
 
     def _chunk(self, chunk: int) -> tuple[int, dict[str, QuantizedArray]]:
         if self._last is None or self._last[0] != chunk:

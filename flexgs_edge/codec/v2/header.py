@@ -13,6 +13,7 @@ from flexgs_edge.codec.header import (
     HeaderError,
     Section,
     canonical_json,
+    checked_contraction,
     checked_integer,
     checked_origin,
     parse_json,
@@ -235,14 +236,18 @@ def decode_header(block: bytes) -> GridHeader:
 
 def _steps(value: object, sh_degree: int) -> dict[str, Any]:
     names = ("chroma", "dc", "opacity", "position", "rotation", "scale", "sh")
-    if not isinstance(value, dict) or tuple(sorted(value)) != names:
-        raise HeaderError(f"steps: wanted an object with the keys {', '.join(names)}, got {shown(value)}")
+    if not isinstance(value, dict) or tuple(sorted(value.keys() - {"contraction"})) != names:
+        raise HeaderError(
+            f"steps: wanted an object with the keys {', '.join(names)} and perhaps contraction, got {shown(value)}"
+        )
     numbers = [value[name] for name in names[:-1]]
     if not isinstance(value["sh"], list) or len(value["sh"]) != sh_degree:
         raise HeaderError(f"steps.sh: wanted {sh_degree} numbers, got {shown(value['sh'])}")
     numbers += value["sh"]
     if not all(type(number) is float and math.isfinite(number) for number in numbers):
         raise HeaderError(f"steps: wanted finite numbers with a decimal point, got {shown(value)}")
+    if "contraction" in value:
+        checked_contraction(value["contraction"])
     try:
         steps = StepSizes.from_json(value).to_json()
     except (InputError, OverflowError) as error:

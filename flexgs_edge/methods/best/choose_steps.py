@@ -11,13 +11,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import CODE_LIMIT, SH_C0
+from flexgs_edge.grid.position_grid import plane_ranges, position_grid
 from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
-from flexgs_edge.memory.rows import COPY_ROWS, blocks, put_rows, read_ahead, read_rows
+from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.rotations import tilted, turned
 from flexgs_edge.scene.source import MemorySource
@@ -148,41 +150,30 @@ def choose_steps(
         return math.sqrt(multiplier * max(len(rows), 1) / (2 * math.log(2) * slope))
 
     bands = tuple(colour(weight2[degrees >= max(level, 1)]) for level in range(1, sh_degree + 1))
-    geometry = {kind: slopes.step(kind, multiplier) for kind in GEOMETRY}
+    geometry: dict[str, Any] = {kind: slopes.step(kind, multiplier) for kind in GEOMETRY}
     return StepSizes(**geometry, dc=colour(weight2), sh=bands, chroma=CHROMA)
 
 
 def holdable(steps: StepSizes, planes: dict[str, np.ndarray]) -> StepSizes:
-    """`steps`, made coarser where codes could not hold the planes' values: far outliers, or a multiplier near zero."""
+    """`steps`, with coarser ones where codes could not hold the planes' values, and positions contracted if they need it."""
 
     def finest(name: str, codes: int = CODE_LIMIT - 2) -> float:
-        return max((float(max(-low, high)) for low, high in _ranges(planes[name])), default=0.0) / codes
+        return max((float(max(-low, high)) for low, high in plane_ranges(planes[name])), default=0.0) / codes
 
-    width = max((float(high - low) for low, high in _ranges(planes["means"])), default=0.0)
     least = 2.0**-70
+    position, contraction = position_grid(planes["means"], max(steps.position, least))
     colours = CODE_LIMIT // 4  # Co reaches twice the coefficients, and refits move the coefficients
     finest_sh = finest("sh_rest", colours)
     return StepSizes(
-        position=max(steps.position, width / (2**POSITION_BITS - 2), finest("means"), least),
+        position=position,
         scale=max(steps.scale, finest("log_scales"), least),
         rotation=max(steps.rotation, 2 / CODE_LIMIT),
         opacity=max(steps.opacity, finest("opacity_logits"), least),
         dc=max(steps.dc, finest("sh_dc", colours), least),
         sh=tuple(max(step, finest_sh, least) for step in steps.sh),
         chroma=steps.chroma,
+        contraction=contraction,
     )
-
-
-def _ranges(planes: np.ndarray) -> list[tuple[np.float32, np.float32]]:
-    """Smallest and largest value of each plane of [width, n] f32; none where n is 0."""
-    ranges = []
-    for plane in planes if planes.shape[1] else ():
-        low, high = plane[0], plane[0]
-        for rows in blocks(len(plane), COPY_ROWS):
-            part = read_rows(plane, rows)
-            low, high = min(low, part.min()), max(high, part.max())
-        ranges.append((low, high))
-    return ranges
 
 
 def reachable(steps: StepSizes, planes: dict[str, np.ndarray], seen: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from flexgs_edge.goals.target import Measurement
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows
 from flexgs_edge.packed.bitspec import BitSpec
-from flexgs_edge.packed.quantize import QuantizedScene, quantize_scene, quantized_bytes
+from flexgs_edge.packed.quantize import QuantizedScene, far_contraction, quantize_scene, quantized_bytes
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import SceneSource
 
@@ -67,6 +67,7 @@ class SceneEvaluator:
         self.judge = judge
         self.budget = budget
         self._ranks = ranks_from_order(ranked.order)
+        self._contraction = far_contraction(self.source)
         self._has_sh = ranked.has_sh
         # Number of SH rows from each rank up. With it sizes cost nothing, and the search asks for hundreds of sizes.
         self._sh_above = np.concatenate([np.cumsum(ranked.has_sh[ranked.order][::-1])[::-1], [0]])
@@ -104,6 +105,6 @@ class SceneEvaluator:
             per_row = QUANTIZE_COPIES * 4 * (14 + self.source.width("sh_rest"))
             chunk_rows = self.budget.rows("quantizing", per_row, minimum=min(kept, 1024), most=65536)
             rows = select_rows(self._ranks, choice, self._has_sh)
-            yield quantize_scene(self.source, *rows, bits, self.groups, chunk_rows)
+            yield quantize_scene(self.source, *rows, bits, self.groups, chunk_rows, self._contraction)
         finally:
             self.budget.give(size)

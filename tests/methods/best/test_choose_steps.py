@@ -144,8 +144,10 @@ def test_far_rows_that_nobody_sees_are_out_of_reach() -> None:
     planes["means"][0, 3] = 1e7 * steps.position
     planes["sh_dc"][1, 4] = 1e8 * steps.dc
     planes["opacity_logits"][0, 5] = -1e8 * steps.opacity
-    # What is seen stays, and coarsens the grid; the same unseen goes, and the grid is as fine as it was.
-    assert reachable(steps, planes, seen).all() and holdable(steps, planes).position > 4 * steps.position
+    # What is seen stays: positions are contracted, and other steps grow. The same unseen goes, and the grid is as it was.
+    held = holdable(steps, planes)
+    assert reachable(steps, planes, seen).all() and held.contraction is not None
+    assert held.position == steps.position and held.opacity > 4 * steps.opacity
     seen[:6] = False
     keep = reachable(steps, planes, seen)
     assert np.flatnonzero(~keep).tolist() == [3, 4, 5]

@@ -1,4 +1,5 @@
 import { checkedInteger, checkedIntegers, checkedOrigin, hasKeys, isFloat } from './checks.js';
+import { checkedContraction } from './contraction.js';
 import { HeaderError } from './errors.js';
 import { parseJson, plain } from './json.js';
 import {
@@ -110,8 +111,10 @@ export function leastBytes(rows) {
 }
 
 function checkedSteps(value, shDegree) {
-  if (!hasKeys(value, STEP_KEYS)) {
-    throw new HeaderError(`steps: wanted an object with the keys ${STEP_KEYS.join(', ')}, got ${shown(value)}`);
+  const contracted = value instanceof Map && value.has('contraction');
+  if (!hasKeys(value, contracted ? [...STEP_KEYS, 'contraction'].sort() : STEP_KEYS)) {
+    const keys = STEP_KEYS.join(', ');
+    throw new HeaderError(`steps: wanted an object with the keys ${keys} and perhaps contraction, got ${shown(value)}`);
   }
   const sh = value.get('sh');
   if (!Array.isArray(sh) || sh.length !== shDegree) {
@@ -121,6 +124,7 @@ function checkedSteps(value, shDegree) {
   if (!numbers.every(isFloat)) {
     throw new HeaderError(`steps: wanted finite numbers with a decimal point, got ${shown(value)}`);
   }
+  if (contracted) checkedContraction(value.get('contraction'));
   for (const name of STEP_ORDER) {
     const most = name === 'chroma' ? 16 : 80;
     const some = name === 'sh' ? sh : [value.get(name)];

@@ -51,6 +51,13 @@ export interface Steps {
   dc: number;
   chroma: number;
   sh: number[];
+  contraction?: Contraction;
+}
+
+/** Of positions: docs/format.md. */
+export interface Contraction {
+  centre: [number, number, number];
+  radius: number;
 }
 
 /** Codes of version 2. Positions are relative to the origin. */
@@ -106,6 +113,8 @@ export interface Header {
   settings: Record<string, unknown>;
   layers: number[];
   chunkCount: number;
+  /** Of version 1: of its positions, null if they are not contracted. In version 2 it stands in `steps`. */
+  contraction?: Contraction | null;
   /** Of version 2. */
   steps?: Steps;
   low?: [number, number, number];

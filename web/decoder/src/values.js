@@ -1,6 +1,8 @@
 // Codes to values. Each operation is rounded to binary32 once, so that all decoders give the same bits: `Math.fround` of a
 // double's sum, product or root is exact.
 
+import { expand } from './contraction.js';
+
 const fround = Math.fround;
 
 /**
@@ -20,6 +22,7 @@ export function values2(codes, header) {
     scaled(codes.position[axis], steps.position, means.subarray(axis * rows));
     scaled(codes.scale[axis], steps.scale, logScales.subarray(axis * rows));
   }
+  if (steps.contraction) expand(means, rows, steps.contraction);
   const opacityLogits = new Float32Array(rows);
   scaled(codes.opacity, steps.opacity, opacityLogits);
   const quats = new Float32Array(4 * rows);

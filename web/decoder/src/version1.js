@@ -1,6 +1,7 @@
 // Version 1: bit-packed planes of codes, each a step between two ends of a group.
 
 import { checkedInteger, checkedOrigin, hasKeys } from './checks.js';
+import { checkedContraction, expand } from './contraction.js';
 import { FgsError, HeaderError } from './errors.js';
 import { parseJson, plain } from './json.js';
 import { CHUNK_ROWS, COUNT_MOST, DEGREE_MOST, PREAMBLE_BYTES } from './limits.js';
@@ -22,8 +23,9 @@ const SMALLEST_STEP = 2 ** -126;
 /** Read and check the header; throws `HeaderError`. */
 function decodeHeader1(bytes) {
   const record = parseJson(bytes);
-  if (!hasKeys(record, KEYS)) {
-    throw new HeaderError(`wanted an object with the keys ${KEYS.join(', ')}, got ${shown(record)}`);
+  const contracted = record instanceof Map && record.has('contraction');
+  if (!hasKeys(record, contracted ? [...KEYS, 'contraction'].sort() : KEYS)) {
+    throw new HeaderError(`wanted an object with the keys ${KEYS.join(', ')} and perhaps contraction, got ${shown(record)}`);
   }
   const count = checkedInteger('count', record.get('count'), 0, COUNT_MOST);
   const shCount = checkedInteger('sh_count', record.get('sh_count'), 0, count);
@@ -39,6 +41,7 @@ function decodeHeader1(bytes) {
   });
   const settings = record.get('settings');
   if (!(settings instanceof Map)) throw new HeaderError(`settings: wanted an object, got ${shown(settings)}`);
+  const contraction = contracted ? checkedContraction(record.get('contraction')) : null;
   const rangesOffset = PREAMBLE_BYTES + bytes.length;
   const rangesBytes = 8 * arrays.reduce((sum, array) => sum + array.channels * array.groups, 0) + 4;
   const chunkCount = Math.ceil(count / CHUNK_ROWS);
@@ -48,6 +51,7 @@ function decodeHeader1(bytes) {
     shCount,
     shDegree,
     origin: checkedOrigin(record.get('origin')),
+    contraction,
     settings: plain(settings),
     layers: [count],
     arrays,
@@ -167,6 +171,7 @@ function valuesOf(codes, header, ranges, start, rows) {
     });
     values[array.key] = out;
   });
+  if (header.contraction) expand(values.means, rows, header.contraction);
   return values;
 }
 

@@ -1,4 +1,5 @@
 // Which chunks of a large scene to have, and in which order: what is in sight comes first.
+import { expandBox } from '../../decoder/src/contraction.js';
 import { dot, subtract } from './vectors.js';
 
 /** A layer that is out of sight comes after so many further layers that are in sight. */
@@ -111,8 +112,9 @@ function partsOf({ settings: { boxes }, layers, chunkRows, steps }) {
       const box = boxes[index];
       const rows = Math.min(chunkRows, count - at);
       const shRows = Math.min(box[6], rows);
-      const [low, high] = [scaled(box.slice(0, 3)), scaled(box.slice(3, 6))];
-      parts.push({ index, layer, rows, shRows, low, high, here: false });
+      const codes = { low: scaled(box.slice(0, 3)), high: scaled(box.slice(3, 6)) };
+      const ends = steps.contraction ? expandBox(codes, steps.contraction) : codes;
+      parts.push({ index, layer, rows, shRows, ...ends, here: false });
     }
   });
   return parts;

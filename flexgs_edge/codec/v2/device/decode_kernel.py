@@ -133,6 +133,8 @@ class ChunkKernel:
             for i, (count, error) in enumerate(zip(counts.tolist(), errors, strict=True)):
                 values = np.empty((count, columns), np.float32)
                 self.device.read(table, values, i * self.rows * columns)
+                if steps.steps.contraction is not None:
+                    values[:, :3] = steps.steps.contraction.expand(values[:, :3].T).T
                 results.append(error or values)
             return results
 
