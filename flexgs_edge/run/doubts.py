@@ -49,8 +49,8 @@ def frame_doubts(views: ViewSet, scene: CheckedScene) -> tuple[str, ...]:
     if scene.frame != RDF and share > BEHIND_SHARE:
         return (
             f"{100 * share:.0f} % of the Gaussians lie behind all {len(views.cameras)} cameras of {views.cameras_from}. The "
-            f"file's axes were read as {scene.frame.name} (x, y, z) and turned into RDF. Give the right ones with --frame, such as "
-            "--frame RDF for a file in the cameras' own frame.",
+            f"file's axes were read as {scene.frame.name} (x, y, z) and turned into RDF. Give the right ones with --frame, "
+            "such as --frame RDF for a file in the cameras' own frame.",
         )
     if 2 * blind > len(cameras):
         return (
