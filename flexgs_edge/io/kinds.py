@@ -27,6 +27,8 @@ _IMAGES = {
     b"II*\0": "a TIFF image",
     b"MM\0*": "a TIFF image",
 }
+_MOVING = re.compile(r"t|scale_t|trbf_(center|scale)|motion_[0-9]+|omega_[0-9]+|rot_r_[0-9]+")
+"""Properties of time, as 4D Gaussian splatting (t, scale_t, rot_r_*) and SpacetimeGaussians (the others) write them."""
 _INCOMPLETE = "is the download or the copy complete?"
 _AGAIN = "the download went wrong; fetch the file itself"
 _TRAIN = "train a scene first, and give its output"
@@ -86,6 +88,11 @@ def kind_of(path: Path, name: str) -> Kind | None:
                 return Kind("a PLY file", suffix=".ply")  # its reader says what is wrong
     except OSError as error:
         raise InputError(f"{name}: cannot read it ({error.strerror})") from error
+    if name.lower().endswith(".lcc"):
+        return Kind(
+            "a scene of XGRIDS (.lcc: the index of several files)",
+            "export a .ply from the program that made it, or with `npx @playcanvas/splat-transform scene.lcc scene.ply`",
+        )
     if not head:
         return Kind("an empty file", _INCOMPLETE)
     if head.startswith(_LFS):
@@ -122,6 +129,12 @@ def _ply_kind(header: PlyHeader) -> Kind:
     has = {p.name for p in vertex.properties} if vertex is not None else set()
     if "packed_position" in has:
         return Kind("a compressed PLY", suffix=".compressed.ply")
+    moving = sorted(name for name in has if _MOVING.fullmatch(name))
+    if moving and "opacity" in has:
+        return Kind(
+            f"a PLY of Gaussians that move (4D: {', '.join(moving[:4])})",
+            "this program reads scenes that stand still; export one moment of it as a plain PLY with the program that trained it",
+        )
     if vertex is None or has & {"f_dc_0", "opacity", "scale_2", "rot_0"}:
         if {"scale_0", "scale_1", "rot_0"} <= has and "scale_2" not in has:
             return Kind(

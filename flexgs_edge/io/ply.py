@@ -14,9 +14,18 @@ from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
+from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.files import atomic_write, check_readable
-from flexgs_edge.io.ply_layout import SMOOTHING, PlyHeader, gaussian_layout, read_header, smoothing_of
+from flexgs_edge.io.ply_layout import (
+    RGB,
+    SMOOTHING,
+    PlyHeader,
+    colour_names,
+    gaussian_layout,
+    read_header,
+    smoothing_of,
+)
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
@@ -69,7 +78,7 @@ class PlySource(SceneSource):
                 stamp = _stamp(file)
             self.sh_degree, self.notes = gaussian_layout(header)
             self.comments = header.comments
-            self._smoothed = smoothing_of(header)
+            self._smoothed, self._colours = smoothing_of(header), colour_names(header)
             antialiased = self._smoothed or header.antialiased
             self.settings: dict[str, Any] = {} if antialiased is None else {"antialiased": antialiased}
             behind = header.check_size(stamp[1])
@@ -108,8 +117,11 @@ class PlySource(SceneSource):
                     if self._smoothed and field in ("log_scales", "opacity_logits"):
                         plane[:, part] = _smooth(block)[field]
                         continue
-                    for channel, name in enumerate(FIELD[field].ply_names(self.sh_degree)):
+                    names = self._colours if field == "sh_dc" else FIELD[field].ply_names(self.sh_degree)
+                    for channel, name in enumerate(names):
                         values = block[name]
+                        if name in RGB:
+                            values = (values / 255.0 - 0.5) / SH_C0
                         if field == "means":
                             values = values.astype(np.float64) - self.origin[channel]
                         plane[channel, part] = values

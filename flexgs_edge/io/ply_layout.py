@@ -9,7 +9,7 @@ import numpy as np
 
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import FormatError
-from flexgs_edge.scene.fields import FIELDS, sh_rest_count
+from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
 from flexgs_edge.scene.source import REST_WIDTHS
 
 _TYPES = {
@@ -36,6 +36,8 @@ _HEADER_LIMIT = 1 << 20
 """Most bytes of a header; those of scenes have 2 kB. A file without `end_header` is not read further."""
 _SILENT = ("nx", "ny", "nz")
 """Properties of INRIA's layout without content (normals)."""
+RGB = ("red", "green", "blue")
+"""8-bit colours, which nerfstudio's export has in place of `f_dc` with `--ply-color-mode rgb`."""
 PROGRAM = "flexgs-edge"
 """First word of our comments."""
 SMOOTHING = "filter_3D"
@@ -274,11 +276,13 @@ def gaussian_layout(header: PlyHeader) -> tuple[int, tuple[str, ...]]:
     vertex = header.vertex
     by_name = {p.name: p for p in vertex.properties}
     degree = _sh_degree(header.name, by_name)
-    needed = [name for f in FIELDS for name in f.ply_names(degree)]
+    colours = colour_names(header)
+    needed = [name for f in FIELDS for name in (colours if f.name == "sh_dc" else f.ply_names(degree))]
     missing = [name for name in needed if name not in by_name]
     if missing:
         raise FormatError(f"{header.name}: element 'vertex' lacks the properties {_list(missing)}")
-    wrong = [name for name in needed if by_name[name].length or not by_name[name].type.startswith("f")]
+    numbers = [name for name in needed if name not in RGB]
+    wrong = [name for name in numbers if by_name[name].length or not by_name[name].type.startswith("f")]
     if wrong:
         kind = "a list" if by_name[wrong[0]].length else f"type {by_name[wrong[0]].type}"
         raise FormatError(f"{header.name}: property {wrong[0]!r} is {kind}; expected float or double")
@@ -286,12 +290,21 @@ def gaussian_layout(header: PlyHeader) -> tuple[int, tuple[str, ...]]:
     known = {*needed, *_SILENT, *((SMOOTHING,) if smoothed else ())}
     extra = [name for name in by_name if name not in known]
     notes = [f"extra properties left out: {_list(extra)}"] if extra else []
+    if colours == RGB:
+        notes.append("colours read from red, green, blue (8 bits each), as the file has no f_dc")
     if smoothed:
         notes.append(
             f"{SMOOTHING} applied to scales and opacities (Mip-Splatting; it dilates by 0.1 px^2, here it is 0.3)"
         )
     notes += [f"element {e.name!r} left out ({e.count} rows)" for e in header.elements if e is not vertex]
     return degree, tuple(notes)
+
+
+def colour_names(header: PlyHeader) -> tuple[str, ...]:
+    """The properties that hold the colours of Gaussians: `f_dc_*`, or `RGB` of a file that has only these."""
+    scalars = {p.name: p.type for p in header.vertex.properties if p.length is None}
+    bytes_only = "opacity" in scalars and "f_dc_0" not in scalars and all(scalars.get(name) == "u1" for name in RGB)
+    return RGB if bytes_only else FIELD["sh_dc"].ply
 
 
 def smoothing_of(header: PlyHeader) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +12,9 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.scene.fields import FIELDS, OPACITY_LIMIT
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
 
+LOG = logging.getLogger("flexgs_edge")
+TELLING_ROWS = 32
+"""In scenes of fewer Gaussians, all opacities and scales may look activated by chance."""
 _TINY = np.finfo(np.float32).tiny
 SH_LARGEST = 1e15
 """Larger SH coefficients are invalid: squares of their colours leave float32, and infinity times a weight of zero is
@@ -54,7 +58,8 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
     Returns
     -------
     SceneSource
-        `source` itself, or a lazy source over it, with a note on the rows that were left out or clamped.
+        `source` itself, or a lazy source over it, with a note on the rows that were left out or clamped. A scene whose
+        opacities and scales look activated is warned of.
 
     Raises
     ------
@@ -67,7 +72,7 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
         return source
     faults = _Faults()
     keep = np.ones(source.count if drop_invalid else 0, bool)
-    flat, extreme, smallest = 0, 0, np.float32(np.inf)
+    flat, extreme, smallest, activated = 0, 0, np.float32(np.inf), source.count >= TELLING_ROWS
     for rows in source.chunks(chunk_rows):
         bad, infinite = _check_chunk(source, rows, faults)
         if drop_invalid:
@@ -76,6 +81,7 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
         without = np.isneginf(scales)
         flat += int(without.any(axis=0).sum())
         extreme += int(np.isinf(logits).sum())
+        activated = activated and bool((scales > 0).all() and ((logits >= 0) & (logits <= 1)).all())
         smallest = min(smallest, scales.min(initial=np.float32(np.inf), where=~without))
     if faults.count and not drop_invalid:
         raise InputError(
@@ -87,6 +93,14 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
     if faults.count:
         note = f"{faults.count} of {source.count} Gaussians left out as invalid: {faults}"
         source = SelectSource(source, np.flatnonzero(keep), (note,))
+    if activated:
+        LOG.warning(
+            "%s: all %d opacities lie in 0..1 and all scales above 0, so they seem to be activated already. They are read as "
+            "logits and logarithms, as the format says: all Gaussians would be half transparent and larger than 1 unit. If the "
+            "scene looks wrong, write log(opacity / (1 - opacity)) and log(scale) to the file.",
+            source.name,
+            source.count,
+        )
     notes = []
     if flat:
         if not np.isfinite(smallest):

@@ -45,6 +45,11 @@ def zipped(folder: Path, *names: str) -> bytes:
         (header(POINTS) + POINTS.tobytes(), "a point cloud of 4 points, not Gaussians"),
         (header(POINTS, extra=FACES), "a mesh with 2 faces, not Gaussians"),
         (header(random_rows(1, names=[n for n in property_names(0) if n != "scale_2"])), "a PLY of 2D Gaussian splats"),
+        (
+            header(random_rows(1, names=[*property_names(0), "t", "scale_t", "rot_r_0"])),
+            "a PLY of Gaussians that move (4D",
+        ),
+        (header(random_rows(1, names=[*property_names(0), "motion_0"])), "a PLY of Gaussians that move (4D: motion_0)"),
         (b"\x89PNG\r\n\x1a\n0000", "a PNG image"),
         (b"\xff\xd8\xff\xe0", "a JPEG image"),
         (b"RIFF0000WEBPVP8L", "a WebP image"),
@@ -159,3 +164,9 @@ def test_a_point_cloud_is_refused_by_the_right_words(tmp_path: Path) -> None:
     found = kind_of(write_rows(tmp_path / "a.ply", POINTS), "a.ply")
     assert found is not None
     assert str(found.refused("a.ply")).endswith("not Gaussians: train a scene first, and give its output")
+
+
+def test_scenes_of_xgrids_are_named(tmp_path: Path) -> None:
+    (tmp_path / "a.lcc").write_text('{"version": "5.0", "totalSplats": 3}')
+    found = kind_of(tmp_path / "a.lcc", "a.lcc")
+    assert found is not None and found.words.startswith("a scene of XGRIDS") and "splat-transform" in found.advice

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.io.ply import PlySource, choose_origin
+from flexgs_edge.io.ply import PlySource, choose_origin, write_ply
 from flexgs_edge.scene.fields import FIELDS
+from flexgs_edge.scene.source import MemorySource
 from scene_files import header, planes_of, property_names, random_rows, write_rows
 
 ALL = [field.name for field in FIELDS]
@@ -270,3 +271,33 @@ def test_the_sample_against_plyfile() -> None:
     source = PlySource(SAMPLE)
     assert (source.count, source.sh_degree, source.origin.tolist(), source.notes) == (32980, 3, [0.0, 0.0, 0.0], ())
     assert_same(source, PlyData.read(SAMPLE)["vertex"].data)
+
+
+def test_colours_of_8_bits(tmp_path: Path) -> None:
+    names = [name for name in property_names(0) if not name.startswith("f_dc")]
+    plain = random_rows(256, names=names)
+    rows = np.zeros(256, [*plain.dtype.descr, *((name, "u1") for name in ("red", "green", "blue"))])
+    for name in names:
+        rows[name] = plain[name]
+    rows["red"], rows["green"], rows["blue"] = np.arange(256), np.arange(256)[::-1], 7
+    source = PlySource(write_rows(tmp_path / "a.ply", rows))
+    assert any("read from red, green, blue" in note for note in source.notes)
+    dc = source.read(slice(0, 256), ["sh_dc"])["sh_dc"]
+    expected = (np.array([rows["red"], rows["green"], rows["blue"]]) / 255 - 0.5) / 0.28209479177387814
+    np.testing.assert_array_equal(dc, expected.astype(np.float32))
+    ours = MemorySource({name: source.read(slice(0, 256), [name])[name] for name in ALL})
+    write_ply(tmp_path / "b.ply", ours)
+    np.testing.assert_array_equal(PlySource(tmp_path / "b.ply").read(slice(0, 256), ["sh_dc"])["sh_dc"], dc)
+    names = [*property_names(0), "red"]
+    assert PlySource(write_rows(tmp_path / "c.ply", random_rows(2, names=names))).notes == (
+        "extra properties left out: red",
+    )
+
+
+def test_ascii_gaussians_of_a_cube(tmp_path: Path) -> None:
+    rows = random_rows(20)
+    for axis, name in enumerate("xyz"):
+        rows[name] = np.arange(20) >> axis & 1
+    lines = [" ".join(f"{value:.9g}" for value in row) for row in rows.tolist()]
+    (tmp_path / "a.ply").write_bytes(header(rows, "ascii") + "\n".join(lines).encode() + b"\n")
+    assert_same(PlySource(tmp_path / "a.ply"), rows)

@@ -178,3 +178,14 @@ def test_sh_count_survives_dropping() -> None:
     data["sh_rest"][:, 6:] = 0.0
     data["means"][0, [0, 8]] = np.nan
     assert check_scene(MemorySource(data, sh_count=6), drop_invalid=True).sh_count == 5
+
+
+@pytest.mark.parametrize("seen", ["opacity_logits", "log_scales", "both"])
+def test_files_that_are_activated_already_are_warned_of(seen: str, caplog: pytest.LogCaptureFixture) -> None:
+    data = arrays(40)
+    for name in ("opacity_logits", "log_scales"):
+        if seen in (name, "both"):
+            data[name] = np.random.default_rng(1).uniform(0.001, 1, data[name].shape).astype(np.float32)
+    with caplog.at_level("WARNING", "flexgs_edge"):
+        check_scene(MemorySource(data), chunk_rows=3)
+    assert ("all 40 opacities lie in 0..1 and all scales above 0" in caplog.text) == (seen == "both")
