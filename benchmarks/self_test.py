@@ -41,7 +41,6 @@ FORMS = {
     "gpu": (1, "gpu"),
     "gpu4": (4, "gpu"),
     "fma": (4, "gpu"),
-    "div": (4, "gpu"),
 }
 
 
@@ -185,7 +184,7 @@ def open_form(form: str, spec: str | None = None) -> OpenCLBackend:
     """A form of the kernels on the default device, or on the one that `spec` names."""
     info = choose_device(spec, list_devices())[0]
     width, shape = FORMS[form]
-    kind = Form(shape, width, written_fma=form == "fma", written_division=form == "div")
+    kind = Form(shape, width, written_fma=form == "fma")
     return OpenCLBackend(replace(info, compute_units=1, form=str(kind)), MemoryBudget(1 << 40))
 
 

@@ -23,7 +23,7 @@ _OPERATOR = re.compile(
 )
 _START = re.compile(r"^(?:__kernel|inline|#define FOR_EACH\w+\()", re.MULTILINE)
 _NAME = re.compile(r"(\w+)\s*\(")
-WRITTEN = {"written_fma": ("fma",), "quotient": ("div",), "written_root": ("div",)}
+WRITTEN = {"written_fma": ("fma",)}
 """Forms of what is written out for some devices."""
 SECONDS = 240
 """Time for one fault. A loop that does not end is refused too."""

@@ -25,27 +25,24 @@ class Form:
         Lanes of a vector.
     written_fma : bool
         Whether `fma` is written out in `common.clh`, for devices whose own one is slow.
-    written_division : bool
-        Whether quotients and roots are rounded in `common.clh`, for devices that do not round their own.
     """
 
     kind: str
     width: int
     written_fma: bool = False
-    written_division: bool = False
 
     def __str__(self) -> str:
-        return f"{self.kind}{self.width}{'+fma' if self.written_fma else ''}{'+div' if self.written_division else ''}"
+        return f"{self.kind}{self.width}{'+fma' if self.written_fma else ''}"
 
     @classmethod
     def named(cls, name: str) -> Form | None:
         """The form that has this name; None if none has.
 
         >>> Form.named("gpu4+fma"), Form.named("tpu")
-        (Form(kind='gpu', width=4, written_fma=True, written_division=False), None)
+        (Form(kind='gpu', width=4, written_fma=True), None)
         """
-        match = re.fullmatch(r"(cpu|gpu)(16|8|4|1)(\+fma)?(\+div)?", name)
-        return cls(match[1], int(match[2]), match[3] is not None, match[4] is not None) if match else None
+        match = re.fullmatch(r"(cpu|gpu)(16|8|4|1)(\+fma)?", name)
+        return cls(match[1], int(match[2]), match[3] is not None) if match else None
 
 
 def native_width(info: DeviceInfo) -> int:

@@ -10,9 +10,8 @@ import numpy as np
 
 from flexgs_edge.errors import BudgetError, DeviceError
 from flexgs_edge.kernels.choose_device import DeviceInfo
-from flexgs_edge.kernels.form import GPU_WIDTHS, Form, possible_forms, with_written_fma
+from flexgs_edge.kernels.form import Form, possible_forms, with_written_fma
 from flexgs_edge.kernels.opencl import OpenCLBackend
-from flexgs_edge.kernels.rounding import rounds_division
 from flexgs_edge.memory.budget import MemoryBudget
 
 KERNEL = "blend_stats"
@@ -49,11 +48,7 @@ def measure_forms(
     found: list[Measured] = []
     failed = ""
     written = False
-    try:
-        forms = _right_forms(info)
-    except DeviceError as error:
-        return [], str(error)
-    for number, form in enumerate(forms):
+    for number, form in enumerate(possible_forms(info)):
         both = [form, with_written_fma(form)]
         # What is faster for the first form is so for all; building the slow ones takes long.
         chosen = both if number == 0 or not found else [both[written]]
@@ -70,14 +65,6 @@ def measure_forms(
         found.sort(key=lambda measured: measured.seconds)
         written = bool(found) and found[0].form.written_fma
     return found, failed
-
-
-def _right_forms(info: DeviceInfo) -> list[Form]:
-    """The forms that the device can take, with written quotients and roots if it does not round its own."""
-    forms = possible_forms(info)
-    if rounds_division(info):
-        return forms
-    return [replace(form, written_division=True) for form in forms if form.width in GPU_WIDTHS]
 
 
 def may_write_fma(info: DeviceInfo) -> bool:

@@ -19,7 +19,6 @@ from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.cl_sources import load_source
 from flexgs_edge.kernels.form import GPU_WIDTHS, WIDTHS, Form, likely_form, native_width
 from flexgs_edge.kernels.loop_limit import LIMITED_BLOCKS, STEPS_A_PAIR, check_steps
-from flexgs_edge.kernels.rounding import rounding_options
 from flexgs_edge.kernels.session import DeviceArray, Session
 from flexgs_edge.memory.budget import MemoryBudget
 
@@ -44,10 +43,10 @@ class OpenCLBackend:
         Lanes of a vector: 16, 8, 4 or 1; in the GPU form 4 or 1.
     form : {"cpu", "gpu"}, optional
         Form of the blend kernel: one work-item a tile, or one work-group a tile.
-    written_fma, written_division : bool, optional
-        Whether `fma` is written out, and whether quotients and roots are rounded by us.
+    written_fma : bool, optional
+        Whether `fma` is written out.
 
-    By default, all four are what the self-test found to be fastest (`DeviceInfo.form`); if it has not run, they follow
+    By default, all three are what the self-test found to be fastest (`DeviceInfo.form`); if it has not run, they follow
     the device's type.
     """
 
@@ -60,7 +59,6 @@ class OpenCLBackend:
         width: int | None = None,
         form: str | None = None,
         written_fma: bool | None = None,
-        written_division: bool | None = None,
     ) -> None:
         start = time.perf_counter()
         self.session = Session(info, budget)
@@ -69,13 +67,15 @@ class OpenCLBackend:
             chosen = replace(chosen, kind=form, width=1 if form == "gpu" else native_width(info))
         self.form, self.width = chosen.kind, width or chosen.width
         self.written_fma = chosen.written_fma if written_fma is None else written_fma
-        self.written_division = chosen.written_division if written_division is None else written_division
         widths = GPU_WIDTHS if self.form == "gpu" else WIDTHS
         if self.width not in widths:
             expected = ", ".join(map(str, widths))
             raise DeviceError(f"vector width {self.width} of the {self.form} form: expected one of {expected}")
         self.name = f"{info.name} ({info.platform})"
-        self._options = rounding_options(info)
+        # OpenCL does not ask for rounded quotients and roots: docs/devices.md#quotients-and-roots
+        offers = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
+        rounds = info.handle is not None and info.handle.single_fp_config & offers
+        self._options = ("-cl-fp32-correctly-rounded-divide-sqrt",) if rounds else ()
         # Hints and conversions that are not OpenCL C: only PoCL's compiler is known to take them, and only it gains by them.
         self._builtins = "portable computing" in info.platform.lower()
         # Blocks of the serial passes: enough to keep all compute units busy, few enough for short scans.
@@ -146,8 +146,6 @@ class OpenCLBackend:
                 options += [f"-DGROUP={self._scan_group}", f"-DLIST_GROUP={LIST_GROUP}"]
             if self.written_fma:
                 options.append("-DWRITTEN_FMA")
-            if self.written_division:
-                options.append("-DWRITTEN_DIVISION")
             if self._builtins:
                 options.append("-DCLANG_BUILTINS")
             source = load_source(spec.file.format(form=self.form), spec.stats, self.form)

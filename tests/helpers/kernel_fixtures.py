@@ -28,7 +28,6 @@ GPU_FORMS = {
     "gpu": Form("gpu", 1),
     "gpu4": Form("gpu", 4),
     "fma": Form("gpu", 4, written_fma=True),
-    "div": Form("gpu", 4, written_division=True),
 }
 
 

@@ -16,7 +16,6 @@ from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.form import Form, likely_form, possible_forms
 from flexgs_edge.kernels.form_probe import Measured, may_write_fma, measure_forms
 from flexgs_edge.kernels.opencl import OpenCLBackend
-from flexgs_edge.kernels.rounding import rounds_division
 from kernel_fixtures import default_device, large_budget
 
 CPU = DeviceInfo(0, "a", "b", "cpu", "1", "OpenCL C 1.2", 2, 8, 4096, 1 << 15, 1 << 32, 1 << 30, "ok")
@@ -85,23 +84,10 @@ def test_fma_is_written_out_only_where_the_device_has_none(monkeypatch: pytest.M
         return 1 / form.width + (form.written_fma is not faster)
 
     monkeypatch.setattr(form_probe, "OpenCLBackend", backend)
-    monkeypatch.setattr(form_probe, "rounds_division", lambda info: True)
     for faster, names in ((True, ["gpu4+fma", "gpu1+fma", "gpu1"]), (False, ["gpu4", "gpu1", "gpu1+fma"])):
         monkeypatch.setattr(form_probe, "_seconds", partial(seconds, faster))
         measured, failed = measure_forms(device_with(flags.INF_NAN))
         assert [str(one.form) for one in measured] == names and failed == "the compiler refuses it"
-    monkeypatch.setattr(form_probe, "rounds_division", lambda info: False)
-    measured, _ = measure_forms(device_with(flags.FMA))
-    assert [str(one.form) for one in measured] == ["gpu4+div", "gpu1+div"]
-
-
-def test_a_device_that_cannot_divide_has_no_form(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(info: DeviceInfo) -> bool:
-        raise DeviceError("it is gone")
-
-    assert rounds_division(default_device())
-    monkeypatch.setattr(form_probe, "rounds_division", broken)
-    assert measure_forms(default_device()) == ([], "it is gone")
 
 
 def test_the_fastest_form_that_is_right_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:

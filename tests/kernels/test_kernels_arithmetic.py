@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import flexgs_edge.constants as constants
-from flexgs_edge.kernels.cl_sources import KERNEL_DIR_VARIABLE, constants_header, kernel_dir
-from flexgs_edge.kernels.launch_record import load_record
+from flexgs_edge.kernels.cl_sources import constants_header, kernel_dir
 from flexgs_edge.kernels.opencl import OpenCLBackend
-from flexgs_edge.kernels.self_test import verdict
 from flexgs_edge.kernels.twins.arithmetic import f32, fexp2, flog2, fma
-from kernel_fixtures import FORMS, default_device, large_budget, open_form, same_bits
+from kernel_fixtures import FORMS, open_form, same_bits
 
 EXP2_ERROR = 2.15e-7
 """Largest relative error over all float32 in [-0.5, 0.5]: 2.142e-7 at -0.4421016."""
@@ -28,22 +23,17 @@ def run_probe(
     inputs: list[np.ndarray],
     outputs: int = 1,
     dtype: type = np.float32,
-    common: Callable[[str], str] = str,
 ) -> list[np.ndarray]:
-    """Run a throw-away kernel after constants and common.clh; `body` reads x0, x1, ... and writes y0, y1, ... at i.
-
-    `common` changes the text of common.clh.
-    """
+    """Run a throw-away kernel after constants and common.clh; `body` reads x0, x1, ... and writes y0, y1, ... at i."""
     backend = open_form(form)
     assert isinstance(backend, OpenCLBackend)
     names = [f"__global const float *x{k}" for k in range(len(inputs))]
     kind = "uint" if dtype is np.uint32 else "float"
     names += [f"__global {kind} *y{k}" for k in range(outputs)]
-    source = constants_header() + common((kernel_dir() / "common.clh").read_text())
+    source = constants_header() + (kernel_dir() / "common.clh").read_text()
     source += f"\n__kernel void probe({', '.join(names)}) {{ const size_t i = get_global_id(0) * W; {body} }}\n"
     session = backend.session
-    written = {"-DWRITTEN_FMA": backend.written_fma, "-DWRITTEN_DIVISION": backend.written_division}
-    options = (f"-DW={backend.width}", *(option for option, chosen in written.items() if chosen))
+    options = (f"-DW={backend.width}", *(["-DWRITTEN_FMA"] if backend.written_fma else []))
     kernel = session.kernel(source, "probe", options, "b" * len(names))
     size = inputs[0].size if inputs else backend.width
     arrays = [session.array((size,), np.float32) for _ in inputs] + [
@@ -108,66 +98,6 @@ def test_fma_of_all_numbers(form: str) -> None:
         assert steady.mean() > 0.99
         expected, got = expected[steady], got[steady]
     assert same_bits(got, expected)
-
-
-def spoiled(common: str) -> str:
-    """common.clh for a device whose quotients are up to two units in the last place away, and whose roots up to three."""
-    quotients = ("a / b", "fma(-q, b, a) / b", "left / b", "fma(-root, root, x) / root")
-    for exact, units in (*((text, 2) for text in quotients), ("sqrt(x)", 3)):
-        assert common.count(f" {exact}") + common.count(f"({exact}") == 1
-        common = common.replace(exact, f"SPOILED({exact}, {units})")
-    assert common.count("((a) / (b))") == 1
-    common = common.replace("((a) / (b))", "SPOILED((a) / (b), 2)")
-    # Another error for each number, none where a result is zero or not finite.
-    return (
-        "#define SPOILED(x, units) spoil(x, units)\n"
-        "inline float __attribute__((overloadable)) spoil(float x, int units) {\n"
-        "  const int bits = as_int(x), off = (int)((uint)bits * 2654435761u >> 16) % (2 * units + 1) - units;\n"
-        "  return fabs(x) > 1e-37f && fabs(x) < 1e38f ? as_float(bits + off) : x;\n"
-        "}\n"
-        "inline float4 __attribute__((overloadable)) spoil(float4 x, int n) {\n"
-        "  return (float4)(spoil(x.s0, n), spoil(x.s1, n), spoil(x.s2, n), spoil(x.s3, n));\n"
-        "}\n" + common
-    )
-
-
-def test_written_quotients_and_roots_are_rounded() -> None:
-    """From those of a device that is off by as much as OpenCL allows. Subnormal results may differ."""
-    count, random = 1 << 18, np.random.default_rng(9)
-    a, b = (any_floats(count, seed) for seed in (10, 11))
-    near = (random.uniform(0.5, 2, (2, count)) * 2.0 ** random.integers(-60, 60, (2, count))).astype(np.float32)
-    # Exact quotients and roots, and those next to them.
-    whole = random.integers(1, 1 << 12, (2, count)).astype(np.float32)
-    beside = ((whole[0] * whole[1]).view(np.int32) + random.integers(-1, 2, count, dtype=np.int32)).view(np.float32)
-    x, y = np.concatenate([a, near[0], beside]), np.concatenate([b, near[1], whole[0]])
-    body = "STOREF(quotient(LOADF(x0, i), LOADF(x1, i)), y0, i); STOREF(sqrt(LOADF(x2, i)), y1, i);"
-    z = np.concatenate([a, near[0], np.square(whole[0]) * np.float32(0.25)])
-    z[-count // 2 :] = (z[-count // 2 :].view(np.int32) + 1).view(np.float32)
-    with np.errstate(all="ignore"):
-        expected = [x / y, np.sqrt(z)]
-    for got, wanted, given in zip(run_probe("div", body, [x, y, z], 2, common=spoiled), expected, ((x, y), (z,))):
-        tiny = np.finfo(np.float32).tiny
-        with np.errstate(all="ignore"):
-            steady = (wanted == 0) | ~(np.abs(wanted) < tiny)
-            for values in given:
-                steady &= (values == 0) | ~(np.abs(values) < tiny)
-        assert steady.mean() > 0.9
-        assert same_bits(got[steady], wanted[steady])
-
-
-def test_a_device_that_does_not_round_passes_with_written_quotients(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All of the self-test; without them, it is refused."""
-    for file in kernel_dir().glob("*.cl*"):
-        text = file.read_text()
-        (tmp_path / file.name).write_text(spoiled(text) if file.name == "common.clh" else text)
-    monkeypatch.setenv(KERNEL_DIR_VARIABLE, str(tmp_path))
-    said = [
-        verdict(load_record(), OpenCLBackend(replace(default_device(), form=form), large_budget()))
-        for form in ("gpu4+div", "gpu4")
-    ]
-    assert said[0] == "ok" and said[1].startswith("kernel activate computes")
 
 
 @pytest.mark.parametrize("form", FORMS)
