@@ -20,11 +20,9 @@ from .commands.evaluate import evaluate as evaluate
 from .commands.info import info as info
 from .commands.render import render_views as render_views
 from .commands.score import score_gaussians as score_gaussians
-from .commands.synth import synth as synth
 from .commands.trim import trim as trim
 from .commands.verify import verify as verify
 from .commands.view import view as view
-from .commands.worth import worth as worth
 from .errors import BudgetError as BudgetError
 from .errors import DeviceError as DeviceError
 from .errors import FlexGSError as FlexGSError
@@ -40,14 +38,12 @@ from .report.file_results import DecompressResult as DecompressResult
 from .report.file_results import DevicesResult as DevicesResult
 from .report.file_results import RenderResult as RenderResult
 from .report.file_results import ScoreResult as ScoreResult
-from .report.file_results import SynthResult as SynthResult
 from .report.file_results import TrimResult as TrimResult
 from .report.file_results import VerifyResult as VerifyResult
 from .report.file_results import ViewResult as ViewResult
 from .report.info_result import InfoResult as InfoResult
 from .report.results import CompressResult as CompressResult
 from .report.results import EvaluateResult as EvaluateResult
-from .report.worth_result import WorthResult as WorthResult
 from .run.inputs import read_scene as read_scene
 from .run.options import CompressOptions as CompressOptions
 from .run.options import ViewOptions as ViewOptions

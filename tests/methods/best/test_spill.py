@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from flexgs_edge.commands.synth import synth
+from benchmarks.synth import synth
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.methods.best.spill import row_bytes
 from flexgs_edge.units import format_mib, parse_size

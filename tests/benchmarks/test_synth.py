@@ -1,20 +1,17 @@
-"""`synth`: exact counts, the same bytes however it is cut, a look that stays, cameras, errors, and memory that does not grow."""
+"""`benchmarks.synth`: exact counts, the same bytes however it is cut, a look that stays, and cameras."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import flexgs_edge.commands.synth as synth_module
-from camera_files import write_inria, write_transforms
+from benchmarks.parts import ACROSS, ALONG, MOST_PARTS, OFFSET, PartsSource, half_logits
+from benchmarks.synth import synth, tile_shifts, tiled_cameras
+from camera_files import write_inria
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.commands.synth import synth, tile_shifts, tiled_cameras
-from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import PlySource, write_ply
 from flexgs_edge.kernels.open_backend import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
@@ -22,7 +19,6 @@ from flexgs_edge.quality.psnr import psnr
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELDS
-from flexgs_edge.scene.parts import ACROSS, ALONG, MOST_PARTS, OFFSET, PartsSource, half_logits
 from flexgs_edge.scene.rotations import turned
 from flexgs_edge.scene.source import MemorySource, SceneSource
 from synthetic import make_camera, random_scene
@@ -188,101 +184,12 @@ def test_every_tile_is_seen(views: int, tiles: int) -> None:
 
 def test_a_scene_and_its_cameras(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out" / "big.ply"
-    found = synth(out, scene, 1000)
-    made = PlySource(out)
-    assert made.count == found.count == 1000 and out.stat().st_size == found.size
-    assert (found.tiles, found.parts, found.views) == (1, (3, 4), 3)
-    before, after = read_cameras(scene.parent), read_cameras(out.parent)
-    for one, other in zip(before, after, strict=True):
+    assert synth(out, scene, 1000) == 1 and PlySource(out).count == 1000
+    for one, other in zip(read_cameras(scene.parent), read_cameras(out.parent), strict=True):
         assert one.name == other.name and (one.width, one.fx, one.fy) == (other.width, other.fx, other.fy)
         assert np.allclose(one.center, other.center) and np.allclose(one.rotation, other.rotation)
-    text = found.summary()
-    assert "1000 Gaussians" in text and "3 or 4 parts" in text and "3 views" in text
     many = 300 * MOST_PARTS * 4 - 5
-    found = synth(out, scene, many, force=True)
-    assert found.tiles == 4 and PlySource(out).count == many and "in 4 copies side by side" in found.summary()
-    assert len(read_cameras(out.parent)) == 4
-
-
-def test_the_memory_limit_does_not_show_in_the_bytes(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "out"
-    synth(folder / "a.ply", scene, 5000)
-    (folder / "cameras.json").unlink()
-    monkeypatch.setattr(synth_module, "CHUNK_ROWS", 1025)
-    synth(folder / "b.ply", scene, 5000)
-    assert (folder / "a.ply").read_bytes() == (folder / "b.ply").read_bytes()
-    with pytest.raises(BudgetError, match="use --memory-limit"):
-        synth(tmp_path / "c.ply", scene, 5000, memory_limit=2**20)
-    assert not list(tmp_path.glob("*.ply")) and not (tmp_path / "cameras.json").exists()
-
-
-def test_a_scene_without_cameras_gets_none(scene: Path, tmp_path: Path) -> None:
-    (scene.parent / "cameras.json").unlink()
-    found = synth(tmp_path / "out" / "big.ply", scene, 600)
-    assert found.cameras is None and [path.name for path in (tmp_path / "out").iterdir()] == ["big.ply"]
-    assert "views" not in found.summary()
-
-
-def test_what_the_cameras_lose_is_said(scene: Path, tmp_path: Path) -> None:
-    (scene.parent / "cameras.json").unlink()
-    write_transforms(scene.parent / "transforms.json", [make_camera(name="a.png", centre=(10.0, 14.5))], k1=0.1)
-    found = synth(tmp_path / "out" / "big.ply", scene, 600)
-    assert found.views == 1
-    assert "lens distortion left out" in found.summary() and "up to 9.5 pixels off the middle" in found.summary()
-
-
-def test_errors(scene: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    with pytest.raises(InputError, match="expected at least the 300 of .*to make a scene smaller, use compress"):
-        synth(out / "a.ply", scene, 299)
-    with pytest.raises(InputError, match="less than 2147483648"):
-        synth(out / "a.ply", scene, 2**31)
-    for name in ("a.fgs", "a.compressed.ply", "a"):
-        with pytest.raises(InputError, match=r"expected a name that ends in \.ply"):
-            synth(out / name, scene, 600)
-    with pytest.raises(InputError, match="--seed -1: expected 0 or more"):
-        synth(out / "a.ply", scene, 600, seed=-1)
-    with pytest.raises(InputError, match=r"cameras\.json: these are the scene's own cameras"):
-        synth(scene.parent / "big.ply", scene, 600, force=True)
-    with pytest.raises(InputError, match="does not exist; make it first"):
-        synth(tmp_path / "nowhere" / "a.ply", scene, 600)
-    assert not list(out.iterdir())
-    (out / "cameras.json").write_text("mine")
-    with pytest.raises(InputError, match=r"cameras\.json: the file exists"):
-        synth(out / "a.ply", scene, 600)
-    assert [(path.name, path.read_text()) for path in out.iterdir()] == [("cameras.json", "mine")]
-
-
-def test_nothing_half_written_is_left(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = PartsSource.read
-
-    def broken(self: PartsSource, rows: slice, *arguments: object) -> object:
-        if rows.start > 0:
-            raise KeyboardInterrupt
-        return plain(self, rows, *arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(PartsSource, "read", broken)
-    with pytest.raises(KeyboardInterrupt):
-        synth(tmp_path / "out" / "big.ply", scene, 2 * synth_module.CHUNK_ROWS)
-    assert not list((tmp_path / "out").iterdir())
-
-
-def test_memory_does_not_grow(scene: Path, tmp_path: Path) -> None:
-    """Ten and a hundred times the Gaussians of a chunk, on the command line, under a limit: the same peak to 4 MiB."""
-    peaks = []
-    for count in (160_000, 800_000):
-        folder = tmp_path / str(count)
-        folder.mkdir()
-        command = ["synth", folder / "big.ply", "--from", scene, "--gaussians", count, "--memory-limit", "200MiB", "-q"]
-        done = subprocess.run(
-            [sys.executable, "-m", "flexgs_edge", *map(str, command), "--json", "-"], capture_output=True, check=True
-        )
-        found = json.loads(done.stdout)
-        assert found["command"] == "synth" and found["count"] == count
-        assert (folder / "big.ply").stat().st_size == found["size"] > 100 * count
-        assert b"wrote " in done.stderr
-        peaks.append(found["peak_memory"])
-        (folder / "big.ply").unlink()
-    assert abs(peaks[1] - peaks[0]) < 4 * 2**20 and max(peaks) < 200 * 2**20
+    assert synth(tmp_path / "more.ply", scene, many) == 4 and PlySource(tmp_path / "more.ply").count == many
+    assert len(read_cameras(tmp_path / "cameras.json")) == 4
+    with pytest.raises(InputError, match="expected at least the 300"):
+        synth(tmp_path / "few.ply", scene, 299)
