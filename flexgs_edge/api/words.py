@@ -53,7 +53,6 @@ class CompressWords(TypedDict, total=False):
     method: str
     select: str
     score: str
-    save_scores: str | None
     score_cache: str | None
     max_drop: float | None
     min_fidelity: float | None

@@ -135,10 +135,10 @@ Several scenes:
     EFFORT,
     "--effort",
     metavar="WORD",
-    type=click.Choice(["fast", "balanced", "max", "thorough"]),
+    type=click.Choice(["fast", "balanced", "max"]),
     default="balanced",
     show_default=True,
-    help="fast, balanced or max. More effort: smaller files, slower. thorough has become max.",
+    help="fast, balanced or max. More effort: smaller files, slower.",
 )
 @option(
     MACHINES,
@@ -219,13 +219,11 @@ Several scenes:
 @option(
     METHOD,
     "--score",
-    metavar="gs|meson|FILE",
+    type=click.Choice(["gs", "meson"]),
     default="gs",
     show_default=True,
-    help="Importance of a Gaussian. gs: opacity, volume and pixels hit. meson: as MesonGS. FILE: .npy or .npz, one number "
-    "a Gaussian.",
+    help="Importance of a Gaussian. gs: opacity, volume and pixels hit. meson: as MesonGS.",
 )
-@option(METHOD, "--save-scores", metavar="FILE", help="Write the scores to a .npy file, for --score in later runs.")
 @option(
     METHOD,
     "--score-cache",

@@ -11,7 +11,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
 
 @click.command(cls=help_page.SectionCommand)
 @shared_options.scene_argument
-@help_page.option(help_page.OUTPUT, "-o", "--output", metavar="SCORES.npy", required=True, help="NumPy file to write.")
+@help_page.option(help_page.OUTPUT, "-o", "--output", metavar="SCORES.npz", required=True, help="NumPy file to write.")
 @help_page.option(
     "Score",
     "--score",
@@ -30,14 +30,14 @@ def command(
 ) -> None:
     """Save the importance of every Gaussian, for --method paper.
 
-    The training views are drawn to score the Gaussians. The file holds one float64 for each Gaussian, in the scene's order:
-    the logarithm of the score, or -inf if no training view sees it. `compress --method paper --score FILE` then skips scoring.
-    Photos are not compared. Photos smaller than the cameras say scale the views down.
+    The training views are drawn to score the Gaussians. `compress --method paper --score-cache FILE` with the same scene,
+    views and score then skips scoring. The file holds one float64 for each Gaussian, in the scene's order: the logarithm of the
+    score, or -inf if no training view sees it. Photos are not compared. Photos smaller than the cameras say scale the views down.
 
     \b
     Examples:
-      flexgs-edge score point_cloud.ply -o scores.npy
-      flexgs-edge compress point_cloud.ply -o scene.fgs --method paper --score scores.npy --max-drop 0.5
+      flexgs-edge score point_cloud.ply -o scores.npz
+      flexgs-edge compress point_cloud.ply -o scene.fgs --method paper --score-cache scores.npz --max-drop 0.5
     """
     progress = talk.start(quiet, json_path, force)
     from flexgs_edge.commands.score import score_gaussians

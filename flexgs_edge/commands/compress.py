@@ -79,17 +79,17 @@ def compress(
     with run.clock.stage("open"):
         prepare_memory(run)
         _foresee(run)
-        scores = paper.given_scores(run)
     with ExitStack() as stack:
         bench = None if run.views is None else stack.enter_context(open_bench(run, options.cluster))
         _foresee(run, opened=True)
         if bench is not None:
             run = check_views(run, bench, options.trust_views)
         ready = run if bench is None or options.method != "paper" else _read_often(run, bench)
-        if run.output.format is not None:
-            made = foreign.compress(ready, bench, scores)
-        elif options.method == "paper":
-            made = paper.compress(ready, bench, scores)
+        if options.method == "paper":
+            made = paper.compress(ready, bench)
+        elif run.output.format is not None:
+            assert bench is not None  # the plan has refused such runs without views
+            made = foreign.compress(ready, bench)
         else:
             assert bench is not None  # the plan has refused such runs without views
             made = best.compress(ready, bench)
@@ -162,8 +162,7 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
         sensitivity=made.sensitivity,
         quality=made.quality,
         quality_views=plan.kind_of(plan.report, views),
-        scores_saved=options.save_scores,
-        score_cache=options.score_cache if plan.computes_scores else None,
+        score_cache=options.score_cache if plan.needs_scores else None,
         scores_reused=made.scores_reused,
         run=bench_info(run, bench),
         format=run.output.format.suffix[1:] if run.output.format else "fgs",

@@ -29,8 +29,6 @@ LOG = logging.getLogger("flexgs_edge")
 OF_ONE_SCENE: dict[str, tuple[object, ...]] = {
     "cameras": (None, AUTO_CAMERAS, NO_CAMERAS),
     "images": (None, NO_PHOTOS),
-    "score": ("gs", "meson"),
-    "save_scores": (None,),
     "score_cache": (None,),
     "report": (None,),
     "resume": (False,),

@@ -11,7 +11,7 @@ import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_writable
-from flexgs_edge.methods.paper.score_files import save_scores
+from flexgs_edge.methods.paper.score_cache import score_cache
 from flexgs_edge.methods.paper.scores import SCORE_ROW_BYTES, SCORES, score_scene
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import ScoreResult
@@ -40,7 +40,8 @@ def score_gaussians(
     input : path
         A scene file or a model folder.
     output : path
-        The `.npy` file to write: [N] f64, logarithms of the scores, -inf for Gaussians that no view sees.
+        The `.npz` file to write, as `score_cache` reads it: `scores` [N] f64, logarithms of the scores, -inf for Gaussians
+        that no view sees, and a fingerprint of what they depend on.
     options : ViewOptions, optional
         Options as on the command line.
     score : {"gs", "meson"}
@@ -60,8 +61,8 @@ def score_gaussians(
     options = replace(options or ViewOptions(), **words)
     if score not in SCORES:
         raise InputError(f"--score {score!r}: expected one of {', '.join(SCORES)}")
-    if Path(output).suffix.lower() != ".npy":
-        raise InputError(f"-o {output}: expected a name that ends in .npy")
+    if Path(output).suffix.lower() != ".npz":
+        raise InputError(f"-o {output}: expected a name that ends in .npz")
     check_writable(output, force)
     # Open the photos as `compress` does: their size sets the size of the views, and with it the scores.
     run = open_run(input, options, progress)
@@ -83,7 +84,7 @@ def score_gaussians(
             device_scene = renderer.load(source)
         with device_scene, clock.stage("score"):
             scores = score_scene(renderer, device_scene, source, views.of(views.train), score, progress)
-        save_scores(output, scores, force)
+        score_cache(output, run, score).save(scores)
         return ScoreResult(
             scene=scene_info(run.scene),
             views=views_info(views),

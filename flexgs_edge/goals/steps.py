@@ -10,7 +10,7 @@ from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.promise import Promised, in_the_way
 from flexgs_edge.goals.target import Measurement, Target
 
-Phase = Literal["list", "refine", "confirm", "fixed", "line", "multiplier"]
+Phase = Literal["list", "refine", "confirm", "fixed", "multiplier"]
 MAX_PRUNE = 980
 """Largest prune rate of the refinement, in thousandths; something must be left to draw."""
 REFINE_STEPS = {"fast": 4, "balanced": 10, "max": 32}
@@ -31,7 +31,7 @@ class Step:
         Quality; `None` if size alone decided.
     excess : float
         By how much the point misses the target; zero or less holds.
-    phase : {"list", "refine", "confirm", "fixed", "line", "multiplier"}
+    phase : {"list", "refine", "confirm", "fixed", "multiplier"}
         Part of the search that asked for the point.
     seconds : float
         Wall time of the measurement.

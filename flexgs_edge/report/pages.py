@@ -175,8 +175,6 @@ def _compress_facts(result: CompressResult) -> list[tuple[str, object]]:
         facts.append(("bits", ", ".join(f"{name} {bits}" for name, bits in result.bits.items()) + found))
     if result.target is not None:
         facts += [("target", result.target), ("decided by", decided_words(result))]
-    if result.scores_saved:
-        facts.append(("scores", f"saved to {result.scores_saved}"))
     return facts
 
 

@@ -72,8 +72,6 @@ class CompressResult:
         Quality of the decoded file over `quality_views`; `None` without cameras.
     quality_views : str
         The kind of views that `quality` is measured on: `held-out`, `training` or `none`.
-    scores_saved : str or None
-        File that the scores were written to.
     score_cache : str or None
         File that keeps the scores between runs.
     scores_reused : bool
@@ -118,7 +116,6 @@ class CompressResult:
     sensitivity: tuple[Sensitivity, ...]
     quality: Quality | None
     quality_views: str
-    scores_saved: str | None
     score_cache: str | None
     scores_reused: bool
     run: RunInfo
@@ -182,7 +179,6 @@ class CompressResult:
             "training_fidelity": rounded(self.training_fidelity),
             "scored": asdict(self.scored) if self.scored else None,
             "warnings": list(self.warnings),
-            "scores_saved": self.scores_saved,
             "score_cache": self.score_cache,
             "scores_reused": self.scores_reused,
             "run": self.run.to_json(),
@@ -217,8 +213,6 @@ class CompressResult:
             decoded = "decoded file" if self.output else "as it would decode"
             lines += quality_lines(self.quality, f"{decoded}, {len(self.quality.views)} {self.quality_views} views")
         lines += [line("warning", words) for words in self.warnings]
-        if self.scores_saved:
-            lines.append(line("scores", f"saved to {self.scores_saved}"))
         if self.score_cache:
             lines.append(
                 line("scores", f"{'reused from' if self.scores_reused else 'made anew, kept in'} {self.score_cache}")

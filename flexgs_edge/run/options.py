@@ -38,8 +38,7 @@ NO_CAMERAS = "none"
 """`--cameras none`: no views at all. Only fixed rates work then."""
 METHODS = ("best", "paper")
 EFFORT_WORDS = tuple(REFINE_STEPS)
-RETIRED_EFFORTS = {"thorough": "max"}
-"""Words for `--effort` that are still accepted, and what they became."""
+SCORES = ("gs", "meson")
 SELECTS = ("test", "train")
 EXPOSURES = ("fit", "none")
 PROMISES = ("whole", "mean")
@@ -53,7 +52,6 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "prune_rate": ("paper", None),
     "sh_rate": ("paper", None),
     "score": ("paper", "gs"),
-    "save_scores": ("paper", None),
     "score_cache": ("paper", None),
     "bits": ("paper", "paper"),
     "groups": ("paper", None),
@@ -176,10 +174,8 @@ class CompressOptions(ViewOptions):
         method: faster, larger files.
     select : {"test", "train"}
         Views that decide when the search stops: the held-out views (`test`) or the training views. Default: `test`.
-    score : str
-        Importance score: `gs`, `meson`, or a .npy/.npz file with one number per Gaussian (`paper`). Default: `gs`.
-    save_scores : str, optional
-        Also write the scores to this .npy file (`paper`).
+    score : {"gs", "meson"}
+        Importance score: `gs` or `meson` (`paper`). Default: `gs`.
     score_cache : str, optional
         Keep the scores in this file. Reuse them when scene, views and score are the same (`paper`).
     max_drop, min_fidelity : float, optional
@@ -209,7 +205,7 @@ class CompressOptions(ViewOptions):
         Go on with cameras and photos that do not fit the scene. Default: raise `InputError`.
     effort : {"fast", "balanced", "max"}
         More effort makes smaller files and takes longer. `balanced` (from 10 000 Gaussians) and `max` also distil (`best`,
-        `.fgs`). `thorough` has become `max`. Default: `balanced`.
+        `.fgs`). Default: `balanced`.
     best_effort : bool
         If the target cannot be met, write the closest result. Default: raise `TargetError`.
     unseen : str
@@ -248,7 +244,6 @@ class CompressOptions(ViewOptions):
     method: str = "best"
     select: str = "test"
     score: str = "gs"
-    save_scores: str | None = None
     score_cache: str | None = None
     max_drop: float | None = None
     min_fidelity: float | None = None
@@ -282,12 +277,9 @@ class CompressOptions(ViewOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.effort in RETIRED_EFFORTS:
-            now = RETIRED_EFFORTS[self.effort]
-            LOG.warning("--effort %s has become --effort %s", self.effort, now)
-            object.__setattr__(self, "effort", now)
         for word, value, known in (
             ("--method", self.method, METHODS),
+            ("--score", self.score, SCORES),
             ("--select", self.select, SELECTS),
             ("--effort", self.effort, EFFORT_WORDS),
             ("--promise", self.promise, PROMISES),
@@ -312,8 +304,6 @@ class CompressOptions(ViewOptions):
             raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
         if self.preview is not None and not 0 <= self.preview <= PREVIEW_MOST:
             raise InputError(f"--preview {self.preview}: expected 0 (none) to {PREVIEW_MOST} bytes")
-        if self.score_cache is not None and self.score not in ("gs", "meson"):
-            raise InputError(f"--score-cache keeps scores that are computed: leave it out with --score {self.score}")
         _ = self.writing
         self._check_targets()
         self.bit_spec()

@@ -35,8 +35,6 @@ NO_OUTPUT = Output()
 def check_output(output: str | os.PathLike[str] | None, options: CompressOptions) -> Output:
     """Check every file that a run writes, before any work; raises `InputError` for what cannot be written."""
     format = _foreign_format(output, options)
-    if options.save_scores is not None:
-        check_writable(options.save_scores, options.force)
     if options.score_cache is not None:
         check_writable(options.score_cache, force=True)
     if options.dry_run:
@@ -49,18 +47,13 @@ def check_output(output: str | os.PathLike[str] | None, options: CompressOptions
     return Output(Path(output), format)
 
 
-FORMAT_BITS = ("bits", "groups")
-"""Options for precisions that other formats have settled."""
-
-
 def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOptions) -> Format | None:
     """The format that `-o` asks for, if the options fit it; `None` for `.fgs`."""
     format = None if output is None else written_format(output)
     if format is None:
         return None
-    for name in FORMAT_BITS:
-        if getattr(options, name) != CompressOptions.__dataclass_fields__[name].default:
-            raise InputError(f"--{name}: {format.suffix} has precisions of its own; leave it out, or write a .fgs")
+    if options.method == "paper":
+        raise InputError(f"--method paper writes .fgs files alone, not {format.suffix}; leave it out, or write a .fgs")
     if options.distil:
         raise InputError(
             f"--distil {options.distil}: distilling ends on the grid of a .fgs, {format.suffix} has its own; "

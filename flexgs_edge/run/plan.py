@@ -29,8 +29,8 @@ class Plan:
         The kind of drop that decides: `drop` against photos, else `modelled drop`.
     target : Target or None
         `None` for fixed rates.
-    needs_scores, computes_scores : bool
-        Whether the method needs importance scores, and whether it computes them instead of reading a file.
+    needs_scores : bool
+        Whether the method computes importance scores.
     """
 
     decide: list[int]
@@ -38,36 +38,33 @@ class Plan:
     figure: Figure
     target: Target | None
     needs_scores: bool
-    computes_scores: bool
 
     @classmethod
     def make(cls, options: CompressOptions, scene: CheckedScene, views: ViewSet | None) -> Plan:
         fixed = options.fixed
         needs_scores = fixed != EVERYTHING and options.method == "paper"
-        computes = needs_scores and options.score in ("gs", "meson")
         bits, _ = options.bit_spec()
         if views is None:
             if options.method != "paper":
                 raise InputError(
                     f"{WITHOUT_VIEWS}. Views are needed to measure what each Gaussian is worth; without them only "
-                    "--method paper with fixed rates works"
+                    "--method paper with both rates 0 works"
                 )
-            if fixed is None or computes or bits is None:
+            if fixed is None or needs_scores or bits is None:
                 why = (
                     "to score Gaussians and to judge the result"
                     if fixed is None or bits is None
                     else "to score Gaussians"
                 )
                 raise InputError(
-                    f"{WITHOUT_VIEWS}. Views are needed {why}; without them only fixed rates work: "
-                    "--prune-rate and --sh-rate with --score FILE, or both rates 0"
+                    f"{WITHOUT_VIEWS}. Views are needed {why}; without them only --prune-rate 0 and --sh-rate 0 work"
                 )
-            return cls([], [], "modelled drop", None, needs_scores, False)
+            return cls([], [], "modelled drop", None, needs_scores)
         if options.select == "test" and not views.held_out:
             raise InputError(
                 "--holdout 0 leaves no view to decide on: use --select train as well, or another --holdout"
             )
-        if not views.train and (options.method != "paper" or computes or bits is None or options.select == "train"):
+        if not views.train and (options.method != "paper" or needs_scores or bits is None or options.select == "train"):
             raise InputError(
                 f"{views.cameras_from}: {len(views.cameras)} views, all of them held out (every {options.holdout}th by name): "
                 "give more views, or --holdout 0 --select train"
@@ -80,7 +77,6 @@ class Plan:
             figure=figure,
             target=options.target(figure, scene.ply_bytes),
             needs_scores=needs_scores,
-            computes_scores=computes,
         )
 
     @property

@@ -40,7 +40,7 @@ def make_settings(
     return {
         "program": f"flexgs-edge {__version__}",
         "method": options.method,
-        "score": None if not plan.needs_scores else options.score if plan.computes_scores else "file",
+        "score": options.score if plan.needs_scores else None,
         "prune_rate": choice.prune / 1000,
         "sh_rate": choice.sh / 1000,
         "bits": None if bits is None else options.bits if options.bits in ("auto", "paper") else str(bits),

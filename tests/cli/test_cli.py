@@ -19,11 +19,10 @@ import pytest
 from flexgs_edge import cli
 from flexgs_edge.cli import app
 from flexgs_edge.errors import BudgetError, DeviceError, InputError, TargetError
-from flexgs_edge.goals.line import LINE_STEPS
 from flexgs_edge.goals.steps import REFINE_STEPS
 from flexgs_edge.methods.best.effort import EFFORTS
 from flexgs_edge.methods.paper.scores import SCORES
-from flexgs_edge.run.options import EFFORT_WORDS, METHODS, RETIRED_EFFORTS, SELECTS, CompressOptions, ViewOptions
+from flexgs_edge.run.options import EFFORT_WORDS, METHODS, SELECTS, CompressOptions, ViewOptions
 from interruptible import running
 from tiny_project import COUNT, make_project
 
@@ -86,8 +85,8 @@ def test_words_of_the_options_are_those_of_the_library() -> None:
     given = {parameter.name: parameter for parameter in command.params}
     fields = set(CompressOptions.__dataclass_fields__)
     assert fields <= set(given), fields - set(given)
-    assert tuple(given["effort"].type.choices) == (*EFFORT_WORDS, *RETIRED_EFFORTS)
-    assert EFFORT_WORDS == tuple(EFFORTS) == tuple(REFINE_STEPS) == tuple(LINE_STEPS)
+    assert tuple(given["effort"].type.choices) == EFFORT_WORDS
+    assert EFFORT_WORDS == tuple(EFFORTS) == tuple(REFINE_STEPS)
     assert tuple(given["method"].type.choices) == METHODS and tuple(given["select"].type.choices) == SELECTS
     score = importlib.import_module("flexgs_edge.cli.score").command
     assert tuple({p.name: p for p in score.params}["score"].type.choices) == SCORES
@@ -140,7 +139,7 @@ def test_a_whole_way_in_processes_of_its_own(project: Path, tmp_path: Path) -> N
             "--device",
             "numpy",
         ),
-        ("score", project, "-o", tmp_path / "s.npy", "--device", "numpy"),
+        ("score", project, "-o", tmp_path / "s.npz", "--device", "numpy"),
     ]
     (project / "point_cloud" / "iteration_7").mkdir(parents=True, exist_ok=True)
     (project / "point_cloud" / "iteration_7" / "point_cloud.ply").write_bytes(
@@ -183,15 +182,14 @@ def test_text_and_json_of_info_agree(packed: Path, capsys: pytest.CaptureFixture
 def test_nothing_is_overwritten_without_force(
     project: Path, packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in ("a.fgs", "a.ply", "s.npy", "a.json", "v00.png"):
+    for name in ("a.fgs", "a.ply", "s.npz", "a.json", "v00.png"):
         (tmp_path / name).write_text("precious")
     scene, poses = project / "point_cloud.ply", project / "cameras.json"
     cases = [
         ("compress", scene, "-o", tmp_path / "a.fgs", *PAPER),
-        ("compress", scene, "-o", tmp_path / "n.fgs", "--save-scores", tmp_path / "s.npy", *PAPER),
         ("compress", scene, "-o", tmp_path / "n.fgs", "--json", tmp_path / "a.json", *PAPER),
         ("decompress", packed, "-o", tmp_path / "a.ply"),
-        ("score", scene, "-o", tmp_path / "s.npy"),
+        ("score", scene, "-o", tmp_path / "s.npz"),
         ("render", packed, "-o", tmp_path, "--cameras", poses, "--views", "0"),
         ("info", packed, "--json", tmp_path / "a.json"),
         ("devices", "--json", tmp_path / "a.json"),
@@ -199,7 +197,7 @@ def test_nothing_is_overwritten_without_force(
     for case in cases:
         code, out, err = run(*case, capsys=capsys)
         assert code == 2 and out == "" and "exists" in err and "-f" in err, case
-    assert all((tmp_path / name).read_text() == "precious" for name in ("a.fgs", "a.ply", "s.npy", "a.json", "v00.png"))
+    assert all((tmp_path / name).read_text() == "precious" for name in ("a.fgs", "a.ply", "s.npz", "a.json", "v00.png"))
     code, _, _ = run("decompress", packed, "-o", tmp_path / "a.ply", "-f", capsys=capsys)
     assert code == 0 and (tmp_path / "a.ply").stat().st_size > 1000
 
@@ -226,7 +224,7 @@ def test_nothing_is_overwritten_without_force(
         (["verify", "none.fgs"], "none.fgs"),
         (["render", "none.ply", "-o", "d", "--views", "3-4"], "START:STOP:STEP"),
         (["evaluate", "none.ply"], "Missing option"),
-        (["score", "none.ply", "-o", "s.npy", "--score", "magic"], "magic"),
+        (["score", "none.ply", "-o", "s.npz", "--score", "magic"], "magic"),
     ],
 )
 def test_misuse_ends_with_2_and_no_traceback(

@@ -91,7 +91,7 @@ def test_json_has_every_documented_key_and_no_infinity(done: tuple[Path, Compres
     assert set(record) >= {
         "program", "command", "input", "views", "output", "size", "ratio", "ratio_without_normals", "count", "sh_count",
         "prune_rate", "sh_rate", "method", "score", "select", "bits", "groups", "target", "decided_by", "reached",
-        "decision_views", "search", "sensitivity", "quality", "quality_views", "scores_saved", "run",
+        "decision_views", "search", "sensitivity", "quality", "quality_views", "run",
     }  # fmt: skip
     assert set(record["quality"]) == {
         "drop", "usual_drop", "fidelity", "modelled_drop", "base_psnr", "psnr", "original_psnr", "ssim",
@@ -126,8 +126,8 @@ def test_same_command_same_bytes(project: Path, done: tuple[Path, CompressResult
 
 def test_saved_scores_take_one_search(project: Path, done: tuple[Path, CompressResult], tmp_path: Path) -> None:
     folder, first = done
-    scored = str(folder / "s.npy")
-    result = compress(project / "point_cloud.ply", tmp_path / "b.fgs", max_drop=2.0, score=scored, **FAST)
+    scored = str(folder / "s.npz")
+    result = compress(project / "point_cloud.ply", tmp_path / "b.fgs", max_drop=2.0, score_cache=scored, **FAST)
     assert "score" not in result.run.stages
     assert (result.prune_rate, result.sh_rate, result.size) == (first.prune_rate, first.sh_rate, first.size)
     assert (
@@ -138,9 +138,9 @@ def test_saved_scores_take_one_search(project: Path, done: tuple[Path, CompressR
 
 def test_score_writes_what_compress_computes(project: Path, done: tuple[Path, CompressResult], tmp_path: Path) -> None:
     folder, _ = done
-    result = score_gaussians(project / "point_cloud.ply", tmp_path / "s.npy", holdout=4)
-    assert np.array_equal(np.load(tmp_path / "s.npy"), np.load(folder / "s.npy"))
-    assert result.scored_views == 6 and result.unseen == int(np.isneginf(np.load(tmp_path / "s.npy")).sum())
+    result = score_gaussians(project / "point_cloud.ply", tmp_path / "s.npz", holdout=4)
+    assert (tmp_path / "s.npz").read_bytes() == (folder / "s.npz").read_bytes()
+    assert result.scored_views == 6 and result.unseen == int(np.isneginf(np.load(tmp_path / "s.npz")["scores"]).sum())
 
 
 def test_decompress_gives_the_files_values(done: tuple[Path, CompressResult], tmp_path: Path) -> None:
@@ -345,7 +345,7 @@ def test_verify_names_the_damaged_part(done: tuple[Path, CompressResult], tmp_pa
     (tmp_path / "a.fgs").write_bytes(data)
     assert verify(tmp_path / "a.fgs").damaged == ("chunk 0",)
     with pytest.raises(InputError, match=r"expected a \.fgs file"):
-        verify(folder / "s.npy")
+        verify(folder / "s.npz")
 
 
 def test_a_compressed_file_can_be_compressed_again(

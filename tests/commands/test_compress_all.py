@@ -137,8 +137,6 @@ def test_a_dry_run_writes_nothing(scans: Path, tmp_path: Path) -> None:
         ({"report": "page"}, "--report page belongs to one scene"),
         ({"cameras": "poses.json"}, "--cameras poses.json belongs"),
         ({"images": "photos"}, "--images photos belongs"),
-        ({"method": "paper", "score": "s.npy"}, "--score s.npy belongs"),
-        ({"method": "paper", "save_scores": "s.npy"}, "--save-scores s.npy belongs"),
         ({"method": "paper", "score_cache": "s.npz"}, "--score-cache s.npz belongs"),
         ({"resume": True}, "--resume belongs"),
         ({"format": "xyz"}, "--format xyz: expected one of"),

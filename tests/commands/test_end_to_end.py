@@ -36,7 +36,7 @@ def flexgs(*arguments: object, code: int = 0) -> dict[str, Any]:
 def sample(sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("sample")
     record = flexgs(
-        "compress", sample_dir / "point_cloud.ply", "-o", folder / "a.fgs", "--save-scores", folder / "scores.npy"
+        "compress", sample_dir / "point_cloud.ply", "-o", folder / "a.fgs", "--score-cache", folder / "scores.npz"
     )
     return folder, record
 
@@ -66,8 +66,8 @@ def test_the_decoded_sample_measures_the_same(
     assert found["quality"]["views"] == sample[1]["quality"]["views"]
 
 
-def test_other_targets_from_saved_scores(sample: tuple[Path, dict[str, Any]], sample_dir: Path, tmp_path: Path) -> None:
-    scores = ("--score", sample[0] / "scores.npy")
+def test_other_targets_from_kept_scores(sample: tuple[Path, dict[str, Any]], sample_dir: Path, tmp_path: Path) -> None:
+    scores = ("--score-cache", sample[0] / "scores.npz")
     scene = sample_dir / "point_cloud.ply"
     small = flexgs("compress", scene, "-o", tmp_path / "s.fgs", *scores, "--max-size", "400kB", "--effort", "fast")
     assert 370_000 < small["size"] <= 400_000 and "score" not in small["run"]["stages"]

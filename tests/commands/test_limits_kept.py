@@ -28,7 +28,7 @@ def run(words: list[str], limit: str) -> subprocess.CompletedProcess[str]:
     ("words", "output"),
     [
         (["compress", "--method", "paper"], "scene.fgs"),
-        (["score"], "scores.npy"),
+        (["score"], "scores.npz"),
         (["render", "--views", "0,1,2"], "views"),
     ],
     ids=["paper", "score", "render"],
@@ -49,7 +49,7 @@ def fine_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "words",
     [
         ["compress", "{file}", "--method", "paper", "-o", "{folder}/scene.fgs"],
-        ["score", "{file}", "-o", "{folder}/scores.npy"],
+        ["score", "{file}", "-o", "{folder}/scores.npz"],
         ["render", "{file}", "--views", "0,1,2", "-o", "{folder}/views"],
         ["evaluate", "{file}", "--against", str(SAMPLE)],
     ],

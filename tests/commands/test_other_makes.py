@@ -18,7 +18,6 @@ from flexgs_edge.commands.render import render_views
 from flexgs_edge.commands.score import score_gaussians
 from flexgs_edge.errors import FormatError
 from flexgs_edge.io.ply import PlySource, write_ply
-from flexgs_edge.methods.paper.score_files import load_scores
 from flexgs_edge.run.inputs import load_scene
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
@@ -105,9 +104,9 @@ def test_scores_are_those_of_the_way_of_drawing(model: Path, tmp_path: Path) -> 
     """Compensated splats reach fewer pixels: none gets more hits from being thin."""
     scores = {}
     for antialiased in (None, True, False):
-        path = tmp_path / f"{antialiased}.npy"
+        path = tmp_path / f"{antialiased}.npz"
         score_gaussians(model, path, antialiased=antialiased, **VIEWS)
-        scores[antialiased] = load_scores(path, ROWS)
+        scores[antialiased] = np.load(path)["scores"]
     assert np.array_equal(scores[None], scores[True])
     assert (
         scores[True].sum() < scores[False].sum() or np.isneginf(scores[True]).sum() > np.isneginf(scores[False]).sum()

@@ -91,7 +91,7 @@ def test_a_size_holds_whatever_the_promise_says() -> None:
     broken = replace(GOOD, drop=0.7, made_gap=5.0)
 
     def step(measurement: Measurement) -> Step:
-        return Step(Choice(0, 0), 900, measurement, target.excess(900, measurement), "line", 0.0)
+        return Step(Choice(0, 0), 900, measurement, target.excess(900, measurement), "list", 0.0)
 
     assert step(broken).holds and better(step(GOOD), step(broken), target)
     assert not better(step(broken), step(GOOD), target)

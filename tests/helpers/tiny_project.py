@@ -60,6 +60,6 @@ def make_project(folder: Path, photos: bool = True, degree: int = 1) -> Path:
 
 
 def compress_project(project: Path, folder: Path) -> CompressResult:
-    """The scene of a project, compressed against its photos to `a.fgs` in a folder, with its scores in `s.npy`."""
-    scores = str(folder / "s.npy")
-    return compress(project / "point_cloud.ply", folder / "a.fgs", max_drop=2.0, save_scores=scores, **FAST)
+    """The scene of a project, compressed against its photos to `a.fgs` in a folder, with its scores in `s.npz`."""
+    scores = str(folder / "s.npz")
+    return compress(project / "point_cloud.ply", folder / "a.fgs", max_drop=2.0, score_cache=scores, **FAST)

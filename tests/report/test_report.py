@@ -185,20 +185,19 @@ def test_one_view_and_photos_larger_than_the_page_shows(project: Path, tmp_path:
 
 def test_fixed_rates_have_no_search_and_no_views_no_pictures(project: Path, tmp_path: Path) -> None:
     (tmp_path / "lone.ply").write_bytes((project / "point_cloud.ply").read_bytes())
-    np.save(tmp_path / "scores.npy", np.arange(400, dtype=np.float32))
     rates: dict[str, Any] = {"method": "paper", "prune_rate": 0.3, "sh_rate": 0.2}
     compress(project / "point_cloud.ply", tmp_path / "a.fgs", report=str(tmp_path / "seen"), **rates, **FAST)
     page = read_page(tmp_path / "seen")
     assert "fixed rates, nothing was searched" in page.text and len(page.pictures("photo")) == 3
     assert page.named("svg", "chart") == []
-    scores = str(tmp_path / "scores.npy")
     compress(
         tmp_path / "lone.ply",
         tmp_path / "b.fgs",
         report=str(tmp_path / "blind"),
-        score=scores,
         cameras="none",
-        **rates,
+        method="paper",
+        prune_rate=0.0,
+        sh_rate=0.0,
         **FAST,
     )
     page = read_page(tmp_path / "blind")

@@ -48,7 +48,7 @@ def test_that_of_drawing_as_well(command: str, tmp_path: Path) -> None:
         if command == "render":
             render_views(scene, tmp_path / "views", force=True, device="numpy", memory_limit=limit)
         else:
-            score_gaussians(scene, tmp_path / "scores.npy", force=True, device="numpy", memory_limit=limit)
+            score_gaussians(scene, tmp_path / "scores.npz", force=True, device="numpy", memory_limit=limit)
 
     with pytest.raises(BudgetError, match="which counts later stages too") as caught:
         run(2**20)

@@ -1,4 +1,4 @@
-"""Files of other formats by measured costs, for `--method best`.
+"""Files of other formats by measured costs.
 
 Pruning goes in the rounds of `best`. Each candidate is a file that is written and read back. Colours are refitted to the
 geometry as the format decodes it.

@@ -18,8 +18,7 @@ from flexgs_edge.goals.steps import SearchResult, Step, step_words
 from flexgs_edge.methods.paper.auto_bits import bits_by_sensitivity
 from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
-from flexgs_edge.methods.paper.score_cache import ScoreCache
-from flexgs_edge.methods.paper.score_files import load_scores, save_scores
+from flexgs_edge.methods.paper.score_cache import score_cache
 from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.methods.paper.search import adapt, measure_fixed
 from flexgs_edge.packed.bitspec import PAPER
@@ -27,7 +26,6 @@ from flexgs_edge.packed.quantize import QuantizedScene, quantized_bytes
 from flexgs_edge.packed.sensitivity import Sensitivity
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decode_bytes
-from flexgs_edge.run.fingerprint import fingerprint
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.judges import Judges
 from flexgs_edge.run.made import Made
@@ -59,7 +57,7 @@ class Ranking:
     reused: bool = False
 
 
-def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray | None = None) -> Made:
+def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
     """Compress a scene into a `.fgs` of version 1.
 
     Parameters
@@ -68,12 +66,10 @@ def compress(run: Run[CompressOptions], bench: Bench | None, scores: np.ndarray 
         Planned.
     bench : Bench or None
         Draws the views; `None` for runs without views, whose rates are fixed.
-    scores : np.ndarray or None
-        [N] f64 from a file (see `given_scores`). By default they are computed if the run needs them.
     """
     run.budget.take("the order of the Gaussians", RANK_ROW_BYTES * run.source.count)
     with nullcontext() if bench is None else Judges(run, bench) as judges:
-        ranking = rank(run, judges, bench, scores)
+        ranking = _rank(run, judges, bench)
         with run.clock.stage("open"):
             has_sh = nonzero_sh(run.source)
         bits, groups = run.options.bit_spec()
@@ -124,51 +120,28 @@ def searching_bytes(run: Run[CompressOptions]) -> int:
     )
 
 
-def given_scores(run: Run[CompressOptions]) -> np.ndarray | None:
-    """[N] f64 from the file that `--score` names, or `None`. It is read before any work, because it may not fit the scene."""
+def _rank(run: Run[CompressOptions], judges: Judges | None, bench: Bench | None) -> Ranking:
+    """Draw the references, and score every Gaussian unless the cache has the scores."""
     assert run.plan is not None
-    if run.plan.computes_scores or not run.plan.needs_scores:
-        return None
-    return load_scores(run.options.score, run.source.count)
-
-
-def rank(
-    run: Run[CompressOptions], judges: Judges | None, bench: Bench | None, scores: np.ndarray | None = None
-) -> Ranking:
-    """Draw the references, score every Gaussian unless scores are given, and save the scores if asked to."""
-    assert run.plan is not None
-    cache = _score_cache(run)
-    reused = False
+    scores, reused, cache = None, False, None
+    if run.plan.needs_scores and run.options.score_cache is not None:
+        with run.clock.stage("fingerprint"):
+            cache = score_cache(run.options.score_cache, run, run.options.score)
     if cache is not None:
         scores = cache.load(run.source.count)
         reused = scores is not None
         LOG.info("scores %s %s", "reused from" if reused else "will be kept in", cache.path)
     if judges is not None and bench is not None:
         with judges.original() as original:
-            if run.plan.computes_scores and scores is None:
+            if run.plan.needs_scores and scores is None:
                 cameras = run.seen.of(run.seen.train)
                 LOG.info("scoring %d Gaussians over %d training poses", run.source.count, len(cameras))
                 with run.clock.stage("score"):
                     scores = score_scene(bench.renderer, original, run.source, cameras, run.options.score, run.progress)
     if cache is not None and scores is not None and not reused:
         cache.save(scores)
-    if run.options.save_scores is not None and scores is not None:
-        save_scores(run.options.save_scores, scores, run.options.force)
     order = np.arange(run.source.count) if scores is None else order_from_scores(scores)
     return Ranking(order, reused)
-
-
-def _score_cache(run: Run[CompressOptions]) -> ScoreCache | None:
-    """The cache of `--score-cache`, with the fingerprint of this run; `None` if nothing is to be cached."""
-    options = run.options
-    assert run.plan is not None
-    if options.score_cache is None or not run.plan.computes_scores:
-        return None
-    assert options.near is not None and options.extent is not None
-    with run.clock.stage("fingerprint"):
-        cameras = run.seen.of(run.seen.train)
-        key = fingerprint(run.source, cameras, options.score, options.near, options.extent, bool(options.antialiased))
-    return ScoreCache(options.score_cache, key)
 
 
 def _search(run: Run[CompressOptions], evaluator: SceneEvaluator) -> SearchResult | None:

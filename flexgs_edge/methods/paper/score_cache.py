@@ -5,11 +5,14 @@ from __future__ import annotations
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write
+from flexgs_edge.run.fingerprint import fingerprint
+from flexgs_edge.run.run import Run
 
 
 class ScoreCache:
@@ -41,7 +44,7 @@ class ScoreCache:
             return None
         except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(
-                f"{self.path}: expected scores kept by an earlier --score-cache, found something else ({error}); "
+                f"{self.path}: expected scores kept by score or by an earlier --score-cache, found something else ({error}); "
                 "remove the file, or name another one"
             ) from error
         same = key == self.fingerprint and scores.shape == (count,) and scores.dtype == np.float64
@@ -51,3 +54,13 @@ class ScoreCache:
         """Write the scores ([N] f64); an old file is replaced."""
         with atomic_write(self.path, force=True) as file:
             np.savez(file, fingerprint=np.array(self.fingerprint), scores=scores)
+
+
+def score_cache(path: str | Path, run: Run[Any], score: str) -> ScoreCache:
+    """The cache at `path`, with the fingerprint of a run and the kind of its scores."""
+    options = run.options
+    assert options.near is not None and options.extent is not None
+    cameras = run.seen.of(run.seen.train)
+    return ScoreCache(
+        path, fingerprint(run.source, cameras, score, options.near, options.extent, bool(options.antialiased))
+    )

@@ -59,7 +59,7 @@ def score_scene(
         For an unknown kind, or when no camera sees any Gaussian.
     """
     if kind not in SCORES:
-        raise InputError(f"score {kind!r}: expected one of {', '.join(SCORES)} or a .npy/.npz file")
+        raise InputError(f"score {kind!r}: expected one of {', '.join(SCORES)}")
     statistics = gather_statistics(renderer, scene, cameras, progress)
     scores = np.empty(source.count)
     for rows in source.chunks(ROWS):

@@ -279,8 +279,3 @@ def test_words_that_make_no_sense(words: dict[str, Any], message: str) -> None:
 def test_other_formats_have_grids_of_their_own(project: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="distilling ends on the grid of a .fgs"):
         compress(project / "point_cloud.ply", tmp_path / "a.spz", distil=10)
-
-
-def test_a_retired_effort_says_what_it_became(caplog: pytest.LogCaptureFixture) -> None:
-    assert CompressOptions(effort="thorough") == CompressOptions(effort="max")
-    assert "--effort thorough has become --effort max" in caplog.text

@@ -156,7 +156,9 @@ def test_scores_are_kept_when_the_target_cannot_be_met(project: Path, tmp_path: 
 @pytest.mark.parametrize("content", [b"", b"ply\nformat", b"PK\x03\x04 not an archive"])
 def test_other_files_are_not_overwritten(project: Path, tmp_path: Path, content: bytes) -> None:
     (tmp_path / "s.npz").write_bytes(content)
-    with pytest.raises(InputError, match=r"s\.npz: expected scores kept by an earlier --score-cache, found"):
+    with pytest.raises(
+        InputError, match=r"s\.npz: expected scores kept by score or by an earlier --score-cache, found"
+    ):
         run(project, tmp_path)
     assert (tmp_path / "s.npz").read_bytes() == content and not (tmp_path / "a.fgs").exists()
 
@@ -170,7 +172,7 @@ def test_plain_scores_are_no_cache(project: Path, tmp_path: Path) -> None:
 def test_nothing_to_keep(project: Path, tmp_path: Path) -> None:
     result = run(project, tmp_path, prune_rate=0.0, sh_rate=0.0)
     assert result.score_cache is None and not (tmp_path / "s.npz").exists()
-    with pytest.raises(InputError, match="leave it out with --score mine.npy"):
-        CompressOptions(method="paper", score="mine.npy", score_cache="s.npz")
+    with pytest.raises(InputError, match="--score 'mine.npy': expected one of gs, meson"):
+        CompressOptions(method="paper", score="mine.npy")
     with pytest.raises(InputError, match="--score-cache belongs to --method paper"):
         CompressOptions(method="best", score_cache="s.npz")

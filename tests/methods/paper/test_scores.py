@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import gc
-import warnings
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import reference_renderer
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.errors import FlexGSError, InputError
-from flexgs_edge.methods.paper.score_files import load_scores, save_scores
+from flexgs_edge.errors import InputError
 from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
@@ -87,92 +81,3 @@ def test_cameras_that_see_nothing(form: str) -> None:
 def test_unknown_kind() -> None:
     with pytest.raises(InputError, match="score 'size': expected one of gs, meson"):
         score("numpy", "size", scene(), cameras())
-
-
-def test_score_files(tmp_path: Path) -> None:
-    scores = np.array([1.5, -np.inf, 3e-9, -2])
-    save_scores(tmp_path / "scores.npy", scores)
-    assert same_bits(load_scores(tmp_path / "scores.npy", 4), scores)
-    np.savez(tmp_path / "scores.npz", anything=np.array([3, 1, 2], np.int32))
-    np.testing.assert_array_equal(load_scores(tmp_path / "scores.npz", 3), [3.0, 1.0, 2.0])
-    np.save(tmp_path / "half.npy", scores[2:].astype(">f4"))
-    assert load_scores(tmp_path / "half.npy", 2).dtype == np.float64
-    with pytest.raises(FlexGSError, match=r"scores\.npy"):
-        save_scores(tmp_path / "scores.npy", scores)
-    save_scores(tmp_path / "scores.npy", scores + 1, force=True)
-    assert load_scores(tmp_path / "scores.npy", 4)[0] == 2.5
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["half.npy", "scores.npy", "scores.npz"]
-
-
-def _saved(values: object) -> Callable[[Path], None]:
-    return lambda path: np.save(path, values)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("write", "words"),
-    [
-        (lambda path: None, ["no such score file"]),
-        (lambda path: path.write_bytes(b""), ["not a NumPy file"]),
-        (lambda path: path.write_bytes(b"hello"), ["not a NumPy file"]),
-        (lambda path: path.mkdir(), ["not a NumPy file"]),
-        (_saved(np.zeros(3)), ["expected 4 numbers", "(3,)", "float64"]),
-        (_saved(np.zeros((4, 1))), ["expected 4 numbers", "(4, 1)"]),
-        (_saved(np.zeros(4, bool)), ["dtype bool"]),
-        (_saved(np.zeros(4, complex)), ["dtype complex128"]),
-        (_saved(np.array(["a", "b", "c", "d"])), ["dtype <U1"]),
-        (_saved(np.array([None] * 4)), ["not a NumPy file"]),
-        (_saved(np.array([0, np.nan, 1, np.nan])), ["2 scores are NaN", "row 1"]),
-        (_saved(np.array([0, 1, 2, np.inf])), ["1 scores are NaN or +inf", "row 3"]),
-    ],
-)
-def test_malformed_score_files(write: Callable[[Path], None], words: list[str], tmp_path: Path) -> None:
-    path = tmp_path / "scores.npy"
-    write(path)
-    with pytest.raises(InputError) as caught:
-        load_scores(path, 4)
-    for word in (str(path), *words):
-        assert word in str(caught.value)
-
-
-def test_truncated_score_files(tmp_path: Path) -> None:
-    """Every length that is not the whole file is an error."""
-    whole = tmp_path / "whole.npy"
-    np.save(whole, np.arange(4.0))
-    data = whole.read_bytes()
-    for length in range(len(data)):
-        part = tmp_path / "part.npy"
-        part.write_bytes(data[:length])
-        with pytest.raises(InputError, match="not a NumPy file"):
-            load_scores(part, 4)
-
-
-def test_archives(tmp_path: Path) -> None:
-    np.savez(tmp_path / "two.npz", a=np.zeros(4), b=np.zeros(4))
-    with pytest.raises(InputError, match=r"expected one array, found 2: a, b"):
-        load_scores(tmp_path / "two.npz", 4)
-    np.savez(tmp_path / "none.npz")
-    with pytest.raises(InputError, match="expected one array, found 0"):
-        load_scores(tmp_path / "none.npz", 4)
-
-
-def test_broken_archives_are_closed(tmp_path: Path) -> None:
-    path = tmp_path / "scores.npz"
-    path.write_bytes(b"PK\x03\x04 no archive")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        with pytest.raises(InputError, match="not a NumPy file"):
-            load_scores(path, 4)
-        gc.collect()
-    assert not caught
-
-
-def test_damaged_archives(tmp_path: Path) -> None:
-    np.savez(tmp_path / "objects.npz", scores=np.array([None] * 4))
-    with pytest.raises(InputError, match="not a NumPy file"):
-        load_scores(tmp_path / "objects.npz", 4)
-    np.savez(tmp_path / "one.npz", scores=np.zeros(4))
-    data = bytearray((tmp_path / "one.npz").read_bytes())
-    data[60] ^= 0xFF
-    (tmp_path / "one.npz").write_bytes(data)
-    with pytest.raises(InputError, match="not a NumPy file"):
-        load_scores(tmp_path / "one.npz", 4)
