@@ -37,6 +37,7 @@ class CompressWords(TypedDict, total=False):
     """Single options of `compress`. `CompressOptions` explains each."""
 
     ignore_distortion: bool
+    dataparser: str | None
     holdout: int
     resolution: int
     near: float | None

@@ -36,8 +36,8 @@ class Camera:
     cx, cy : float
         Principal point, pixels, integer pixel centres: (W - 1) / 2 is the middle.
     distortion : str, optional
-        A lens distortion that was ignored. The pose serves for scores, but photos of this camera do not match its
-        renders.
+        Why photos of this camera do not match its renders: a lens distortion that was ignored, or an assumed field of
+        view. The pose serves for scores.
     dilation : float
         Added to both diagonal terms of the 2D covariance, px^2.
     """

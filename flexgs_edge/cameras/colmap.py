@@ -173,7 +173,7 @@ def _camera(path: Path, lens_file: Path, image: _Image, lenses: dict[int, _Lens]
     rotation = _rotation(place, image.quaternion)
     fx, fy = lens.parameters[0], lens.parameters[lens.model.focals - 1]
     cx, cy = (value - 0.5 for value in lens.parameters[lens.model.focals : lens.model.focals + 2])
-    distortion = f"COLMAP model {lens.model.name}" if lens.distorted else None
+    distortion = f"lens distortion (COLMAP model {lens.model.name})" if lens.distorted else None
     return Camera(
         image.name, lens.width, lens.height, rotation, np.array(image.translation), fx, fy, cx, cy, distortion
     )

@@ -9,6 +9,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.colmap import find_model, read_colmap
 from flexgs_edge.cameras.inria import cameras_of_list
 from flexgs_edge.cameras.json_values import load_json
+from flexgs_edge.cameras.nerfstudio import cameras_of_poses, is_pose_list
 from flexgs_edge.cameras.transforms import cameras_of_frames
 from flexgs_edge.errors import InputError
 
@@ -16,6 +17,7 @@ NERF_SYNTHETIC = "transforms_train.json"
 JSON_NAMES = ("cameras.json", "transforms.json", NERF_SYNTHETIC)
 SUPPORTED = (
     "INRIA's cameras.json (any .json file with a list of cameras), NeRF's or nerfstudio's transforms.json, "
+    "a list of poses of ns-export cameras, "
     "a COLMAP model (cameras and images, .bin or .txt), or a folder that holds one of them"
 )
 
@@ -29,7 +31,11 @@ def find_cameras(folder: str | os.PathLike[str]) -> Path | None:
     return find_model(place)
 
 
-def read_cameras(path: str | os.PathLike[str], ignore_distortion: bool = False) -> list[Camera]:
+def read_cameras(
+    path: str | os.PathLike[str],
+    ignore_distortion: bool = False,
+    dataparser: str | os.PathLike[str] | None = None,
+) -> list[Camera]:
     """Read cameras from a file or folder, sorted by name.
 
     Parameters
@@ -39,6 +45,9 @@ def read_cameras(path: str | os.PathLike[str], ignore_distortion: bool = False) 
         model also in its `sparse/0` or `colmap/sparse/0`).
     ignore_distortion : bool, optional
         Take the poses of distorted lenses; such cameras cannot be compared with photos.
+
+    dataparser : path, optional
+        nerfstudio's `dataparser_transforms.json`, for a transforms.json. Default: the one that is found.
 
     Raises
     ------
@@ -64,9 +73,19 @@ def read_cameras(path: str | os.PathLike[str], ignore_distortion: bool = False) 
     elif place.suffix.lower() == ".json":
         value = load_json(place)
         if isinstance(value, dict) and "frames" in value:
-            cameras = cameras_of_frames(place, value, ignore_distortion)
+            moved = None if dataparser is None else Path(dataparser)
+            cameras = cameras_of_frames(place, value, ignore_distortion, moved)
+        elif is_pose_list(value):
+            cameras = cameras_of_poses(place, value, _lenses_beside(place))
         else:
             cameras = cameras_of_list(place, value)
     else:
         raise InputError(f"{path}: unknown kind of camera file; supported: {SUPPORTED}")
     return sorted(cameras, key=lambda camera: camera.name)
+
+
+def _lenses_beside(place: Path) -> list[Camera]:
+    """The cameras of another file beside a list of poses, for their lenses; without photos, if these lenses are bent."""
+    names = (name for name in ("transforms.json", "cameras.json") if name != place.name)
+    beside = next((place.with_name(name) for name in names if place.with_name(name).is_file()), None)
+    return [] if beside is None else read_cameras(beside, ignore_distortion=True)

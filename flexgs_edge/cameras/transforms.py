@@ -1,11 +1,13 @@
 """Read transforms.json of NeRF and nerfstudio: poses camera to world in OpenGL's axes, and intrinsics.
 
 Poses are taken as they stand in the file. nerfstudio writes `dataparser_transforms.json` beside a trained model. If it
-is there, we move the poses into the frame of the training, which is also the frame of an exported PLY.
+is found (`find_dataparser`) or given, we move the poses into the frame of the training, which is also the frame of an
+exported PLY.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import posixpath
@@ -17,18 +19,17 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera, distinct_names
 from flexgs_edge.cameras.json_values import Entry, kind, load_json
+from flexgs_edge.cameras.nerfstudio import FLIP, find_dataparser, rigid
 from flexgs_edge.cameras.photos import SUFFIXES, photo_size
 from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.small_matrices import product
 
-DATAPARSER = "dataparser_transforms.json"
+LOG = logging.getLogger("flexgs_edge")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 """Values of `camera_model` without a lens."""
 BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Values of `camera_model` that are pinholes if their parameters are zero."""
-FLIP = np.diag([1.0, -1.0, -1.0])
-"""Turns OpenGL's camera (y up, looking along -z) into COLMAP's."""
 UNDISTORT = (
     "make a pinhole model of the photos with `ns-process-data images --data PHOTOS --output-dir MODEL` and "
     "`colmap image_undistorter --image_path PHOTOS --input_path MODEL/colmap/sparse/0 --output_path OUTPUT --output_type COLMAP` "
@@ -36,7 +37,9 @@ UNDISTORT = (
 )
 
 
-def read_transforms(path: str | os.PathLike[str], ignore_distortion: bool = False) -> list[Camera]:
+def read_transforms(
+    path: str | os.PathLike[str], ignore_distortion: bool = False, dataparser: Path | None = None
+) -> list[Camera]:
     """Read a transforms.json in the file's order.
 
     Names are the frames' `file_path`, without the folder that all of them share. Pixel centres of the file lie at
@@ -49,6 +52,8 @@ def read_transforms(path: str | os.PathLike[str], ignore_distortion: bool = Fals
         The file.
     ignore_distortion : bool, optional
         Take the poses of distorted lenses as pinholes; such cameras cannot be compared with photos.
+    dataparser : path, optional
+        A `dataparser_transforms.json`. Default: the one that is found.
 
     Raises
     ------
@@ -59,10 +64,12 @@ def read_transforms(path: str | os.PathLike[str], ignore_distortion: bool = Fals
         If the file breaks its format; the message names file, frame and key.
     """
     path = Path(path)
-    return cameras_of_frames(path, load_json(path), ignore_distortion)
+    return cameras_of_frames(path, load_json(path), ignore_distortion, dataparser)
 
 
-def cameras_of_frames(path: Path, value: Any, ignore_distortion: bool = False) -> list[Camera]:
+def cameras_of_frames(
+    path: Path, value: Any, ignore_distortion: bool = False, dataparser: Path | None = None
+) -> list[Camera]:
     """`read_transforms` for JSON that is loaded already."""
     top = Entry(str(path), value)
     frames = top.get("frames")
@@ -71,7 +78,7 @@ def cameras_of_frames(path: Path, value: Any, ignore_distortion: bool = False) -
     entries = [Entry(f"{path}: frame {index}", frame) for index, frame in enumerate(frames)]
     paths = [_file_path(entry) for entry in entries]
     names = distinct_names(_without_shared_folder(paths))
-    frame_change = _Similarity.beside(path, top)
+    frame_change = _Similarity.of(dataparser or find_dataparser(path), top)
     return [
         _camera(path, top, entry, file_path, name, frame_change, ignore_distortion)
         for entry, file_path, name in zip(entries, paths, names)
@@ -100,20 +107,20 @@ class _Similarity:
     scale: float
 
     @classmethod
-    def beside(cls, path: Path, top: Entry) -> _Similarity:
+    def of(cls, place: Path | None, top: Entry) -> _Similarity:
         """The map from the file's frame to the training's; the identity if there is no dataparser_transforms.json."""
-        place = path.with_name(DATAPARSER)
-        if not place.is_file():
+        if place is None:
             return cls(np.eye(3), np.zeros(3), 1.0)
+        LOG.info("poses moved into the frame of the training by %s", place)
         entry = Entry(str(place), load_json(place))
-        linear, shift = _rigid(entry, "transform")
+        linear, shift = rigid(entry, "transform")
         scale = entry.finite("scale", "a factor above 0")
         if scale <= 0:
             raise entry.fail("scale", "a factor above 0", f"{scale:g}")
         # nerfstudio's `transform` and `scale` start at the frame of the original capture, but our poses come after
         # `applied_*`.
         if top.has("applied_transform"):
-            applied, moved = _rigid(top, "applied_transform")
+            applied, moved = rigid(top, "applied_transform")
             linear = product(linear, applied.T)
             shift = shift - product(linear, moved)
         if top.has("applied_scale"):
@@ -128,27 +135,16 @@ class _Similarity:
         return product(self.linear, turn), self.scale * (product(self.linear, position) + self.shift)
 
 
-def _rigid(entry: Entry, key: str) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and translation of a 3x4 or 4x4 matrix."""
-    value = entry.get(key)
-    rows = len(value) if isinstance(value, list) else 3
-    matrix = entry.array(key, (4 if rows == 4 else 3, 4))
-    if rows == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise entry.fail(key, "0 0 0 1 as the last row", " ".join(f"{v:g}" for v in matrix[3]))
-    entry.check_rotation(key, matrix[:3, :3])
-    return matrix[:3, :3], matrix[:3, 3]
-
-
 def _camera(
     path: Path, top: Entry, frame: Entry, file_path: str, name: str, frame_change: _Similarity, ignore_distortion: bool
 ) -> Camera:
     distortion = _distortion(top, frame)
     if distortion is not None and not ignore_distortion:
         raise InputError(
-            f"{frame.place} ({name}): lens distortion ({distortion}), renders have none; {UNDISTORT}; "
+            f"{frame.place} ({name}): {distortion}, renders have none; {UNDISTORT}; "
             "or use --ignore-distortion to take the poses alone, without photos"
         )
-    turn, position = frame_change.moved(*_rigid(frame, "transform_matrix"))
+    turn, position = frame_change.moved(*rigid(frame, "transform_matrix"))
     rotation = product(FLIP, turn.T)
     width, height = _size(path, top, frame, file_path)
     fx, fy = _focals(top, frame, width, height)
@@ -180,14 +176,14 @@ def _distortion(top: Entry, frame: Entry) -> str | None:
     if model not in (*PINHOLES, *BENT):
         if "FISHEYE" not in model:
             raise InputError(f"{frame.place}: camera_model: expected PINHOLE or OPENCV, found {model!r}")
-        return f"camera_model {model}"
+        return f"lens distortion (camera_model {model})"
     found = []
     for key in DISTORTION:
         if _has(top, frame, key):
             value = _holder(top, frame, key).finite(key, "a finite number")
             if value != 0:
                 found.append(f"{key} = {value:g}")
-    return ", ".join(found) or None
+    return f"lens distortion ({', '.join(found)})" if found else None
 
 
 def _size(path: Path, top: Entry, frame: Entry, file_path: str) -> tuple[int, int]:

@@ -59,6 +59,13 @@ cameras_option = stack(
     ),
     option(
         VIEWS,
+        "--dataparser",
+        metavar="FILE",
+        help="dataparser_transforms.json of nerfstudio's training, for a transforms.json. Default: the one near the scene, "
+        "the cameras, or in outputs/.",
+    ),
+    option(
+        VIEWS,
         "--up",
         type=AXIS,
         help="Up of automatic views: x, -x, y, -y, z, -z, or three numbers such as 0,-1,0.2. It is a direction in the frame "

@@ -44,6 +44,7 @@ class Companions:
     images: Path | None = None
     white_background: bool | None = None
     antialiased: bool | None = None
+    dataparser: Path | None = None
 
 
 def find_companions(path: str | os.PathLike[str]) -> Companions:

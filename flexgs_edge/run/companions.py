@@ -10,6 +10,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+from flexgs_edge.cameras.nerfstudio import dataparser_above
 from flexgs_edge.cameras.read import NERF_SYNTHETIC, find_cameras
 from flexgs_edge.io.model_folder import Companions, find_companions
 
@@ -24,6 +25,7 @@ def companions_of(path: str | os.PathLike[str]) -> Companions:
         found = replace(found, cameras=find_cameras(folder))
         if found.images is None and found.cameras == folder / NERF_SYNTHETIC and (folder / "train").is_dir():
             found = replace(found, images=folder / "train")
+    found = replace(found, dataparser=dataparser_above(Path(path)))
     for what, place in (("cameras", found.cameras), ("photos", found.images)):
         if place is not None:
             LOG.info("found %s beside the scene: %s", what, place)
@@ -39,4 +41,4 @@ def merge_companions(first: Companions, second: Companions) -> Companions:
     chosen = first if first.cameras is not None else second
     white = first.white_background if first.white_background is not None else second.white_background
     antialiased = first.antialiased if first.antialiased is not None else second.antialiased
-    return Companions(chosen.cameras, chosen.images, white, antialiased)
+    return Companions(chosen.cameras, chosen.images, white, antialiased, chosen.dataparser)

@@ -90,6 +90,8 @@ class ViewOptions:
         A camera file, a folder with one, `auto`, or `none`. Default: the cameras beside the scene, else `auto`.
     ignore_distortion : bool
         Use the poses of cameras with lens distortion, without their photos. Default: raise `InputError` for them.
+    dataparser : str, optional
+        nerfstudio's `dataparser_transforms.json` of the training, for poses of a transforms.json. Default: the one found.
     images : str, optional
         Folder of photos, or `none`. Default: `images/` beside the scene.
     exposure : {"fit", "none"}
@@ -125,6 +127,7 @@ class ViewOptions:
 
     cameras: str | None = None
     ignore_distortion: bool = False
+    dataparser: str | None = None
     images: str | None = None
     exposure: str = "fit"
     holdout: int = DEFAULT_HOLDOUT

@@ -146,13 +146,13 @@ def find_views(
             )
         return None if place == NO_CAMERAS else _automatic_views(options, source)
     else:
-        cameras = read_cameras(place, options.ignore_distortion)
+        cameras = read_cameras(place, options.ignore_distortion, options.dataparser or companions.dataparser)
     arrays = given.images if with_photos else None
     images = _images(options, companions, place) if with_photos and arrays is None else None
-    bent = sum(camera.distortion is not None for camera in cameras)
+    bent = [camera.distortion for camera in cameras if camera.distortion is not None]
     notes: tuple[str, ...] = ()
     if bent:
-        notes = (f"lens distortion of {bent} cameras ignored: only their poses are used",)
+        notes = (f"{len(bent)} cameras have {bent[0]}: only their poses are used",)
         if options.images is None:
             images = None
     background = options.background or (0.0, 0.0, 0.0)

@@ -125,7 +125,7 @@ def test_lenses_that_distort(tmp_path: Path, text: bool, model: str, parameters:
         read_cameras(folder)
     assert "--ignore-distortion" in str(caught.value) and str(folder) in str(caught.value)
     (camera,) = read_cameras(folder, ignore_distortion=True)
-    assert camera.distortion == f"COLMAP model {model}" and camera.fx == 50.0
+    assert camera.distortion == f"lens distortion (COLMAP model {model})" and camera.fx == 50.0
     # The mark survives what is done to cameras, and photos are refused.
     for bent in (camera, camera.scaled(32, 24), camera.moved(np.ones(3))):
         with pytest.raises(InputError, match=r"photos cannot be compared: camera 'left/a.jpg' has lens distortion"):

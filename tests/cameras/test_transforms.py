@@ -197,7 +197,7 @@ def test_lenses_that_distort(tmp_path: Path, changes: dict[str, Any], lens: str)
             read_cameras(write(tmp_path, value))
         assert "colmap image_undistorter" in str(caught.value) and "ns-process-data" in str(caught.value)
         (camera,) = read_cameras(tmp_path, ignore_distortion=True)
-        assert camera.distortion == lens
+        assert camera.distortion == f"lens distortion ({lens})"
         with pytest.raises(InputError, match="photos cannot be compared"):
             Photos.open(tmp_path, [camera])
 

@@ -258,7 +258,7 @@ def test_cameras_of_other_programs_beside_the_scene(tmp_path: Path, project: Pat
         compress(scene, None, **rates)
     found = compress(scene, None, ignore_distortion=True, **rates).views
     assert found is not None and found.images is None and found.total == VIEWS
-    assert any("lens distortion of 9 cameras ignored" in note for note in found.notes)
+    assert any("9 cameras have lens distortion" in note for note in found.notes)
     with pytest.raises(InputError, match="photos cannot be compared"):
         compress(scene, None, ignore_distortion=True, images=str(tmp_path / "images"), **rates)
 
