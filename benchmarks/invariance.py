@@ -26,10 +26,10 @@ from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.io.ply import PlySource, write_ply
-from flexgs_edge.methods.best.candidates import Candidate
 from flexgs_edge.methods.best.grid_coder import GridCoder
-from flexgs_edge.methods.best.grid_search import GridSearch
-from flexgs_edge.methods.best.method import grid_search
+from flexgs_edge.methods.best.grid_maker import GridMaker
+from flexgs_edge.methods.best.method import grid_maker
+from flexgs_edge.methods.best.search import Candidate
 from flexgs_edge.progress import Progress
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.source import SceneSource
@@ -52,7 +52,7 @@ def write_project(folder: Path, source: SceneSource, cameras: Sequence[Camera], 
 class Found:
     """Answer of a search: the multiplier, the kept rows (ascending), and the bytes of the file."""
 
-    search: GridSearch
+    maker: GridMaker
     multiplier: float
     rows: np.ndarray
     size: int
@@ -60,32 +60,34 @@ class Found:
 
 def compress_and_look(path: Path, output: Path, near: float, progress: Progress, **words: Any) -> Found:
     """Compress by `--method best`; returns the kept rows and the bytes of the file."""
-    searches: list[GridSearch] = []
+    makers: list[GridMaker] = []
     steps: list[Candidate] = []
 
+    class Recorded(GridMaker):
+        def _measured(self, *given: Any) -> Any:
+            found = super()._measured(*given)
+            steps.append(found[0])
+            return found
+
     def recording(options: CompressOptions, coder: GridCoder) -> Any:
-        make = grid_search(options, coder)
+        make = grid_maker(options, coder, Recorded)
 
-        def recorded(path: Any, measure: Any, report: Any) -> Any:
-            def noted(step: Candidate) -> None:
-                steps.append(step)
-                report(step)
-
-            search = make(path, measure, noted)
-            assert isinstance(search, GridSearch)
-            searches.append(search)
-            return search
+        def recorded(*given: Any) -> Any:
+            maker = make(*given)
+            assert isinstance(maker, GridMaker)
+            makers.append(maker)
+            return maker
 
         return recorded
 
-    with mock.patch("flexgs_edge.methods.best.method.grid_search", recording):
+    with mock.patch("flexgs_edge.methods.best.method.grid_maker", recording):
         result = compress(path, output, method="best", near=near, force=True, progress=progress, **words)
     assert result.search is not None
-    chosen = steps[result.search.steps.index(result.search.chosen)]
-    rows = searches[0].rounds.scene_rows(searches[0].kept(chosen.multiplier).rows)
-    # A search lands by removing a few of them.
+    chosen = next(step for step in steps if step.measurement == result.search.chosen.measurement)
+    rows = makers[0].rounds.scene_rows(makers[0].selection.kept(chosen.multiplier).rows)
+    # A search trims a few of them.
     check(0.8 * len(rows) < result.count <= len(rows), "the rows of the file")
-    return Found(searches[0], chosen.multiplier, np.sort(rows), result.size)
+    return Found(makers[0], chosen.multiplier, np.sort(rows), result.size)
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ def compare(
     )
     first = compress_and_look(source.path, scratch / "first.fgs", DEFAULT_NEAR, progress, **words)
     second = compress_and_look(moved, scratch / "second.fgs", DEFAULT_NEAR * factor, progress, **words)
-    choice = second.search.rounds.scene_rows(second.search.kept(first.multiplier).rows)
+    choice = second.maker.rounds.scene_rows(second.maker.selection.kept(first.multiplier).rows)
     note = f"{len(first.rows)} and {len(second.rows)} Gaussians, {first.size} and {second.size} bytes"
     return Likeness(_same(first.rows, second.rows), second.size / first.size, _same(first.rows, choice)), note
 

@@ -79,7 +79,7 @@ def short_searches() -> Iterator[None]:
     """The first whole result that holds is the answer: on tiny scenes one takes a second, nearly all of it the coder's tables."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("fast", "max"):
-            patch.setitem(EFFORTS, name, replace(EFFORTS[name], steps=1, close=1.0, far=1.0))
+            patch.setitem(EFFORTS, name, replace(EFFORTS[name], close=1.0))
         yield
 
 

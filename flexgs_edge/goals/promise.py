@@ -22,6 +22,8 @@ SSIM_PER_DB = 0.015
 docs/results/tuning.md#ssim_per_db"""
 LEAST_SSIM = 1e-4
 """Least SSIM that a target allows to lose; rounding alone loses a part of it."""
+LOST_ALONE = 1.5
+"""A view that loses so many times the share of all other bounds needs more than finer steps."""
 MADE_GAP = 3.0
 """Generated poses may have this much less fidelity than the views that decide, dB: twice their squared error."""
 
@@ -207,18 +209,21 @@ def excesses(target: Target, size: int, measurement: Measurement) -> list[float]
     return [own, *(excess for excess in found if excess is not None)]
 
 
-def breaks_a_view(target: Target, measurement: Measurement) -> bool:
-    """Whether the bound on the worst view is missed."""
-    parts = target.parts if isinstance(target, Promised) else ()
-    return any((part.excess(measurement) or 0.0) > 0.0 for part in parts if isinstance(part, WorstView))
+def lost_views(target: Target, measurement: Measurement) -> list[int]:
+    """Places, among the views that decide, of those that lose too much while all else is far nearer to what is allowed.
 
-
-def broken_views(target: Target, measurement: Measurement) -> list[int]:
-    """Places, among the views that decide, of those that lose more than the bound on the worst view."""
-    parts = target.parts if isinstance(target, Promised) else ()
-    bounds = [part.allowed(measurement) for part in parts if isinstance(part, WorstView)]
-    losses = enumerate(measurement.losses)
-    return [place for place, loss in losses if loss is not None and any(loss > bound for bound in bounds)]
+    A finer result alone would mend them at the cost of all others. With a target for the size there are none.
+    """
+    if not isinstance(target, Promised) or target.limit_bytes is not None:
+        return []
+    others = [part.share(measurement) for part in target.parts if not isinstance(part, WorstView)]
+    most = max(math.exp(target.target.excess(0, measurement)), *(share for share in others if share is not None), 0.0)
+    bounds = [part.allowed(measurement) for part in target.parts if isinstance(part, WorstView)]
+    return [
+        place
+        for place, loss in enumerate(measurement.losses)
+        if loss is not None and any(loss > max(1.0, LOST_ALONE * most) * bound for bound in bounds)
+    ]
 
 
 def bounds_ssim(target: Target) -> bool:

@@ -35,8 +35,6 @@ class Original:
         Steps of the descent to the first candidate; 0 (default): colours are refitted instead.
     turns : np.ndarray, optional
         [n] f64, above 0: how often a descent looks at each of `poses`, relative to the others. Default: alike.
-    nearest : np.ndarray, optional
-        [n] i64, with `turns`: the place of the nearest view that decides, for each of `poses`.
     """
 
     bench: Bench
@@ -47,7 +45,6 @@ class Original:
     progress: Progress = SILENT
     steps: int = 0
     turns: np.ndarray | None = None
-    nearest: np.ndarray | None = None
 
     @property
     def poses(self) -> list[Camera]:

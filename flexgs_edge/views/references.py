@@ -71,6 +71,10 @@ class References:
         self._places[view] = (self._end, half.shape)
         self._end += half.nbytes
 
+    def make_room(self, view: int, count: int) -> None:
+        """Give each view from number `view` on a number that is `count` higher."""
+        self._places = {place + count * (place >= view): found for place, found in self._places.items()}
+
     def __getitem__(self, view: int) -> np.ndarray:
         """[3, H, W] f16, a kept view; both sides are rounded up to whole tiles."""
         offset, shape = self._places[view]

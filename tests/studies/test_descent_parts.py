@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexgs_edge.methods.best import effort, grid_results
+from flexgs_edge.methods.best import effort, grid_maker
 from flexgs_edge.methods.best.refit.distil import STRUCTURE, Schedule, distil
 from flexgs_edge.progress import SILENT
 from flexgs_edge.run.options import CompressOptions
@@ -43,7 +43,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Schedule, bool, float]]
         return distil(*words, structure=structure, **more)
 
     monkeypatch.setattr(effort, "LEAST_STEPS", 60)
-    for module in (grid_results, descent_parts):
+    for module in (grid_maker, descent_parts):
         monkeypatch.setattr(module, "distil", watched)
     return found
 

@@ -54,10 +54,6 @@ class Checkpoint:
         """The fingerprint in the folder's name."""
         return self.folder.name.rpartition("-")[2]
 
-    def further(self) -> Checkpoint:
-        """The folder for the rounds of a search that begins anew with more poses; it goes with this one."""
-        return Checkpoint(self.folder / "further")
-
     @property
     def rounds(self) -> int:
         """How many rounds were finished."""

@@ -20,9 +20,6 @@ FULL_PASSES = 10
 goes the course `SHORT`: docs/results/tuning.md#full_passes"""
 FULL_RATES, LEAST_RATE = 41.0, 0.25
 """Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
-PILOT, PILOT_POWER = 0.5, -0.1
-"""A pilot is a shorter descent, which tells how much a candidate's will mend: its steps as a share of the candidate's, and the
-power by which the loss changes with the steps. After descents between the rounds there is none: docs/results/tuning.md#pilot"""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
 INTERLEAVE_TO, MOST_LEFT = 0.8, 0.9
@@ -34,11 +31,6 @@ many; and most descents: docs/results/tuning.md#interleaved"""
 INTERLEAVED_SHARE, INTERLEAVED_LAST = 0.5, 0.2
 """Steps of a descent between rounds, as a share of those of the descent to a candidate, and its last rates over its first:
 docs/results/tuning.md#interleaved"""
-ALL_LEFT = 0.97
-"""A candidate with this share of the Gaussians that there are gains hardly anything by the others."""
-STEPS_SLOPE, LEAST_STEPS_SLOPE, NEAR_TARGET = 0.35, 0.1, 0.1
-"""Expected slope of the log of the loss over that of the multiplier where all Gaussians that are left stay, so that steps alone
-get finer. At a slope below the second, and an excess above the third, others are missing: docs/results/tuning.md#interleaved"""
 
 
 def fits(most: int) -> list[float]:

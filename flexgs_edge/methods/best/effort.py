@@ -24,7 +24,7 @@ LEAST_VIEWS = 6
 """Least poses for a step of the refit. Steps from fewer poses overfit the scored poses, and all others get worse:
 docs/results/tuning.md#least_views"""
 
-REFITTED = 0.66
+REFITTED = 0.61
 """Expected loss after the first round of the colour refit, divided by the loss before it, until a candidate tells:
 docs/results/tuning.md#refitted"""
 LARGEST_STEP = 4
@@ -50,13 +50,8 @@ class Effort:
         has none, because they cost more time there than their bytes are worth: docs/results/tuning.md#refit_rounds
     subsets : int
         Most steps of a round, as for `refit_colours`.
-    steps : int
-        Most candidates, unless none of them holds.
     close : float
-        The search ends when a candidate is no farther than this below the target (log of limit over loss).
-    far : float
-        After `steps` candidates, the search goes on only if the best one is farther than this below the target:
-        docs/results/tuning.md#far
+        A search ends when a candidate's log of the largest share is no farther than this below 0.
     few : int
         Least scored poses, if there are as many: docs/results/tuning.md#few
     views : int
@@ -86,7 +81,6 @@ class Effort:
     keep: float
     refit_rounds: int
     subsets: int
-    steps: int
     close: float
     few: int
     views: int
@@ -96,7 +90,6 @@ class Effort:
     passes: float = 0.0
     interleaved: int = 0
     interleave_at: float = 0.8
-    far: float = 0.15
     descends: int = 0
 
     def poses_of(self, pixels: Sequence[int], count: int) -> int:
@@ -169,25 +162,22 @@ EFFORTS = {
         keep=0.77,
         refit_rounds=0,
         subsets=7,
-        steps=1,
-        close=0.14,
+        close=0.3,
         few=32,
         views=96,
         pixels=12,
-        refitted=0.86,
+        refitted=0.93,
         probed=4,
-        far=0.25,
     ),
     "balanced": Effort(
         keep=0.8,
         refit_rounds=2,
         subsets=7,
-        steps=2,
         close=0.13,
         few=400,
         views=400,
         pixels=24,
-        refitted=0.7,
+        refitted=0.64,
         passes=8.0,
         interleaved=2,
         descends=10_000,
@@ -196,7 +186,6 @@ EFFORTS = {
         keep=0.8,
         refit_rounds=2,
         subsets=7,
-        steps=2,
         close=0.09,
         few=400,
         views=400,

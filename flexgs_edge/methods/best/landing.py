@@ -82,6 +82,7 @@ def land_on_quality(
     excesses: Sequence[float],
     attempt: Callable[[GridScene], Sequence[float]],
     storage: Storage,
+    most: int,
     descended: bool = False,
 ) -> None:
     """Remove the Gaussians whose removal costs least, until a quality hardly holds.
@@ -98,6 +99,8 @@ def land_on_quality(
         Makes and measures the result of a grid, and returns its excesses.
     storage : Storage
         Holds the grids.
+    most : int
+        Most results, whatever is usual.
     descended : bool
         The result comes from a descent.
     """
@@ -107,7 +110,7 @@ def land_on_quality(
     tries = DESCENDED_TRIES if descended else QUALITY_TRIES
     usual = (DESCENDED_SHARE if descended else SHARE) * grid.count
     stride, slowest = (aim - known.max()) * usual, 1.0 / usual
-    for number in range(tries + 1 if known.max() < -NEAR_QUALITY else 0):
+    for number in range(min(tries + 1, most) if known.max() < -NEAR_QUALITY else 0):
         if number == tries and least:
             return
         count = min(least + round(stride), beyond - 1)

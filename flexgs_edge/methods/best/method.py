@@ -26,17 +26,17 @@ from flexgs_edge.goals.steps import Scored, SearchResult, Step, step_words
 from flexgs_edge.goals.target import Measurement
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import values_of
-from flexgs_edge.methods.best.candidates import Candidate, Product, RateResult
 from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
 from flexgs_edge.methods.best.effort import distil_steps, effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder
-from flexgs_edge.methods.best.grid_search import GridSearch
+from flexgs_edge.methods.best.grid_maker import GridMaker
+from flexgs_edge.methods.best.guess import Measure
 from flexgs_edge.methods.best.keep import kept_as_it_is, reckoned, with_preview
 from flexgs_edge.methods.best.layers import HALF, assign_layers, can_sort
-from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch, PosesLacking
 from flexgs_edge.methods.best.poses import ScoredPoses, is_fine, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
+from flexgs_edge.methods.best.search import Candidate, Maker, Product, RateResult, search
 from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, choose_storage, least_spilled, needed_bytes
 from flexgs_edge.methods.best.view_weights import KnownErrors
 from flexgs_edge.quality.view_quality import Quality
@@ -56,11 +56,9 @@ from flexgs_edge.views.references import References
 
 LOG = logging.getLogger("flexgs_edge")
 
-SEARCHES = 3
-"""Most searches, each with more poses beside views that lost too much: docs/results/tuning.md#needed"""
-
-Report = Callable[[Candidate], None]
-SearchMaker = Callable[[PruneRounds, Measure, Report], MultiplierSearch[Product]]
+See = Callable[[Sequence[int], int], bool]
+MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
+"""Makes the maker of a search from rounds, a measure, and what scores poses beside views that lose too much."""
 
 
 def compress(run: Run[CompressOptions], bench: Bench) -> Made:
@@ -95,7 +93,7 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
         with run.clock.stage("search"):
             found = kept_as_it_is(run, bench, coder, judges.decide)
         grid, search = found or search_best(
-            grid_search(run.options, coder), run, bench, poses, judges.decide, checkpoint=kept
+            grid_maker(run.options, coder), run, bench, poses, judges.decide, checkpoint=kept
         )
         judges.decided()
         if run.options.layers is not None and run.options.layers > 1:
@@ -176,23 +174,23 @@ def _tried(
     return size, judges.measure(MemorySource(values_of(grid, judges.storage), origin=grid.origin))
 
 
-def grid_search(
-    options: CompressOptions, coder: GridCoder, search: type[GridSearch] = GridSearch
-) -> SearchMaker[GridScene]:
-    """Make searches for the grid of a `.fgs`."""
+def grid_maker(options: CompressOptions, coder: GridCoder, kind: type[GridMaker] = GridMaker) -> MakerOf[GridScene]:
+    """Make makers of the grid of a `.fgs`."""
 
     def size_of(grid: GridScene) -> int:
         return reckoned(options, coder.size(grid))
 
     plan = effort_of(options)
 
-    def make(rounds: PruneRounds, measure: Measure, report: Report) -> MultiplierSearch[GridScene]:
-        return search(rounds, size_of, measure, plan, options.refit, report, rounds.original.steps)
+    def make(rounds: PruneRounds, measure: Measure, see: See | None = None) -> GridMaker:
+        maker = kind(rounds, size_of, measure, plan, options.refit, rounds.original.steps, see)
+        maker.selection.most = options.max_gaussians
+        return maker
 
     return make
 
 
-def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge, lost: Sequence[int] = ()) -> ScoredPoses:
+def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge) -> ScoredPoses:
     """`scored_poses` for a run.
 
     Parameters
@@ -203,8 +201,6 @@ def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge, lost: Se
         Its renderer has nothing loaded.
     judge : Judge
         On the views that decide.
-    lost : sequence of int
-        As for `scored_poses`. Default: none.
     """
     return scored_poses(
         run.seen.of(run.seen.train),
@@ -214,12 +210,11 @@ def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge, lost: Se
         judge.covered_decides,
         judge.cameras,
         judge.photos_that_decide(run.target),
-        lost,
     )
 
 
 def search_best(
-    make: SearchMaker[Product],
+    make: MakerOf[Product],
     run: Run[CompressOptions],
     bench: Bench,
     poses: ScoredPoses,
@@ -228,12 +223,10 @@ def search_best(
 ) -> tuple[Product, SearchResult]:
     """Search, and return the product to write and all candidates that led to it.
 
-    Where candidates keep breaking views, the search begins anew with poses beside these, `SEARCHES` times in all at most.
-
     Parameters
     ----------
     make : callable
-        `grid_search`, or the search for a file of another format.
+        `grid_maker`, or what makes a file of another format.
     run : Run
         Planned. The storage of `bench.renderer` holds its scene as a whole.
     bench : Bench
@@ -252,39 +245,31 @@ def search_best(
     BudgetError
         When the scene does not fit.
     """
-    lost: list[int] = []
-    tried: list[Step] = []
-    for left in reversed(range(SEARCHES if run.options.makes_poses else 1)):
-        try:
-            product, search = _search_from(poses, make, run, bench, judge, checkpoint, asks=left > 0)
-            break
-        except PosesLacking as lacking:
-            lost += lacking.views
-            tried += [as_step(step, run.source.count) for step in lacking.steps]
-        # Outside of the handler, whose error would keep the last search in memory.
-        LOG.info("views that lose too much: %d; searching again with poses beside them", len(set(lost)))
-        poses = choose_poses(run, bench, judge, lost)
-        checkpoint = None if checkpoint is None else checkpoint.further()
-    return product, replace(search, steps=(*tried, *search.steps))
-
-
-def _search_from(
-    poses: ScoredPoses,
-    make: SearchMaker[Product],
-    run: Run[CompressOptions],
-    bench: Bench,
-    judge: Judge,
-    checkpoint: Checkpoint | None,
-    asks: bool = False,
-) -> tuple[Product, SearchResult]:
     with (
         open_rounds(run, bench, poses.cameras, checkpoint=checkpoint, known=poses.known) as rounds,
         run.clock.stage("search"),
     ):
+        further = 0
+
+        def see(views: Sequence[int], number: int) -> bool:
+            nonlocal further
+            beside = poses.beside([judge.cameras[view] for view in views], bench.renderer, run.source)
+            seen = rounds.see(beside, number, poses.known)
+            if seen:
+                further += len(beside)
+                LOG.info("views that lose too much: %d; %d poses beside them are scored too", len(views), len(beside))
+            return seen
+
         product, search = search_rounds(
-            make, rounds, run, judge, on_step=lambda step: LOG.info("%s", step_words(step, run.target)), asks=asks
+            make,
+            rounds,
+            run,
+            judge,
+            on_step=lambda step: LOG.info("%s", step_words(step, run.target)),
+            see=see if run.options.makes_poses else None,
         )
-        return product, replace(search, scored=Scored(len(poses.cameras), poses.made, rounds.unseen))
+        scored = Scored(len(poses.cameras) + further, poses.made + further, rounds.unseen)
+        return product, replace(search, scored=scored)
 
 
 @contextmanager
@@ -328,9 +313,9 @@ def open_rounds(
             with run.clock.stage("search"):
                 between = poses_between(scored) if steps else ()
                 poses = [*scored, *between]
-                turns, nearest = (known.slopes(poses), known.nearest(poses)) if known and steps else (None, None)
+                turns = known.slopes(poses) if known and steps else None
                 rounds = make(
-                    Original(bench, source.origin, scored, references, between, run.progress, steps, turns, nearest),
+                    Original(bench, source.origin, scored, references, between, run.progress, steps, turns),
                     source,
                     refit=options.refit,
                     unseen_share=options.unseen_share,
@@ -342,12 +327,12 @@ def open_rounds(
 
 
 def search_rounds(
-    make: SearchMaker[Product],
+    make: MakerOf[Product],
     rounds: PruneRounds,
     run: Run[CompressOptions],
     judge: Judge,
     on_step: Callable[[Step], None] | None = None,
-    asks: bool = False,
+    see: See | None = None,
 ) -> tuple[Product, SearchResult]:
     """Search as `search_best` does, from rounds that are open already."""
     renderer, source = rounds.original.bench.renderer, run.source
@@ -361,9 +346,7 @@ def search_rounds(
         if on_step:
             on_step(as_step(step, source.count))
 
-    search = make(rounds, measure, report)
-    search.most, search.asks = run.options.max_gaussians, asks
-    found = search.run(run.target, run.options.best_effort)
+    found = search(make(rounds, measure, see), run.target, best_effort=run.options.best_effort, on_step=report)
     if found.chosen.left_out:
         LOG.warning(
             "%d Gaussians that no scored pose sees were left out: they lie so far away, or are so extreme, that all others "

@@ -27,8 +27,7 @@ effort allows: docs/results/tuning.md#fine_drop"""
 COVERAGE_POSES = 32
 """Poses that tell how much of the views the scene covers. All 220 of one scene took a tenth of the run."""
 BESIDE_FINER = 2.0
-"""How much finer we look at poses beside a view that lost too much, for each search that lost it:
-docs/results/tuning.md#needed"""
+"""How much finer than in the mean we look at poses beside a view that lost too much: docs/results/tuning.md#needed"""
 
 
 @dataclass(frozen=True)
@@ -43,11 +42,33 @@ class ScoredPoses:
         How many of them were generated (`--views-margin`).
     known : KnownErrors, optional
         What decides how often descents look at a pose. Default: all alike.
+    given : tuple of Camera
+        The given ones among them, at every pixel.
+    step : float
+        Mean distance in pixels between the points that we look at.
     """
 
     cameras: list[Camera]
     made: int = 0
     known: KnownErrors | None = None
+    given: tuple[Camera, ...] = ()
+    step: float = 1.0
+
+    def beside(self, views: Sequence[Camera], renderer: Renderer, source: SceneSource) -> list[Camera]:
+        """Further poses beside views that lost too much, and nearer and farther ones of these.
+
+        Parameters
+        ----------
+        views : sequence of Camera
+            The views.
+        renderer : Renderer
+            With nothing loaded.
+        source : SceneSource
+            The original.
+        """
+        poses = [pose for view in views for pose in poses_beside(view, self.given)]
+        poses += margin_of(renderer, source, poses, self.given)
+        return sampled_poses(poses, [max(self.step / BESIDE_FINER, 1.0)] * len(poses))
 
 
 def scored_poses(
@@ -58,7 +79,6 @@ def scored_poses(
     covered_decides: bool = False,
     deciding: Sequence[Camera] = (),
     photo: Callable[[int, np.ndarray], np.ndarray] | None = None,
-    lost: Sequence[int] = (),
 ) -> ScoredPoses:
     """Choose as many poses as the effort scores. Each next pose is the one that adds most to what those before it see.
 
@@ -83,9 +103,6 @@ def scored_poses(
     photo : callable, optional
         The photo of one of these ([H, W, 3] f32) by its place and a render, if photos decide. Poses then get pixels by
         `view_weights`. Default: alike.
-    lost : sequence of int
-        Places, among the views that decide, of those that lost too much, in one search or in several. They get poses beside
-        them, with the more points, the more often they lost. Default: none.
     """
     plan = EFFORTS[options.effort]
     positions = some_positions(source)
@@ -95,14 +112,11 @@ def scored_poses(
     fine = is_fine(options, source)
     most = plan.views if fine else plan.poses_of([camera.width * camera.height for camera in ordered], source.count)
     chosen, given = ordered[:most], {id(camera) for camera in cameras}
-    beside = {place: poses_beside(deciding[place], chosen) for place in sorted(set(lost))}
     if options.makes_poses:
-        margin = margin_of(renderer, source, chosen, cameras)
-        further = [pose for poses in beside.values() for pose in poses]
-        scored = [*chosen, *margin, *further]
+        scored = [*chosen, *margin_of(renderer, source, chosen, cameras)]
         needed = needed_poses(scored, chosen, ordered[most:], deciding, positions, renderer.near)
-        chosen = [*scored, *needed, *margin_of(renderer, source, [*further, *needed], cameras)]
-    drawn = chosen
+        chosen = [*scored, *needed, *margin_of(renderer, source, needed, cameras)]
+    drawn, steps = chosen, [1.0]
     errors = None
     if photo is not None:
         drop = options.max_drop or DEFAULT_MAX_DROP
@@ -116,11 +130,9 @@ def scored_poses(
         if max(steps) > 1 and covered_decides:
             # A small object in a large view would fall between the pixels.
             steps = sampling_steps(chosen, source.count * plan.pixels, _coverage(renderer, source, chosen))
-        finer = {id(pose): BESIDE_FINER ** lost.count(place) for place, poses in beside.items() for pose in poses}
-        pairs = zip(chosen, steps, strict=True)
-        steps = [max(step / finer.get(id(pose), 1.0), 1.0) for pose, step in pairs]
         drawn = sampled_poses(chosen, steps)
-    return ScoredPoses(drawn, sum(id(camera) not in given for camera in chosen), errors)
+    own = tuple(camera for camera in chosen if id(camera) in given)
+    return ScoredPoses(drawn, len(chosen) - len(own), errors, own, sum(steps) / len(steps))
 
 
 def _coverage(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera]) -> float:

@@ -7,10 +7,12 @@ the original's renders. Searches start from the snapshots that the rounds leave 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from weakref import WeakMethod
 
 import numpy as np
 
+from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.errors import InputError
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.checkpoint import Checkpoint
@@ -26,6 +28,7 @@ from flexgs_edge.methods.best.costs import (
 from flexgs_edge.methods.best.effort import LEAST_VIEWS
 from flexgs_edge.methods.best.refit.colour import normal_bytes, normal_sums, step_colours
 from flexgs_edge.methods.best.snapshot import Snapshot
+from flexgs_edge.methods.best.view_weights import KnownErrors
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.check import alive, invisible
@@ -206,6 +209,37 @@ class PruneRounds:
         with renderer.load(source, sum_bytes(2) + cost_bytes(source.sh_degree), view_sums=2) as scene:
             self._parts = [self._measure(scene, some) for some in self._views]
         return self._add(Snapshot(rows, planes, RemovalCosts.of(self._parts, self.storage)))
+
+    def see(self, cameras: Sequence[Camera], number: int, known: KnownErrors | None) -> bool:
+        """Score further poses, too, from snapshot `number` on; later ones are dropped. False if there are sets enough.
+
+        Parameters
+        ----------
+        cameras : sequence of Camera
+            The poses. They become a set of their own.
+        number : int
+            A snapshot that descents have made, or the first one. Its costs are measured anew.
+        known : KnownErrors or None
+            Descents look at poses by it.
+        """
+        if len(self._views) >= MOST_PARTS:
+            return False
+        original, renderer, count = self.original, self.original.bench.renderer, len(self.original.cameras)
+        planes, rows = self.snapshots[number].planes, self.snapshots[number].rows
+        scored = [*original.cameras, *cameras]
+        original.references.make_room(count, len(cameras))
+        turns = None if original.turns is None or known is None else known.slopes([*scored, *original.between])
+        self.original = original = replace(original, cameras=scored, turns=turns)
+        if self.storage.spills:
+            renderer.largest = largest_of(scored)
+        with renderer.load(self._source) as scene:
+            for view, camera in enumerate(renderer.in_turn(scene, cameras), start=count):
+                original.references.add(view, renderer.render_planes(scene, camera))
+        self._views.append(range(count, len(scored)))
+        del self.snapshots[number:]
+        self.checkpoint = None  # it holds the rounds without these poses
+        self.renew(lambda: (rows, planes))
+        return True
 
     def _add(self, snapshot: Snapshot, keep_views: bool = False) -> Snapshot:
         """Append a snapshot, and save it if there is a checkpoint."""

@@ -13,7 +13,7 @@ count more whose picture few others share.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.quality.psnr import contrast, far_bases, mse, mse_of_psnr
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.views.original import Original
 
 LEAST = 1e-6
 """Least weight of a pose."""
@@ -33,10 +32,6 @@ STEP = 4
 POWER, RARE_POWER = 4.8, 2.4
 """Powers of the slope, and of how rare a pose's picture is. The slope alone would minimise the mean drop; higher powers lift
 the worst view, as a soft maximum does: docs/results/tuning.md#view_weights"""
-
-LOOK_POWER, FEWEST_LOOKS, MOST_LOOKS = 0.5, 0.5, 2.5
-"""Power of a view's drop over the mean drop by which descents look at its poses more often, once the worst view broke its bound,
-and limits of that factor: docs/results/tuning.md#looks"""
 
 
 @dataclass(frozen=True)
@@ -67,13 +62,9 @@ class KnownErrors:
         """
         allowed = float(np.median(self.errors)) * (10 ** (self.drop / 10) - 1)
         slopes = 1.0 / (self.errors + max(allowed, 1e-12))
-        relative: np.ndarray = (slopes / slopes.max())[self.nearest(cameras)]
+        nearest = squared_distances(cameras, self.cameras).argmin(axis=1)
+        relative: np.ndarray = (slopes / slopes.max())[nearest]
         return relative
-
-    def nearest(self, cameras: Sequence[Camera]) -> np.ndarray:
-        """[n] i64, the place of the view that is nearest to each of n cameras."""
-        places: np.ndarray = squared_distances(cameras, self.cameras).argmin(axis=1)
-        return places
 
 
 def base_errors(
@@ -129,24 +120,6 @@ def view_weights(slopes: np.ndarray, rare: np.ndarray) -> np.ndarray:
     weights: np.ndarray = slopes**POWER * rare**RARE_POWER
     relative: np.ndarray = np.maximum(weights / weights.max(), LEAST)
     return relative
-
-
-def looking_more(original: Original, losses: Sequence[float | None]) -> Original:
-    """The original as further descents look at it after a candidate whose worst view broke its bound.
-
-    Parameters
-    ----------
-    original : Original
-        With `turns` and `nearest`; another one stays as it is.
-    losses : sequence of float or None
-        Drop of each view that decides; views without one count as the mean.
-    """
-    if original.turns is None or original.nearest is None:
-        return original
-    known = np.array([np.nan if loss is None else max(loss, 0.0) for loss in losses])
-    times = (known / np.nanmean(known)) ** LOOK_POWER
-    more = np.clip(np.nan_to_num(times, nan=1.0), FEWEST_LOOKS, MOST_LOOKS)
-    return replace(original, turns=original.turns * more[original.nearest])
 
 
 def rareness(cameras: Sequence[Camera], points: np.ndarray, near: float) -> np.ndarray:

@@ -7,7 +7,7 @@ geometry as the format decodes it.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,14 +15,14 @@ import numpy as np
 from flexgs_edge.goals.target import Target
 from flexgs_edge.io.exchange import near_order
 from flexgs_edge.io.formats import Format
-from flexgs_edge.methods.best.allocation import BitModel, choose_one_degree
-from flexgs_edge.methods.best.candidates import Candidate
-from flexgs_edge.methods.best.costs import RemovalCosts
+from flexgs_edge.methods.best.allocation import BitModel, choose, choose_one_degree
 from flexgs_edge.methods.best.effort import EFFORTS, Effort
-from flexgs_edge.methods.best.method import SearchMaker
-from flexgs_edge.methods.best.multiplier import Measure, MultiplierSearch
+from flexgs_edge.methods.best.guess import PRUNED_PART, Guess, Measure
+from flexgs_edge.methods.best.method import MakerOf, See
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.rounds import PruneRounds, take_rows
+from flexgs_edge.methods.best.search import Candidate
+from flexgs_edge.methods.best.selection import Selection
 from flexgs_edge.methods.foreign.file_maker import FileMaker, WrittenFile
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
@@ -30,13 +30,13 @@ from flexgs_edge.scene.lower_sh import lower_degree
 from flexgs_edge.scene.source import MemorySource
 
 
-class FileSearch(MultiplierSearch[WrittenFile]):
-    """The search for a file; see `MultiplierSearch`.
+class CostMaker:
+    """Makes files of a format by measured costs; a `Maker`.
 
     Parameters
     ----------
     rounds : PruneRounds
-        Snapshots to choose from.
+        Rounds of pruning; more are done when they are needed.
     files : FileMaker
         Writes, reads back and measures.
     measure : callable
@@ -46,8 +46,8 @@ class FileSearch(MultiplierSearch[WrittenFile]):
     refit : bool
         Refit colours to the decoded geometry, and their constant to the decoded SH (default). This writes two more files
         for each candidate.
-    on_step : callable, optional
-        Called with each candidate.
+    see : callable, optional
+        As for `GridMaker`.
     """
 
     def __init__(
@@ -57,25 +57,28 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         measure: Measure,
         effort: Effort,
         refit: bool = True,
-        on_step: Callable[[Candidate], None] | None = None,
+        see: See | None = None,
     ) -> None:
-        super().__init__(rounds, measure, effort, on_step)
-        self.files, self.refit = files, refit
-        self.bits = bit_model(files.format, len(rounds.snapshots[0].costs.sh))
+        self.rounds, self.files, self.measure = rounds, files, measure
+        self.effort, self.refit, self.close = effort, refit, effort.close
+        chosen = choose_one_degree if files.format.one_degree else choose
+        bits = bit_model(files.format, len(rounds.snapshots[0].costs.sh))
+        self.selection = Selection(rounds, effort.keep, chosen, bits)
+        self._see = see
 
-    def choose(self, costs: RemovalCosts, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
-        """See `MultiplierSearch`. If a format has only one SH degree for all Gaussians, so has the choice."""
-        if self.files.format.one_degree:
-            return choose_one_degree(costs, self.bits, multiplier)
-        return super().choose(costs, multiplier)
+    def start(self, target: Target) -> float:
+        """See `Maker`."""
+        Guess(self.measure).prune(self.selection, target, PRUNED_PART)
+        return self.selection.cut()
 
-    def discard(self, product: WrittenFile) -> None:
-        """Remove a file that is not the best any more."""
-        product.path.unlink()
+    def probe(self, multiplier: float, target: Target) -> float | None:
+        """See `Maker`: only a written file tells."""
+        return None
 
-    def _whole(self, multiplier: float, target: Target) -> tuple[Candidate, WrittenFile]:
+    def make(self, multiplier: float, target: Target) -> tuple[Candidate, WrittenFile]:
+        """See `Maker`."""
         started = time.perf_counter()
-        kept = self.kept(multiplier)
+        kept = self.selection.kept(multiplier)
         planes, degrees = kept.planes, kept.degrees
         planes["sh_rest"] = lower_degree(planes["sh_rest"], int(degrees.max(initial=0)))
         order = near_order(MemorySource(planes, origin=self.rounds.original.origin))
@@ -84,6 +87,20 @@ class FileSearch(MultiplierSearch[WrittenFile]):
         excess = target.excess(file.size, file.measurement)
         seconds = time.perf_counter() - started
         return Candidate(multiplier, file.count, file.sh_count, file.size, file.measurement, excess, seconds), file
+
+    def trim(
+        self, chosen: Candidate, product: WrittenFile, target: Target, tell: Callable[[Candidate], None], most: int
+    ) -> tuple[Candidate, WrittenFile]:
+        """See `Maker`: a file stays as it is."""
+        return chosen, product
+
+    def see(self, views: Sequence[int]) -> bool:
+        """See `Maker`."""
+        return self._see is not None and self._see(views, self.selection.begin)
+
+    def discard(self, product: WrittenFile) -> None:
+        """Remove a file that is not the best any more."""
+        product.path.unlink()
 
     def _finish(self, planes: dict[str, np.ndarray], degrees: np.ndarray) -> WrittenFile:
         """Refit all colours to the decoded geometry, then the constant to the decoded SH. Geometry is written as it was."""
@@ -127,7 +144,12 @@ def bit_model(format: Format, sh_degree: int) -> BitModel:
     return BitModel(8 * (format.row_bytes - format.sh_bytes), bands)
 
 
-def file_search(options: CompressOptions, files: FileMaker) -> SearchMaker[WrittenFile]:
-    """Make searches for a file of another program's format."""
-    plan = EFFORTS[options.effort]
-    return lambda rounds, measure, report: FileSearch(rounds, files, measure, plan, options.refit, report)
+def file_maker(options: CompressOptions, files: FileMaker) -> MakerOf[WrittenFile]:
+    """Make makers of a file of another program's format."""
+
+    def make(rounds: PruneRounds, measure: Measure, see: See | None = None) -> CostMaker:
+        maker = CostMaker(rounds, files, measure, EFFORTS[options.effort], options.refit, see)
+        maker.selection.most = options.max_gaussians
+        return maker
+
+    return make

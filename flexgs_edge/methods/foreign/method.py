@@ -6,7 +6,7 @@ import logging
 
 from flexgs_edge.io.exchange import read_foreign
 from flexgs_edge.methods.best.method import choose_poses, search_best
-from flexgs_edge.methods.foreign.by_cost import file_search
+from flexgs_edge.methods.foreign.by_cost import file_maker
 from flexgs_edge.methods.foreign.file_maker import open_files, publish
 from flexgs_edge.run.judges import Judges
 from flexgs_edge.run.made import Made
@@ -37,7 +37,7 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
         poses = choose_poses(run, bench, judges.decide)
         with open_files(run, format, bench, judges) as files:
             LOG.info("searching for %s", plan.target.describe())
-            file, search = search_best(file_search(options, files), run, bench, poses, judges.decide)
+            file, search = search_best(file_maker(options, files), run, bench, poses, judges.decide)
             judges.decided()
             quality = judges.measure(read_foreign(file.path))
             if output is not None:

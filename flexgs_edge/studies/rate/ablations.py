@@ -11,7 +11,7 @@ import numpy as np
 
 from flexgs_edge.methods.best.allocation import REMOVAL_FACTOR, SH_FACTOR, BitModel
 from flexgs_edge.methods.best.costs import RemovalCosts
-from flexgs_edge.methods.best.grid_search import GridSearch
+from flexgs_edge.methods.best.grid_maker import GridMaker
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.snapshot import Snapshot
 from flexgs_edge.methods.paper.prune import ranks_from_order
@@ -62,15 +62,15 @@ class OnePassPath(PruneRounds):
         return snapshot
 
 
-class SomeDegrees(GridSearch):
+class SomeDegrees(GridMaker):
     """A search with fewer SH degrees to choose from; a subclass says which."""
 
     with_none: ClassVar[bool]
 
-    def choose(self, costs: RemovalCosts, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
-        """See `MultiplierSearch.choose`."""
+    def choose(self, costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
+        """See `GridMaker.choose`."""
         top = len(costs.sh)
-        return choose_among(costs, self.bits, multiplier, (0, top) if self.with_none else (top,))
+        return choose_among(costs, bits, multiplier, (0, top) if self.with_none else (top,))
 
 
 class AllOrNone(SomeDegrees):
@@ -116,7 +116,7 @@ class Variant:
     words : str
         What replaces the part, for tables.
     search : type
-        The search, a `GridSearch`.
+        The search, a `GridMaker`.
     path : callable
         Makes the rounds from the arguments of `PruneRounds`.
     refit : bool
@@ -127,7 +127,7 @@ class Variant:
 
     name: str
     words: str
-    search: type[GridSearch] = GridSearch
+    search: type[GridMaker] = GridMaker
     path: Callable[..., PruneRounds] = PruneRounds
     refit: bool = True
     distil: int | None = None

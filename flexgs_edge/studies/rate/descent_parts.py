@@ -6,13 +6,13 @@ from dataclasses import replace
 from typing import Any
 
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.methods.best.grid_search import GridSearch
-from flexgs_edge.methods.best.kept import Kept
+from flexgs_edge.methods.best.grid_maker import GridMaker
 from flexgs_edge.methods.best.refit.distil import Schedule, distil
+from flexgs_edge.methods.best.selection import Kept
 from flexgs_edge.scene.source import Planes
 
 
-class NoneBetween(GridSearch):
+class NoneBetween(GridMaker):
     """A search without descents between rounds of pruning."""
 
     def __init__(self, *words: Any, **more: Any) -> None:
@@ -20,28 +20,28 @@ class NoneBetween(GridSearch):
         self._interleaved = 0
 
 
-class NoPrices(GridSearch):
+class NoPrices(GridMaker):
     """A search in whose descents bits cost nothing."""
 
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
         return super()._distil(kept, replace(schedule, multiplier=0.0), step_sizes)
 
 
-class NoStructure(GridSearch):
+class NoStructure(GridMaker):
     """A search whose descents see squared errors alone, without SSIM."""
 
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
         return distil(kept.planes, kept.degrees, self.rounds.original, schedule, step_sizes, structure=0.0)
 
 
-class RoundedAtTheEnd(GridSearch):
+class RoundedAtTheEnd(GridMaker):
     """A search whose descents draw the values themselves to the end, and never those on the grid."""
 
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
         return super()._distil(kept, replace(schedule, on_grid=1.0, holding=1.0), step_sizes)
 
 
-class NoMean(GridSearch):
+class NoMean(GridMaker):
     """A search whose descents end with their last values, and not with a mean of the last ones."""
 
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
@@ -49,7 +49,7 @@ class NoMean(GridSearch):
         return super()._distil(kept, replace(schedule, course=course), step_sizes)
 
 
-DESCENT_PARTS: tuple[tuple[str, str, type[GridSearch]], ...] = (
+DESCENT_PARTS: tuple[tuple[str, str, type[GridMaker]], ...] = (
     ("none between", "no descents between the rounds of pruning", NoneBetween),
     ("no prices", "bits cost nothing in descents", NoPrices),
     ("no SSIM", "descents see squared errors alone", NoStructure),

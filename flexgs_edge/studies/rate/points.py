@@ -17,7 +17,7 @@ from flexgs_edge.grid.values import from_grid
 from flexgs_edge.io.exchange import near_order
 from flexgs_edge.io.formats import FORMATS, Format
 from flexgs_edge.methods.best.grid_coder import GridCoder
-from flexgs_edge.methods.best.method import grid_search, open_rounds, search_rounds
+from flexgs_edge.methods.best.method import grid_maker, open_rounds, search_rounds
 from flexgs_edge.methods.best.poses import scored_poses
 from flexgs_edge.methods.foreign.file_maker import open_files
 from flexgs_edge.quality.view_quality import Quality
@@ -199,7 +199,7 @@ def best_points(studied: StudyScene, variant: Variant, effort: str, ratios: Sequ
         for ratio in sorted(ratios):
             aimed = run.aimed_at(_target(studied, ratio))
             coder = GridCoder(studied.bench.renderer, settings_room(aimed))
-            make = grid_search(options, coder, variant.search)
+            make = grid_maker(options, coder, variant.search)
             with run.clock.stage("search"):
                 grid, search = search_rounds(make, rounds, aimed, studied.judge)
             seconds = time.perf_counter() - started

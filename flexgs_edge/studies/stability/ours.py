@@ -14,10 +14,11 @@ from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.methods.best.grid_coder import GridCoder
-from flexgs_edge.methods.best.grid_search import GridSearch
-from flexgs_edge.methods.best.method import grid_search, open_rounds
+from flexgs_edge.methods.best.grid_maker import GridMaker
+from flexgs_edge.methods.best.method import grid_maker, open_rounds
 from flexgs_edge.methods.best.poses import scored_poses
 from flexgs_edge.methods.best.rounds import PruneRounds
+from flexgs_edge.methods.best.search import search as search_by
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import MemorySource, SceneSource
@@ -76,22 +77,22 @@ def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: Judg
     judge = judge or studied.judge
     made = _search(studied, rounds, judge, rounds.original.bench.renderer)
     with studied.run.clock.stage("search"):
-        found = made.run(target, best_effort=True)
+        found = search_by(made, target, best_effort=True)
     multiplier = found.chosen.multiplier
     return _whole(made, found.product, multiplier, found.reached)
 
 
-def _search(studied: StudyScene, rounds: PruneRounds, judge: Judge, renderer: Renderer) -> GridSearch:
+def _search(studied: StudyScene, rounds: PruneRounds, judge: Judge, renderer: Renderer) -> GridMaker:
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=rounds.original.origin)) as scene:
             return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))
 
     options = replace(studied.run.options, refit=True)
-    made = grid_search(options, GridCoder(renderer))(rounds, measure, lambda step: None)
-    assert isinstance(made, GridSearch)
+    made = grid_maker(options, GridCoder(renderer))(rounds, measure, None)
+    assert isinstance(made, GridMaker)
     return made
 
 
-def _whole(made: GridSearch, grid: GridScene, multiplier: float, reached: bool) -> Whole:
-    rows = made.rounds.scene_rows(made.kept(multiplier).rows)
+def _whole(made: GridMaker, grid: GridScene, multiplier: float, reached: bool) -> Whole:
+    rows = made.rounds.scene_rows(made.selection.kept(multiplier).rows)
     return Whole(grid, coded_size(grid, {}), multiplier, rows, reached)

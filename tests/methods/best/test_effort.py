@@ -19,13 +19,13 @@ from flexgs_edge.methods.best.effort import (
     sampling_steps,
 )
 from flexgs_edge.run.options import CompressOptions
-from known_search import EFFORT
+from known_rounds import EFFORT
 from synthetic import make_camera
 
 
 def test_efforts_grow() -> None:
     fast, balanced, most = EFFORTS.values()
-    for name in ("keep", "refit_rounds", "steps", "views", "passes"):
+    for name in ("keep", "refit_rounds", "views", "passes"):
         assert getattr(fast, name) <= getattr(balanced, name) <= getattr(most, name)
         assert getattr(fast, name) < getattr(most, name)
     assert fast.close > balanced.close > most.close

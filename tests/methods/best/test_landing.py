@@ -100,7 +100,7 @@ def test_lands_just_below_a_quality(grid: GridScene, excess: float, power: float
         seen.append((gone, excess + 3 * (gone / COUNT) ** power))
         return [seen[-1][1]]
 
-    land_on_quality(grid, removal, [excess], attempt, IN_MEMORY)
+    land_on_quality(grid, removal, [excess], attempt, IN_MEMORY, 9)
     best = max((found for _, found in seen if found <= 0.0), default=excess)
     missed = all(found > 0.0 for _, found in seen[:QUALITY_TRIES])
     assert len(seen) <= QUALITY_TRIES + missed and len({gone for gone, _ in seen}) == len(seen)
@@ -116,7 +116,7 @@ def test_each_bound_rises_at_its_own_pace(grid: GridScene) -> None:
         seen.append((-0.1 - gone, -0.2 + 3 * gone))
         return [*seen[-1]]
 
-    land_on_quality(grid, np.random.default_rng(1).random(COUNT), [-0.1, -0.2], attempt, IN_MEMORY, descended=True)
+    land_on_quality(grid, np.random.default_rng(1).random(COUNT), [-0.1, -0.2], attempt, IN_MEMORY, 9, descended=True)
     assert 2 <= len(seen) <= DESCENDED_TRIES and -NEAR_QUALITY <= seen[-1][1] <= 0.0
 
 
@@ -132,7 +132,7 @@ def test_ever_more_go_while_nothing_is_lost(grid: GridScene, needless: float) ->
         (holds if excess <= 0.0 else misses).append(gone)
         return [excess]
 
-    land_on_quality(grid, np.random.default_rng(1).random(COUNT), [-0.06], attempt, IN_MEMORY, descended=True)
+    land_on_quality(grid, np.random.default_rng(1).random(COUNT), [-0.06], attempt, IN_MEMORY, 9, descended=True)
     assert len(holds) + len(misses) <= DESCENDED_TRIES and max(holds) > 0.9 * needless
 
 
@@ -144,12 +144,12 @@ def test_fewer_go_behind_a_descent(grid: GridScene) -> None:
         return [-0.001]
 
     for descended in (False, True):
-        land_on_quality(grid, np.zeros(COUNT), [-0.11], attempt, IN_MEMORY, descended)
+        land_on_quality(grid, np.zeros(COUNT), [-0.11], attempt, IN_MEMORY, 9, descended)
     assert asked == [round(0.1 * share * COUNT) for share in (SHARE, DESCENDED_SHARE)]
 
 
 def test_a_quality_that_is_met_is_left_alone(grid: GridScene) -> None:
-    land_on_quality(grid, np.zeros(COUNT), [-0.5 * NEAR_QUALITY], lambda _: pytest.fail("no need"), IN_MEMORY)
+    land_on_quality(grid, np.zeros(COUNT), [-0.5 * NEAR_QUALITY], lambda _: pytest.fail("no need"), IN_MEMORY, 9)
 
 
 def test_removals_that_gain_quality(grid: GridScene) -> None:
@@ -159,9 +159,9 @@ def test_removals_that_gain_quality(grid: GridScene) -> None:
         asked.append(smaller.count)
         return [-0.2]
 
-    land_on_quality(grid, np.zeros(COUNT), [-0.1], attempt, IN_MEMORY)
+    land_on_quality(grid, np.zeros(COUNT), [-0.1], attempt, IN_MEMORY, 9)
     assert len(asked) == QUALITY_TRIES
-    land_on_quality(grid.take(np.arange(1)), np.zeros(1), [-0.1], attempt, IN_MEMORY)
+    land_on_quality(grid.take(np.arange(1)), np.zeros(1), [-0.1], attempt, IN_MEMORY, 9)
     assert len(asked) == QUALITY_TRIES
 
 
@@ -174,7 +174,7 @@ def test_rows_that_must_stay(grid: GridScene) -> None:
         counts.append(smaller.count)
         return [-0.15 + 1e-6 * (COUNT - smaller.count)]
 
-    land_on_quality(grid, removal, [-0.2], attempt, IN_MEMORY)
+    land_on_quality(grid, removal, [-0.2], attempt, IN_MEMORY, 9)
     assert counts and min(counts) == COUNT - 30
     found, size, _ = landed(grid, 0.97, removal)
     assert found is grid and size == size_of(grid)

@@ -12,16 +12,15 @@ import pytest
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.commands.compress import compress
-from flexgs_edge.goals.promise import Promised, WorstView, broken_views
-from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, Target
+from flexgs_edge.goals.promise import MeanSsim, Promised, WorstView, lost_views
+from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement
 from flexgs_edge.memory.process import current_rss
-from flexgs_edge.methods.best.multiplier import BROKEN, PosesLacking
+from flexgs_edge.methods.best.effort import LARGEST_STEP
 from flexgs_edge.methods.best.needed_poses import BESIDE, MOST_TIMES, needed_poses, poses_beside
 from flexgs_edge.methods.best.poses import scored_poses
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import CompressOptions
 from kernel_fixtures import large_budget, open_form
-from known_search import AT, BYTES, EFFORT, FakeRounds, KnownSearch, World, powers, search
 from synthetic import make_camera, random_scene
 from tiny_project import make_project
 
@@ -85,115 +84,27 @@ def test_poses_beside_a_view_lie_half_way_to_its_neighbours() -> None:
     assert len(poses_beside(view, [view, *given])) == BESIDE
 
 
-def test_scored_poses_beside_lost_views_are_finer_each_time() -> None:
+def test_poses_beside_lost_views_are_finer_than_the_others() -> None:
     given, view = [around(2.0 * place) for place in range(20)], around(13.0)
     # So few Gaussians that the poses are looked at as coarsely as they may.
-    source, options = random_scene(20, 5), CompressOptions(effort="fast")
-    renderer = Renderer(open_form("w16"), large_budget())
-
-    def widths(lost: list[int]) -> dict[str, int]:
-        found = scored_poses(given, options, renderer, source, deciding=[view], lost=lost).cameras
-        return {camera.name: camera.width for camera in found if camera.name.endswith(" to 13")}
-
-    assert not widths([])
-    once, twice, often = widths([0]), widths([0, 0]), widths([0] * 9)
-    assert set(once) == set(twice) == {"12 to 13", "14 to 13", "10 to 13", "16 to 13"}
-    # 40 pixels: every second one of them, then all.
-    assert set(once.values()) <= {19, 20} and set(twice.values()) == set(often.values()) == {40}
-    lifted = replace(options, views_margin=False)
-    assert not [
-        camera.name
-        for camera in scored_poses(given, lifted, renderer, source, deciding=[view], lost=[0]).cameras
-        if " to " in camera.name
-    ]
+    source, renderer = random_scene(20, 5), Renderer(open_form("w16"), large_budget())
+    poses = scored_poses(given, CompressOptions(effort="fast"), renderer, source, deciding=[view])
+    assert list(poses.given) == sorted(given, key=poses.given.index) and poses.step == LARGEST_STEP
+    found = poses.beside([view], renderer, source)
+    assert {"12 to 13", "14 to 13", "10 to 13", "16 to 13"} <= {camera.name for camera in found}
+    assert {camera.width for camera in found} <= {19, 20}  # of 40 pixels: every second one
 
 
-class Breaking(World):
-    """A world whose last view of three loses `times` the mean."""
-
-    def __init__(self, times: float) -> None:
-        super().__init__(lambda m: (m / AT) ** 0.6, lambda m: BYTES * (m / AT) ** -0.45)
-        self.times = times
-
-    def measure(self, planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
-        found = super().measure(planes, estimate)
-        drop = found.drop or 0.0
-        worst = replace(found, drop=self.times * drop, modelled_drop=self.times * drop)
-        rest = (3 - self.times) / 2 * drop
-        return replace(found, worst=worst, usual=drop, losses=(rest, rest, self.times * drop))
+PROMISED = Promised(MaxDrop(1.0), (WorstView("drop", 1.7), MeanSsim(0.015)))
 
 
-def asking(world: World, target: Target) -> Any:
-    rounds = FakeRounds()
-    world.rounds, world.multiplier = rounds, None
-    finder = KnownSearch(rounds, world.size_of, world.measure, EFFORT, refit=False)  # type: ignore[arg-type]
-    finder.world, finder.asks = world, True
-    return finder
-
-
-PROMISED = Promised(MaxDrop(1.0), (WorstView("drop", 1.7),))
-
-
-def test_candidates_in_a_row_that_break_a_view_ask_for_poses() -> None:
-    with pytest.raises(PosesLacking) as caught:
-        asking(Breaking(40.0), PROMISED).run(PROMISED)
-    assert caught.value.views == (2,) and len(caught.value.steps) == BROKEN
-    assert all(broken_views(PROMISED, step.measurement) == [2] for step in caught.value.steps)
-
-
-class Freeing(KnownSearch):
-    """Counts what the search frees."""
-
-    freed = 0
-
-    def discard(self, product: Any) -> None:
-        self.freed += 1
-
-
-def test_a_search_that_asks_frees_its_products() -> None:
-    world, rounds = Breaking(40.0), FakeRounds()
-    world.rounds = rounds
-    finder = Freeing(rounds, world.size_of, world.measure, EFFORT, refit=False)  # type: ignore[arg-type]
-    finder.world, finder.asks = world, True
-    with pytest.raises(PosesLacking):
-        finder.run(PROMISED)
-    assert finder.freed == BROKEN
-
-
-def test_a_search_with_a_result_that_holds_does_not_ask() -> None:
-    """Two candidates break a view. With one that holds before them, the search keeps that one."""
-    world = Breaking(40.0)
-    finder = asking(world, PROMISED)
-    found = search(powers(), MaxDrop(0.5), best_effort=True).chosen
-    holding = replace(found, excess=-0.5, measurement=replace(found.measurement, losses=(0.1, 0.1, 0.1)))
-    missed = [step for step in broken_steps(world) if not step.holds]
-    assert finder._broken(missed, PROMISED) == [2] and finder._broken([holding, *missed], PROMISED) == []
-
-
-def broken_steps(world: World) -> list[Any]:
-    with pytest.raises(PosesLacking) as caught:
-        asking(world, PROMISED).run(PROMISED)
-    return list(caught.value.steps)
-
-
-@pytest.mark.parametrize(
-    ("world", "target"),
-    [
-        (Breaking(1.2), PROMISED),
-        (powers(), PROMISED),
-        (Breaking(40.0), MaxDrop(1.0)),
-        (Breaking(40.0), Promised(MaxSize(3000, "drop"), (WorstView("drop", 1.7),))),
-    ],
-)
-def test_others_do_not_ask(world: World, target: Target) -> None:
-    assert asking(world, target).run(target).reached
-
-
-def test_broken_views_are_those_beyond_the_bound() -> None:
-    point = Measurement(1.0, 40.0, 1.0, usual=1.0, losses=(1.69, None, 1.71, -0.2))
-    assert broken_views(PROMISED, point) == [2]
-    assert broken_views(Promised(MaxDrop(1.0), (WorstView("drop", 0.5),)), point) == [0, 2]
-    assert broken_views(MaxDrop(1.0), point) == []
+def test_lost_views_are_those_far_beyond_the_bound_and_all_other_shares() -> None:
+    point = Measurement(0.9, 40.0, 0.9, usual=1.0, ssim_drop=0.012, losses=(1.69, None, 2.2, 2.4, -0.2))
+    assert lost_views(PROMISED, point) == [3]  # 1.5 times .9 times 1.7 dB
+    assert lost_views(PROMISED, replace(point, ssim_drop=0.03)) == []
+    assert lost_views(Promised(MaxDrop(9.0), (WorstView("drop", 0.5),)), point) == [0, 2, 3]
+    assert lost_views(MaxDrop(1.0), point) == []
+    assert lost_views(Promised(MaxSize(9, "drop"), PROMISED.parts), point) == []
 
 
 @pytest.fixture(scope="module")
@@ -204,22 +115,25 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 WORDS: dict[str, Any] = {"effort": "fast", "holdout": 4, "max_drop": 2.0, "max_worst_drop": 0.3}
 
 
-def test_a_search_begins_anew_with_more_poses(
+def test_a_search_goes_on_with_more_poses(
     project: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     caplog.set_level("INFO", "flexgs_edge")
     result = compress(project, tmp_path / "a.fgs", **WORDS)
     words = [record.getMessage() for record in caplog.records]
-    assert sum("searching again with poses beside them" in word for word in words) in (1, 2)
+    assert sum("poses beside them are scored too" in word for word in words) in (1, 2)
     assert result.promise is not None and result.promise.held and result.search is not None
-    # Candidates of all searches are told.
-    assert len(result.search.steps) == sum(word.startswith("multiplier: ") for word in words) > BROKEN
-    monkeypatch.setattr("flexgs_edge.methods.best.method.SEARCHES", 1)
-    once = compress(project, tmp_path / "b.fgs", **WORDS)
+    assert len(result.search.steps) == sum(word.startswith("multiplier: ") for word in words) > 1
+    monkeypatch.setattr("flexgs_edge.methods.best.rounds.MOST_PARTS", 1)
+    once = compress(project, tmp_path / "b.fgs", **{**WORDS, "best_effort": True})
     assert once.scored is not None and result.scored is not None and once.scored.made < result.scored.made
 
 
-def test_another_search_depends_neither_on_memory_nor_on_a_stop(
+class Stop(Exception):
+    pass
+
+
+def test_more_poses_depend_neither_on_memory_nor_on_a_stop(
     project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = tmp_path / "a.fgs"
@@ -229,12 +143,12 @@ def test_another_search_depends_neither_on_memory_nor_on_a_stop(
     kept = {**WORDS, "resume": True, "scratch": str(tmp_path)}
 
     def stop(*words: Any) -> None:
-        raise KeyboardInterrupt
+        raise Stop
 
     with monkeypatch.context() as patch:
-        # The first search has asked for more poses, and the second one has begun.
-        patch.setattr("flexgs_edge.methods.best.checkpoint.Checkpoint.further", stop)
-        with pytest.raises(KeyboardInterrupt):
+        # A candidate has asked for more poses.
+        patch.setattr("flexgs_edge.methods.best.rounds.PruneRounds.see", stop)
+        with pytest.raises(Stop):
             compress(project, tmp_path / "c.fgs", **kept)
     assert list(tmp_path.glob(".flexgs-resume-*/round-0"))
     compress(project, tmp_path / "c.fgs", **kept)

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from flexgs_edge.methods.best.view_weights import (
-    FEWEST_LOOKS,
-    LOOK_POWER,
     POWER,
     RARE_POWER,
     STEP,
     KnownErrors,
     base_errors,
-    looking_more,
     rareness,
     view_weights,
 )
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.views.original import Original
 from kernel_fixtures import draw, large_budget, open_form
 from synthetic import look_from, make_camera, random_scene
 
@@ -52,26 +46,6 @@ def test_each_pose_has_the_weight_of_the_nearest_view() -> None:
     # The largest weight among the poses is 1, even if the best view has no pose near it.
     assert view_weights(errors.slopes(cameras[:1]), np.ones(1)).tolist() == [1.0]
     assert KnownErrors(known, np.zeros(2), 1.0).slopes(cameras).tolist() == [1.0] * 3
-
-
-def test_descents_look_more_often_where_a_view_broke_its_bound() -> None:
-    known = [make_camera(translation=(place, 0.0, 0.0)) for place in (0.0, 5.0, 9.0, 12.0)]
-    poses = [make_camera(translation=(place, 0.0, 0.1)) for place in (9.1, 5.2, 0.3, 0.2, 12.0)]
-    errors = KnownErrors(known, np.full(4, 1e-3), 1.0)
-    turns = np.array([1.0, 2.0, 3.0, 1.0, 4.0])
-    fields: Any = {"bench": None, "origin": np.zeros(3), "cameras": poses, "references": None}
-    original = Original(**fields, turns=turns, nearest=errors.nearest(poses))
-    found = looking_more(original, [4.0, 1.0, 1.0, None]).turns
-    assert found is not None
-    assert found.tolist() == pytest.approx(
-        [0.5**LOOK_POWER, 2 * 0.5**LOOK_POWER, 3 * 2**LOOK_POWER, 2**LOOK_POWER, 4.0]
-    )
-    limited = looking_more(original, [900.0, -1.0, 0.0, 0.0]).turns
-    assert limited is not None
-    assert limited.tolist() == pytest.approx([FEWEST_LOOKS, 2 * FEWEST_LOOKS, 6.0, 2.0, 4 * FEWEST_LOOKS])
-    assert original.turns is turns
-    alike = Original(**fields)
-    assert looking_more(alike, [1.0]) is alike
 
 
 def test_a_picture_that_few_share_counts_more() -> None:

@@ -1,0 +1,301 @@
+"""Makes the candidates for a `.fgs`: what a multiplier keeps, fine-tuned, on its grid, coded and measured."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from flexgs_edge.goals.promise import excesses
+from flexgs_edge.goals.steps import better
+from flexgs_edge.goals.target import Target
+from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.on_grid import lowered
+from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.grid.to_grid import recolour, to_grid
+from flexgs_edge.grid.values import values_of
+from flexgs_edge.methods.best import descents
+from flexgs_edge.methods.best.allocation import BitModel, choose
+from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
+from flexgs_edge.methods.best.costs import RemovalCosts, cost_bytes, measure_costs
+from flexgs_edge.methods.best.effort import Effort
+from flexgs_edge.methods.best.guess import PRUNED_PART, Guess, Measure
+from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
+from flexgs_edge.methods.best.refit.colour import refit_colours
+from flexgs_edge.methods.best.refit.distil import LAST, Schedule, distil, structure_of
+from flexgs_edge.methods.best.rounds import PruneRounds
+from flexgs_edge.methods.best.search import FAR, Candidate
+from flexgs_edge.methods.best.selection import Kept, Selection
+from flexgs_edge.methods.best.snapshot import Snapshot
+from flexgs_edge.render.fit import sum_bytes
+from flexgs_edge.scene.source import MemorySource, Planes
+
+FINE_COLOUR = 2.0**-8
+"""Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
+PRICED, ABOVE = -0.035, 0.02
+"""Expected log of the size after a descent over that before it, below 0 since bits cost; and how far above a size we aim, since
+results that are too large can be trimmed: docs/results/tuning.md#landing"""
+
+
+class GridMaker:
+    """Makes grids that are coded in container version 2; a `Maker`.
+
+    Parameters
+    ----------
+    rounds : PruneRounds
+        Rounds of pruning; more are done when they are needed.
+    size_of : callable
+        Bytes of a grid's file.
+    measure : callable
+        Quality of planes.
+    effort : Effort
+        How much work to spend.
+    refit : bool
+        Refit the colours of each candidate (default).
+    steps : int
+        Views that the descent to a candidate looks at. 0 (default): colours are refitted instead.
+    see : callable, optional
+        Scores poses beside these of the views that decide, as `Maker.see`.
+
+    Attributes
+    ----------
+    selection : Selection
+        Which Gaussians stay.
+    """
+
+    def __init__(
+        self,
+        rounds: PruneRounds,
+        size_of: Callable[[GridScene], int],
+        measure: Measure,
+        effort: Effort,
+        refit: bool = True,
+        steps: int = 0,
+        see: Callable[[Sequence[int], int], bool] | None = None,
+    ) -> None:
+        self.rounds, self.size_of, self.measure = rounds, size_of, measure
+        self.effort, self.refit, self.steps, self.close = effort, refit, steps, effort.close
+        self.selection = Selection(rounds, effort.keep, self.choose, BitModel())
+        self._see = see
+        self._interleaved = effort.interleaved if steps else 0
+        self._slopes: Slopes | None = None
+        self._guess, self._left = Guess(measure), 0.0
+
+    def choose(self, costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
+        """Rows to keep ([n] bool), and their SH degrees ([n] u8)."""
+        return choose(costs, bits, multiplier)
+
+    def start(self, target: Target) -> float:
+        """Prune and descend in turn, then prune until pruning alone loses its share; returns the multiplier of that cut."""
+        self._interleave(target)
+        self._guess.prune(self.selection, target, descents.PRUNED_DISTILLED if self.steps else PRUNED_PART)
+        multiplier = self.selection.cut()
+        if target.limit_bytes is None:
+            self._guess.learn(values_of(self._before_refit(multiplier), self.rounds.storage), target)
+        return multiplier
+
+    def probe(self, multiplier: float, target: Target) -> float:
+        """See `Maker`: of the grid of a multiplier, without a refit or a descent of its own."""
+        grid = self._before_refit(multiplier)
+        if target.limit_bytes is not None:
+            return target.excess(self.size_of(grid), None) + (PRICED if self.steps else 0.0) - ABOVE
+        return self._after(self._guess(values_of(grid, self.rounds.storage), target))
+
+    def make(self, multiplier: float, target: Target) -> tuple[Candidate, GridScene]:
+        """See `Maker`. Where a descent mends nothing, colours are refitted instead, also those of all further candidates."""
+        started = time.perf_counter()
+        kept, step_sizes = self._choice(multiplier)
+        by_size = target.limit_bytes is not None
+        grid = self._distilled(kept, step_sizes, multiplier) if self.steps else self._finish(kept, step_sizes)
+        candidate, grid = self._measured(grid, multiplier, target, started, kept.left_out)
+        if not (self.steps and self.refit) or by_size or candidate.excess <= FAR:
+            return candidate, grid
+        before = self._guess(values_of(self._before_refit(multiplier), self.rounds.storage), target)
+        if before > candidate.excess:
+            return candidate, grid
+        self.steps, self.selection.begin = 0, 0
+        kept, step_sizes = self._choice(multiplier)
+        return self._measured(self._finish(kept, step_sizes), multiplier, target, started, kept.left_out)
+
+    def trim(
+        self, chosen: Candidate, product: GridScene, target: Target, tell: Callable[[Candidate], None], most: int
+    ) -> tuple[Candidate, GridScene]:
+        """See `Maker`. The constant colours of each are refitted."""
+        self.rounds.let_go()  # this goes back to none of them
+        best = chosen, product
+        found = excesses(target, chosen.size, chosen.measurement)
+        if most < 1 or max(found) >= -NEAR_QUALITY:
+            return best
+
+        def attempt(smaller: GridScene) -> list[float]:
+            nonlocal best
+            started = time.perf_counter()
+            grid = self._with_constants(smaller) if self.refit else smaller
+            step, grid = self._measured(grid, chosen.multiplier, target, started, chosen.left_out)
+            tell(step)
+            if better(step, best[0], target):
+                best = step, grid
+            return excesses(target, step.size, step.measurement)
+
+        removal, descended = self._removal_costs(product), self.steps > 0
+        try:
+            land_on_quality(product, removal, found, attempt, self.rounds.storage, most, descended)
+        except KeyboardInterrupt:
+            if best[0] is chosen:
+                raise
+        return best
+
+    def see(self, views: Sequence[int]) -> bool:
+        """See `Maker`."""
+        if self._see is None or not self._see(views, self.selection.begin):
+            return False
+        self._slopes = None
+        return True
+
+    def discard(self, product: GridScene) -> None:
+        """Grids go by themselves."""
+
+    def _interleave(self, target: Target) -> None:
+        """Prune and descend in turn, until descents mend too little, or as few Gaussians are left as a size asks for."""
+        by_size, after = target.limit_bytes is not None, -math.inf
+        for fit in descents.fits(self._interleaved) if by_size else [1.0] * self._interleaved:
+            self._guess.prune(self.selection, target, self.effort.interleave_at, fit)
+            self.rounds.renew(self._cut_and_descend)
+            before = after
+            if not by_size:
+                planes = self.selection.last.planes
+                self._guess.learn(planes, target)
+                after = self._guess(planes, target)
+                if after >= math.log(descents.MOST_LEFT):
+                    break
+                self._left = after
+            self.selection.begin = len(self.rounds.snapshots) - 1
+            # One alone may leave more by chance.
+            if min(before, after) >= math.log(descents.INTERLEAVE_TO):
+                break
+
+    def _cut_and_descend(self) -> tuple[np.ndarray, Planes]:
+        """Rows and planes after a cut by half a round and a descent off the grid."""
+        kept = self.selection.kept(self.selection.cut())
+        schedule = self._schedule(descents.INTERLEAVED_SHARE, kept.planes, last=descents.INTERLEAVED_LAST)
+        return kept.rows, self._distil(kept, schedule)
+
+    def _after(self, excess: float) -> float:
+        """Expected excess of a candidate after its refit or descent, from that before it."""
+        if self.steps:
+            return self._descents.after(excess, self._left if self.selection.begin else None)
+        return excess + (math.log(self.effort.refitted) if self.refit else 0.0)
+
+    def _before_refit(self, multiplier: float) -> GridScene:
+        kept, step_sizes = self._choice(multiplier)
+        return self._to_grid(kept.planes, kept.degrees, step_sizes)[0]
+
+    def _to_grid(self, planes: Planes, degrees: np.ndarray, step_sizes: StepSizes) -> tuple[GridScene, np.ndarray]:
+        return to_grid(planes, degrees, step_sizes, self.rounds.original.origin, storage=self.rounds.storage)
+
+    def _probe_slopes(self, snapshot: Snapshot) -> Slopes:
+        original, planes = self.rounds.original, snapshot.planes
+        return probe_slopes(original.bench.renderer, planes, original.origin, original.cameras, self.effort.probed)
+
+    def _choice(self, multiplier: float) -> tuple[Kept, StepSizes]:
+        """The rows that a multiplier keeps, and the grid's step sizes."""
+        kept = self.selection.kept(multiplier)
+        snapshot = self.rounds.snapshots[kept.snapshot]
+        if self._slopes is None:
+            # Measured once, near the answer: slopes change little between snapshots, and step sizes must not jump there.
+            self._slopes = self._probe_slopes(snapshot)
+        step_sizes = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
+        count = len(kept.rows)
+        kept = kept.take(reachable(step_sizes, kept.planes, kept.weight2 > 0), self.rounds.storage)
+        kept.left_out = count - len(kept.rows)
+        return kept, holdable(step_sizes, kept.planes)
+
+    def _distilled(self, kept: Kept, step_sizes: StepSizes, multiplier: float) -> GridScene:
+        """Move all values towards the references, put them on the grid, and refit the constant colour.
+
+        As in `_finish`, copies go as soon as they can, those of `kept` as well: a large scene has no room for all of them.
+        """
+        moved = self._distil(kept, self._schedule(1.0, kept.planes, multiplier=multiplier), step_sizes)
+        kept.planes = {}
+        grid, _ = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
+        del moved
+        return self._with_constants(grid) if self.refit else grid
+
+    def _finish(self, kept: Kept, step_sizes: StepSizes) -> GridScene:
+        """Put geometry on its grid, refit all colours, put SH on their grid, refit the constant colour, put it on its grid."""
+        storage, planes = self.rounds.storage, kept.planes
+        fine = replace(step_sizes, dc=step_sizes.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in step_sizes.sh))
+        grid, order = self._to_grid(planes, kept.degrees, holdable(fine, planes))
+        kept.planes = planes = {}
+        degrees = kept.degrees[order]
+        moved = values_of(grid, storage)
+        sh = step_sizes.sh[: grid.sh_degree]
+        if self.refit:
+            if self.effort.refit_rounds:
+                moved = self._refit_colours(moved, degrees, self.effort.refit_rounds)
+            grid = replace(grid, step_sizes=replace(grid.step_sizes, sh=sh))
+            grid = recolour(grid, moved["sh_dc"], moved["sh_rest"], storage)
+            del moved
+            moved = self._refit_colours(values_of(grid, storage), degrees, 1, bands=False)
+            final = replace(grid.step_sizes, dc=step_sizes.dc)
+            return recolour(replace(grid, step_sizes=final), moved["sh_dc"], storage=storage)
+        final = replace(grid.step_sizes, dc=step_sizes.dc, sh=sh)
+        return recolour(replace(grid, step_sizes=final), moved["sh_dc"], moved["sh_rest"], storage)
+
+    def _with_constants(self, grid: GridScene) -> GridScene:
+        """The grid with its constant colours refitted once."""
+        storage = self.rounds.storage
+        moved = self._refit_colours(values_of(grid, storage), grid.sh_degrees, 1, bands=False)
+        return recolour(grid, moved["sh_dc"], storage=storage)
+
+    def _measured(
+        self, grid: GridScene, multiplier: float, target: Target, started: float, left_out: int
+    ) -> tuple[Candidate, GridScene]:
+        """Code and measure a grid. One that is a little larger than a size target loses Gaussians first."""
+        grid = lowered(grid, self.rounds.storage)
+        size, limit = self.size_of(grid), target.limit_bytes
+        if limit is not None and 0.0 < math.log(size / limit) <= REACH:
+            grid, size = self._landed(grid, size, limit)
+        measurement = self.measure(values_of(grid, self.rounds.storage))
+        excess, seconds = target.excess(size, measurement), time.perf_counter() - started
+        return Candidate(multiplier, grid.count, grid.sh_count, size, measurement, excess, seconds, left_out), grid
+
+    def _landed(self, grid: GridScene, size: int, limit: int) -> tuple[GridScene, int]:
+        """`land`, and then the constant colours, which had been fitted to what is gone, once more."""
+        landed, less = land(grid, self._removal_costs(grid), size, limit, self.size_of, self.rounds.storage)
+        if landed is grid or not self.refit:
+            return landed, less
+        mended = self._with_constants(landed)
+        final = self.size_of(mended)
+        return (mended, final) if final <= limit else (landed, less)
+
+    def _removal_costs(self, grid: GridScene) -> np.ndarray:
+        """[n] f64, what the removal of each row of a result costs. Behind a descent, those from before it say little.
+
+        Infinite for rows that no scored pose sees: whether they stay is not for a landing to say.
+        """
+        original = self.rounds.original
+        source = MemorySource(values_of(grid, self.rounds.storage), origin=original.origin)
+        with original.bench.renderer.load(source, sum_bytes(2) + cost_bytes(0), view_sums=2) as scene:
+            costs = measure_costs(original.bench, scene, original.cameras, sh_costs=False)
+        return np.where(costs.weight2 > 0, costs.removal, np.inf)
+
+    def _schedule(self, share: float, planes: Planes, last: float = LAST, multiplier: float = 0.0) -> Schedule:
+        """A descent from these planes with `share` of a candidate's steps."""
+        fidelity = self.measure(planes, estimate=True).figure("fidelity")
+        return self._descents.schedule(share, fidelity, last, multiplier)
+
+    @property
+    def _descents(self) -> descents.Descents:
+        return descents.Descents(self.steps, len(self.rounds.original.cameras), self._guess.lead)
+
+    def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
+        weight = structure_of(self._guess.lead)
+        return distil(kept.planes, kept.degrees, self.rounds.original, schedule, step_sizes, structure=weight)
+
+    def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
+        subsets = self.effort.subsets_of(len(self.rounds.original.cameras))
+        return refit_colours(planes, degrees, self.rounds.original, rounds=times, bands=bands, subsets=subsets)

@@ -1,0 +1,253 @@
+"""The search of every maker of files: a few finished candidates, until the largest share of a bound is hardly below 1.
+
+The multiplier is the Lagrange multiplier (lambda) of the rate: the squared error that one bit is worth. It decides which
+Gaussians stay, with which SH degree, and how fine the grid is. With it the log of the share rises and the size falls, up to
+noise. So candidates are placed by secant steps inside of a bracket: the largest multiplier that holds, and the least one beyond
+it that misses. The best candidate then loses Gaussians until it hardly holds.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+from flexgs_edge.errors import TargetError
+from flexgs_edge.goals.line import NEAREST, next_point, weighed
+from flexgs_edge.goals.promise import lost_views
+from flexgs_edge.goals.steps import better, obstacle
+from flexgs_edge.goals.target import Measurement, Target
+
+LOG = logging.getLogger("flexgs_edge")
+
+Product = TypeVar("Product")
+"""Type of the product of a candidate: a grid, or a finished file."""
+
+MOST, MOST_TRIED = 4, 6
+"""Most candidates, and most of them with those that lost Gaussians; while none holds, the second is the limit of both."""
+PROBES = 4
+"""Most probes before the first candidate."""
+AIM, FARTHER = -0.01, 0.05
+"""Log of the share that we aim at, and how much farther below 1 for each candidate in a row that missed."""
+SLOPE, SIZE_SLOPE = 0.7, -0.45
+"""Slopes of the logs of the share and of the size over that of the multiplier, before two points are measured:
+docs/results/tuning.md#slope"""
+LARGEST_STRIDE = 1.2
+"""Largest change of the log of the multiplier beyond what is measured."""
+CLOSE_SIZE = 0.003
+"""A candidate that is smaller than asked by no more than this ends a search for a size."""
+FLAT, FAR = 0.1, 0.1
+"""Where the log of the share falls at less than the first, over that of the multiplier, and exceeds the second, a smaller
+multiplier helps no more."""
+LEAST_CHANGE = 1e-3
+"""Multipliers whose logs differ by less are the same."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A finished result: coded and measured.
+
+    Parameters
+    ----------
+    multiplier : float
+        Squared error that a bit is worth.
+    count, sh_count : int
+        Gaussians kept, and those with SH.
+    size : int
+        Bytes of the file.
+    measurement : Measurement
+        Quality of the result.
+    excess : float
+        Log of the largest share: the target holds at zero or less.
+    seconds : float
+        Time that making and measuring took.
+    left_out : int
+        Gaussians that no scored pose sees and that were left out because the grid would be coarser with them.
+    """
+
+    multiplier: float
+    count: int
+    sh_count: int
+    size: int
+    measurement: Measurement
+    excess: float
+    seconds: float
+    left_out: int = 0
+
+    @property
+    def holds(self) -> bool:
+        """Whether this candidate meets the target."""
+        return self.excess <= 0.0
+
+
+class Maker(Protocol[Product]):
+    """Makes the candidates of a search."""
+
+    close: float
+    """How far below 1 the log of the largest share ends the search."""
+
+    def start(self, target: Target) -> float:
+        """Prune, and return a multiplier to begin with."""
+
+    def probe(self, multiplier: float, target: Target) -> float | None:
+        """Expected excess of the candidate of a multiplier, in less time than it takes; `None` if that is not known."""
+
+    def make(self, multiplier: float, target: Target) -> tuple[Candidate, Product]:
+        """The candidate of a multiplier, finished and measured."""
+
+    def trim(
+        self, chosen: Candidate, product: Product, target: Target, tell: Callable[[Candidate], None], most: int
+    ) -> tuple[Candidate, Product]:
+        """The best of a candidate that holds and of at most `most` that are made of it by the loss of Gaussians."""
+
+    def see(self, views: Sequence[int]) -> bool:
+        """Score poses beside these of the views that decide, too, from now on; False if that is not possible."""
+
+    def discard(self, product: Product) -> None:
+        """Free a product that is not the best any more."""
+
+
+@dataclass(frozen=True)
+class RateResult(Generic[Product]):
+    """The answer of a search.
+
+    Parameters
+    ----------
+    product : Product
+        A grid, or a finished file.
+    chosen : Candidate
+        The best candidate, which `product` belongs to.
+    reached : bool
+        Whether it meets the target.
+    steps : tuple of Candidate
+        All candidates in the order of the search.
+    """
+
+    product: Product
+    chosen: Candidate
+    reached: bool
+    steps: tuple[Candidate, ...]
+
+
+def search(
+    maker: Maker[Product],
+    target: Target,
+    most: int = MOST,
+    best_effort: bool = False,
+    on_step: Callable[[Candidate], None] | None = None,
+) -> RateResult[Product]:
+    """Search for the best candidate. An interrupted search answers with the best one so far.
+
+    Parameters
+    ----------
+    maker : Maker
+        Makes the candidates.
+    target : Target
+        What must hold.
+    most : int
+        Most candidates, if one of them holds.
+    best_effort : bool
+        Answer with the closest candidate if none holds.
+    on_step : callable, optional
+        Called with each candidate.
+
+    Raises
+    ------
+    TargetError
+        When no candidate holds and `best_effort` is not set; it names the closest one.
+    """
+    steps: tuple[Candidate, ...] = ()
+    best: tuple[Candidate, Product] | None = None
+    by_size = target.limit_bytes is not None
+
+    def tell(step: Candidate) -> None:
+        nonlocal steps
+        steps = (*steps, step)
+        if on_step:
+            on_step(step)
+
+    place: float | None = _aimed(maker, math.log(maker.start(target)), target)
+    try:
+        while place is not None:
+            step, product = maker.make(math.exp(place), target)
+            tell(step)
+            if best is None or better(step, best[0], target):
+                dropped, best = best, (step, product)
+                if dropped is not None:
+                    maker.discard(dropped[1])
+            else:
+                maker.discard(product)
+            close = best[0].holds and best[0].excess > -(CLOSE_SIZE if by_size else maker.close)
+            if close or len(steps) >= (most if best[0].holds else MOST_TRIED):
+                break
+            lost = [] if best[0].holds else lost_views(target, step.measurement)
+            seen = bool(lost) and maker.see(lost)
+            # The same multiplier has other costs now, so that nothing but a miss of it is known.
+            place = place if seen else next_place(steps, target)
+        if best is not None and best[0].holds and not by_size:
+            best = maker.trim(*best, target, tell, MOST_TRIED - len(steps))
+    except KeyboardInterrupt:
+        if best is None:
+            raise
+        LOG.warning("interrupted: the best result so far is taken")
+    assert best is not None
+    chosen, product = best
+    if not chosen.holds and not best_effort:
+        last = ", with one Gaussian left" if by_size and chosen.count == 1 else ""
+        raise TargetError(
+            f"{target.describe()} is out of reach; the closest point has {target.report(chosen.size, chosen.measurement)}"
+            f"{last} (--best-effort writes it){obstacle(target, chosen)}"
+        )
+    return RateResult(product, chosen, chosen.holds, steps)
+
+
+def _aimed(maker: Maker[Product], place: float, target: Target) -> float:
+    """Log of the multiplier whose candidate we expect just below the target, found by probes."""
+    seen: list[tuple[float, float]] = []
+    slope = SLOPE if target.limit_bytes is None else SIZE_SLOPE
+    for _ in range(PROBES):
+        excess = maker.probe(math.exp(place), target)
+        if excess is None or abs(excess - AIM) < -AIM:
+            break
+        seen.append((place, excess))
+        place = next_point(seen, slope, LARGEST_STRIDE)
+    return place
+
+
+def next_place(steps: Sequence[Candidate], target: Target) -> float | None:
+    """Log of the multiplier of the next candidate; `None` if another one would not be better.
+
+    Parameters
+    ----------
+    steps : sequence of Candidate
+        All so far, at least one.
+    target : Target
+        What must hold.
+    """
+    by_size = target.limit_bytes is not None
+    slope = SIZE_SLOPE if by_size else SLOPE
+    misses = next((count for count, step in enumerate(reversed(steps)) if step.holds), len(steps))
+    points = [(math.log(step.multiplier), step.excess) for step in steps]
+    if misses > 1 and not by_size:
+        (before, worse), (place, excess) = points[-2:]
+        if place < before and excess > FAR and worse - excess < FLAT * (before - place):
+            return None
+    place = next_point(weighed([(at, excess + FARTHER * misses) for at, excess in points]), slope, LARGEST_STRIDE)
+    low, high = _bracket(points, slope)
+    place = min(max(place, low), high)
+    return place if place > math.log(1e-30) and all(abs(place - at) > LEAST_CHANGE for at, _ in points) else None
+
+
+def _bracket(points: Sequence[tuple[float, float]], slope: float) -> tuple[float, float]:
+    """Places between which the answer lies, a little inside of both ends; infinite where none is known.
+
+    One end is the farthest candidate that holds, the other the nearest miss beyond it.
+    """
+    sign = math.copysign(1.0, slope)
+    low = max((sign * at for at, excess in points if excess <= 0.0), default=-math.inf)
+    high = min((sign * at for at, excess in points if excess > 0.0 and sign * at > low), default=math.inf)
+    away = NEAREST * (high - low) if math.isfinite(high - low) else 0.0
+    ends = sign * (low + away), sign * (high - away)
+    return min(ends), max(ends)

@@ -1,0 +1,131 @@
+"""Which Gaussians a multiplier keeps: chosen from the last round of pruning that it cuts by at most a round."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexgs_edge.constants import SH_C0
+from flexgs_edge.memory.storage import IN_MEMORY, Storage
+from flexgs_edge.methods.best.allocation import BitModel, drop_bands, keep_most, keep_one
+from flexgs_edge.methods.best.costs import RemovalCosts
+from flexgs_edge.methods.best.rounds import PruneRounds
+from flexgs_edge.methods.best.snapshot import Snapshot
+
+MOST_ROUNDS = 24
+"""Most rounds of pruning."""
+FEW = 16
+"""Of fewer Gaussians none goes in a round."""
+ALL_LEFT = 0.97
+"""A multiplier that keeps this share of what a descent has left asks for more: it chooses from what there was before."""
+
+
+@dataclass
+class Kept:
+    """The Gaussians that a multiplier keeps.
+
+    Attributes
+    ----------
+    snapshot : int
+        Number of the snapshot that they were chosen from.
+    rows : np.ndarray
+        [n] i64, places in the rows of `PruneRounds`, ascending.
+    planes : dict
+        Stored planes of these rows ([width, n] f32 by field), with SH dropped.
+    degrees : np.ndarray
+        [n] u8, SH degrees.
+    weight2 : np.ndarray
+        [n] f64, sums of squared weights.
+    left_out : int
+        How many rows were left out because the grid would be coarser with them (`reachable`).
+    """
+
+    snapshot: int
+    rows: np.ndarray
+    planes: dict[str, np.ndarray]
+    degrees: np.ndarray
+    weight2: np.ndarray
+    left_out: int = 0
+
+    def take(self, keep: np.ndarray, storage: Storage = IN_MEMORY) -> Kept:
+        """The rows for which `keep` ([n] bool) is True."""
+        if keep.all():
+            return self
+        rows = np.flatnonzero(keep)
+        planes = {name: storage.take(values, rows) for name, values in self.planes.items()}
+        some, weight2 = storage.take(self.rows, rows), storage.take(self.weight2, rows)
+        return Kept(self.snapshot, some, planes, self.degrees[rows], weight2)
+
+
+@dataclass
+class Selection:
+    """Chooses from rounds of pruning.
+
+    Parameters
+    ----------
+    rounds : PruneRounds
+        More rounds are done when they are needed.
+    keep : float
+        Share that stays in a round.
+    choose : callable
+        Rows to keep ([n] bool) and their SH degrees ([n] u8), from costs, bits and a multiplier.
+    bits : BitModel
+        Bits of a Gaussian by SH degree.
+    most : int, optional
+        Most Gaussians (`--max-gaussians`).
+    begin : int
+        Snapshots before this one do not count: a descent has changed all costs since.
+    """
+
+    rounds: PruneRounds
+    keep: float
+    choose: Callable[[RemovalCosts, BitModel, float], tuple[np.ndarray, np.ndarray]]
+    bits: BitModel
+    most: int | None = None
+    begin: int = 0
+
+    @property
+    def last(self) -> Snapshot:
+        """What the last round has left."""
+        return self.rounds.snapshots[-1]
+
+    def prune(self, enough: Callable[[Snapshot], bool]) -> None:
+        """Do rounds until the last snapshot is enough."""
+        for _ in range(MOST_ROUNDS):
+            if enough(self.last) or self.last.count < FEW:
+                break
+            self.rounds.descend(self.keep)
+
+    def cut(self) -> float:
+        """The multiplier that would cut the last snapshot by half a round more."""
+        costs = self.last.costs.removal[self.last.costs.weight2 > 0]
+        if not len(costs):
+            return 1.0
+        return max(float(np.quantile(costs, (1 - self.keep) / 2)) / self.bits.base, 1e-30)
+
+    def kept(self, multiplier: float) -> Kept:
+        """The rows that a multiplier keeps."""
+        index, keep, degrees = self._chosen(multiplier)
+        if index == self.begin > 0 and keep.mean() >= ALL_LEFT:
+            self.begin = 0
+            index, keep, degrees = self._chosen(multiplier)
+        snapshot = self.rounds.snapshots[index]
+        rows, storage = np.flatnonzero(keep), self.rounds.storage
+        planes = drop_bands(snapshot.planes, rows, degrees[rows], snapshot.costs.sh_mean, SH_C0, storage)
+        weight2 = storage.take(snapshot.costs.weight2, rows)
+        return Kept(index, storage.take(snapshot.rows, rows), planes, degrees[rows], weight2)
+
+    def _chosen(self, multiplier: float) -> tuple[int, np.ndarray, np.ndarray]:
+        for index in range(self.begin, self.begin + MOST_ROUNDS + 1):
+            if index == len(self.rounds.snapshots):
+                self.rounds.descend(self.keep)
+            snapshot = self.rounds.snapshots[index]
+            keep, degrees = self.choose(snapshot.costs, self.bits, multiplier)
+            keep_one(keep, snapshot.costs)
+            if self.most is not None:
+                keep_most(keep, snapshot.costs, self.most)
+            if keep.mean() >= self.keep or snapshot.count < FEW:
+                break
+        return index, keep, degrees
