@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from flexgs_edge.goals.choice import Choice
@@ -117,6 +117,11 @@ class _Search:
         self._confirmed: dict[Choice, Step] = {}
         self._sizes: dict[Choice, int] = {}
         self._off = 0.0
+        self._has_sh = self.size(Choice(0, 0)) != self.size(Choice(0, 1000))
+
+    def distinct(self, choices: Iterable[Choice]) -> list[Choice]:
+        """The choices without those that are others by name only: a scene without SH has no SH rates."""
+        return list(dict.fromkeys(choice if self._has_sh else Choice(choice.prune, 0) for choice in choices))
 
     def size(self, choice: Choice) -> int:
         if choice not in self._sizes:
@@ -192,12 +197,13 @@ def _confirmed(search: _Search, chosen: Step) -> Step:
 
 
 def _candidates(search: _Search) -> list[Choice]:
-    return search.by_size([Choice(100 * p, 100 * s) for p, s in CANDIDATES])
+    return search.by_size(search.distinct(Choice(100 * p, 100 * s) for p, s in CANDIDATES))
 
 
 def _search_quality(search: _Search, refine_steps: int) -> Step:
     candidates = _candidates(search)
-    at = candidates.index(Choice(100 * START[0], 100 * START[1]))
+    (start,) = search.distinct([Choice(100 * START[0], 100 * START[1])])
+    at = candidates.index(start)
     best = search.estimate(candidates[at], "list")
     if best.holds:
         for choice in candidates[at + 1 :]:
@@ -211,7 +217,7 @@ def _search_quality(search: _Search, refine_steps: int) -> Step:
             if best.holds:
                 break
     gentlest = best.choice == candidates[0]
-    box = _box(best.choice, to_zero=gentlest)
+    box = search.distinct(_box(best.choice, to_zero=gentlest))
     if not best.holds:
         # The whole list fails: only the gentlest point can still hold, and it is the closest if it does not.
         best = search.estimate(Choice(0, 0), "refine")
@@ -251,7 +257,7 @@ def _search_size(search: _Search, limit: int, refine_steps: int) -> Step:
     candidates = _candidates(search)
     fitting = [choice for choice in candidates if search.size(choice) <= limit]
     answer = fitting[0] if fitting else candidates[-1]
-    box = _box(answer, to_zero=answer == candidates[0])
+    box = search.distinct(_box(answer, to_zero=answer == candidates[0]))
     edge = _edge(search, [choice for choice in box if search.size(choice) <= limit])
     if fitting:
         search.estimate(answer, "list")

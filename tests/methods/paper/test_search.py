@@ -320,3 +320,14 @@ def test_the_model_finds_the_plane_through_its_points() -> None:
     # Quality that rises with compression is noise: slopes stay at zero.
     odd = LossModel.fit([(Choice(100, 100), 0.2), (Choice(300, 300), -0.2), (Choice(100, 300), 0.1)])
     assert odd.prune >= 0.0 and odd.sh >= 0.0
+
+
+@pytest.mark.parametrize("target", [MaxDrop(1.0), MaxSize(400_000, "drop")])
+def test_a_scene_without_sh_has_no_sh_rates(target: MaxDrop | MaxSize) -> None:
+    class Plain(Fake):
+        def size(self, choice: Choice) -> int:
+            return 1_000_000 - 900 * choice.prune
+
+    steps = adapt(Plain(lambda choice: 0.2 * math.exp(3 * choice.prune / 1000)), target).steps
+    measured = [(step.choice, step.estimated) for step in steps]
+    assert all(choice.sh == 0 for choice, _ in measured) and len(set(measured)) == len(measured) > 2
