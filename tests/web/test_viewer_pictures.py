@@ -21,8 +21,12 @@ from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.render import render_views
 from flexgs_edge.commands.trim import trim
 from flexgs_edge.commands.view import view
+from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.io.ply import write_ply
+from flexgs_edge.run.live import fine_steps
+from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.growth import GrownSource
+from flexgs_edge.scene.source import MemorySource
 from viewer_tab import LOOK, POSES, Drawn, decibels, drag, faults, picture, requests, served, until
 from web_vectors import FOLDER
 
@@ -36,6 +40,38 @@ def go(tab: Browser, address: str, width: int = 480, height: int = 360, dark: bo
     tab.send("Page.navigate", url=address)
     tab.wait("Page.loadEventFired")
     until(tab, "globalThis.viewer && viewer.stats.wholeMs > 0 && viewer.stats.firstMs > 0")
+
+
+@pytest.mark.parametrize("distance", [3e4, 2e7])
+@pytest.mark.parametrize("coded", [False, True], ids=["ply", "grid"])
+def test_far_gaussians_leave_near_ones_their_places(
+    tab: Browser, scene: Path, sample_dir: Path, tmp_path: Path, distance: float, coded: bool
+) -> None:
+    """Opaque Gaussians in sight, far behind an object: a scene that `view` codes on the fly, and one on a grid."""
+    source, cameras = open_fgs(scene), str(sample_dir / "cameras.json")
+    planes = source.read(slice(0, source.count), list(FIELD))
+    rows = np.flatnonzero(np.abs(planes["means"]).max(axis=0) < 2.2)
+    planes = {name: values[:, rows] for name, values in planes.items()}
+    rng = np.random.default_rng(5)
+    ways = [read_cameras(cameras)[pose].rotation.T @ [*rng.uniform(-0.4, 0.4, 2), 1] for pose in POSES * 13]
+    rows = rng.permutation(len(rows))[: len(ways)]
+    away = distance * np.geomspace(0.5, 1, len(ways))  # at equal depths, any rounding would change who covers whom
+    planes["means"][:, rows] = away * np.array(ways).T
+    planes["log_scales"][:, rows] = np.log(0.02 * away)
+    planes["opacity_logits"][:, rows] = 5
+    path = tmp_path / ("far.fgs" if coded else "far.ply")
+    if coded:
+        steps = fine_steps(planes["means"], planes["log_scales"], 3)
+        assert steps.contraction is not None
+        write_grid(path, to_grid(planes, np.full(planes["means"].shape[1], 3), steps, np.zeros(3))[0], {})
+    else:
+        write_ply(path, MemorySource(planes))
+    files = render_views(path, tmp_path / "drawn", views=POSES, cameras=cameras, **LOOK).files
+    with served(path, cameras, **LOOK) as address:
+        go(tab, address)
+        for pose, file in zip(POSES, files, strict=True):
+            wanted = np.asarray(Image.open(file), np.float64)
+            assert decibels(picture(tab, pose, wanted.shape[1], wanted.shape[0]), wanted) >= 45, pose
 
 
 @pytest.mark.parametrize(

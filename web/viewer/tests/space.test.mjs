@@ -116,3 +116,17 @@ test('without boxes that can be used, chunks come as they are', () => {
   assert.equal(Space.tells(header({ layers: [0], count: 0 })), false);
   assert.equal(Space.tells(header({ chunkRows: undefined, steps: undefined })), false, 'version 1');
 });
+
+test('boxes of contracted positions lie around what is in them', () => {
+  const steps = { position: 0.1, contraction: { centre: [1, 0, 0], radius: 2 } };
+  const contracted = new Space(header({ steps }), 1e9);
+  const plain = new Space(header(), 1e9);
+  contracted.parts.forEach((part, i) => {
+    const { low, high } = plain.parts[i];
+    // At 7.5 radii and more, the farthest places are more than 2^6 radii away.
+    const far = Math.max(Math.abs(low[0] - 1), Math.abs(high[0] - 1)) / 2;
+    assert.ok(low.every((value, axis) => part.low[axis] <= value) && high.every((value, axis) => part.high[axis] >= value));
+    if (far <= 1) assert.deepEqual([part.low, part.high], [low, high]);
+    if (far >= 7) assert.ok(Math.max(Math.abs(part.low[0] - 1), Math.abs(part.high[0] - 1)) >= 2 * 2 ** 6);
+  });
+});
