@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from flexgs_edge.cameras.lens import Lens, fitting_zoom
 from flexgs_edge.constants import DEFAULT_HOLDOUT, DILATION
 from flexgs_edge.errors import InputError
 from flexgs_edge.small_matrices import inverse, product
@@ -38,6 +39,8 @@ class Camera:
     distortion : str, optional
         Why photos of this camera do not match its renders: a lens distortion that was ignored, or an assumed field of
         view. The pose serves for scores.
+    lens : Lens, optional
+        The lens of its photos, which are freed of it when they are loaded.
     dilation : float
         Added to both diagonal terms of the 2D covariance, px^2.
     """
@@ -52,6 +55,7 @@ class Camera:
     cx: float
     cy: float
     distortion: str | None = None
+    lens: Lens | None = None
     dilation: float = DILATION
 
     def __post_init__(self) -> None:
@@ -86,6 +90,13 @@ class Camera:
             cx=(self.cx + 0.5) * across - 0.5,
             cy=(self.cy + 0.5) * down - 0.5,
         )
+
+    def behind(self, lens: Lens) -> Camera | None:
+        """The pinhole that takes the place of `lens` with these intrinsics; None if photos cannot be freed of it."""
+        zoom = fitting_zoom(lens, self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+        if zoom is None:
+            return None
+        return replace(self, fx=self.fx * zoom, fy=self.fy * zoom, lens=replace(lens, zoom=zoom), distortion=None)
 
     def every(self, step: float, column: float = 0, row: float = 0) -> Camera:
         """The view at points `step` pixels apart in both directions, from the place (`column`, `row`) on.

@@ -14,6 +14,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera, distinct_names
 from flexgs_edge.cameras.json_values import MAX_SIDE
+from flexgs_edge.cameras.lens import Lens
 from flexgs_edge.errors import FormatError, InputError
 
 
@@ -58,10 +59,13 @@ MODELS: dict[int, Model] = dict(
 )
 """Camera models by COLMAP's model id."""
 
-UNDISTORT = (
-    "colmap image_undistorter --image_path IMAGES --input_path {model} --output_path OUTPUT --output_type COLMAP"
-)
-"""Command that makes a pinhole model and matching photos from a distorted one; `{model}` is the folder."""
+LENSES: dict[str, Callable[[tuple[float, ...]], Lens]] = {
+    **dict.fromkeys(("SIMPLE_RADIAL", "RADIAL"), Lens),
+    "OPENCV": lambda p: Lens(p[:2], (p[2], p[3])),
+    "FULL_OPENCV": lambda p: Lens((*p[:2], *p[4:]), (p[2], p[3])),
+    **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), lambda p: Lens(p, fisheye=True)),
+}
+"""The lens that the parameters after the principal point describe, by the names of models whose photos can be freed of it."""
 QUATERNION_TOLERANCE = 1e-2
 """Largest |norm - 1| of a quaternion. COLMAP normalises what it reads; other writers keep 4 digits or more."""
 MODEL_FOLDERS = ("0", "sparse/0", "sparse", "colmap/sparse/0")
@@ -122,7 +126,7 @@ def read_colmap(path: str | os.PathLike[str], ignore_distortion: bool = False) -
     Raises
     ------
     InputError
-        If a file is missing or cannot be read, or a lens is distorted; the message names the command that undistorts.
+        If a file is missing or cannot be read, or photos cannot be freed of a lens.
     FormatError
         If a file breaks the format; the message names file and camera, image, line or byte.
     """
@@ -164,19 +168,23 @@ def _camera(path: Path, lens_file: Path, image: _Image, lenses: dict[int, _Lens]
     if image.lens not in lenses:
         raise FormatError(f"{place}: camera {image.lens} is not in {lens_file.name} (which has {len(lenses)})")
     lens = lenses[image.lens]
-    if lens.distorted and not ignore_distortion:
-        raise InputError(
-            f"{lens_file}: camera {image.lens} has lens distortion (model {lens.model.name}), renders have none; "
-            f"undistort photos and model with `{UNDISTORT.format(model=path.parent)}` and use OUTPUT/sparse and OUTPUT/images, "
-            "or use --ignore-distortion to take the poses alone, without photos"
-        )
     rotation = _rotation(place, image.quaternion)
     fx, fy = lens.parameters[0], lens.parameters[lens.model.focals - 1]
     cx, cy = (value - 0.5 for value in lens.parameters[lens.model.focals : lens.model.focals + 2])
     distortion = f"lens distortion (COLMAP model {lens.model.name})" if lens.distorted else None
-    return Camera(
+    camera = Camera(
         image.name, lens.width, lens.height, rotation, np.array(image.translation), fx, fy, cx, cy, distortion
     )
+    if distortion is None or ignore_distortion:
+        return camera
+    make = LENSES.get(lens.model.name)
+    straight = None if make is None else camera.behind(make(lens.parameters[lens.model.focals + 2 :]))
+    if straight is None:
+        raise InputError(
+            f"{lens_file}: camera {image.lens} has {distortion}, and photos cannot be freed of it; use --ignore-distortion "
+            "to take the poses alone, without photos"
+        )
+    return straight
 
 
 def _rotation(place: str, quaternion: Sequence[float]) -> np.ndarray:
@@ -271,7 +279,7 @@ def _binary_lenses(path: Path, file: BinaryIO, size: int) -> dict[int, _Lens]:
         place = f"{path}: camera {key}"
         model = MODELS.get(model_id)
         if model is None:
-            raise FormatError(_unknown(place, str(model_id), path))
+            raise FormatError(_unknown(place, str(model_id)))
         layout = struct.Struct(f"<{model.count}d")
         _add(place, lenses, key, _lens(place, model, width, height, data.numbers(layout, f"camera {index}")))
     data.end("camera")
@@ -301,7 +309,7 @@ def _text_lenses(path: Path, file: BinaryIO, size: int) -> dict[int, _Lens]:
             )
         model = next((model for model in MODELS.values() if model.name == words[1]), None)
         if model is None:
-            raise FormatError(_unknown(place, words[1][:40], path))
+            raise FormatError(_unknown(place, words[1][:40]))
         key, width, height = (_whole(place, word) for word in (words[0], *words[2:4]))
         if len(words) != 4 + model.count:
             raise FormatError(f"{place}: model {model.name} has {model.count} parameters, found {len(words) - 4}")
@@ -336,10 +344,9 @@ def _lines(path: Path, file: BinaryIO) -> Iterator[tuple[str, bytes]]:
             yield f"{path}: the line at byte {file.tell() - len(line)}", line
 
 
-def _unknown(place: str, model: str, path: Path) -> str:
+def _unknown(place: str, model: str) -> str:
     return (
-        f"{place}: unknown camera model {model}; expected SIMPLE_PINHOLE or PINHOLE: "
-        f"`{UNDISTORT.format(model=path.parent)}` makes such a model of any other"
+        f"{place}: unknown camera model {model}; expected one of {', '.join(known.name for known in MODELS.values())}"
     )
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera, limit_width
+from flexgs_edge.cameras.lens import straightened
 from flexgs_edge.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class Photos:
     paths : list of Path
         The photo of each camera (for messages, where they are arrays).
     notes : tuple of str
-        Notes on photos that were scaled or are missing, for the summary.
+        Notes on photos that were scaled or undistorted, or are missing, for the summary.
     """
 
     def __init__(
@@ -127,6 +128,8 @@ class Photos:
     ) -> Photos:
         scaled, note = _scale_to(sizes, paths, cameras)
         notes: tuple[str, ...] = () if note is None else (note,)
+        bent = sum(camera.lens is not None for camera in cameras)
+        notes += (f"lens distortion removed from {bent} photos",) if bent else ()
         if max_width is not None:
             scaled, note = limit_width(scaled, max_width)
             notes += () if note is None else (note,)
@@ -147,6 +150,9 @@ class Photos:
 
         camera = self.cameras[index]
         pixels = self._decoded(index)
+        if camera.lens is not None:
+            own = camera.scaled(pixels.shape[1], pixels.shape[0])
+            pixels = straightened(pixels, camera.lens, own.fx, own.fy, own.cx, own.cy)
         if pixels.shape[:2] == (camera.height, camera.width):
             return pixels
         # Area average in floats, so that colours are not rounded to 8 bits a second time.

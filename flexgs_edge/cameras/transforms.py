@@ -19,6 +19,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera, distinct_names
 from flexgs_edge.cameras.json_values import Entry, kind, load_json
+from flexgs_edge.cameras.lens import Lens
 from flexgs_edge.cameras.nerfstudio import FLIP, find_dataparser, rigid
 from flexgs_edge.cameras.photos import SUFFIXES, photo_size
 from flexgs_edge.errors import FormatError, InputError
@@ -30,11 +31,6 @@ PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 """Values of `camera_model` without a lens."""
 BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Values of `camera_model` that are pinholes if their parameters are zero."""
-UNDISTORT = (
-    "make a pinhole model of the photos with `ns-process-data images --data PHOTOS --output-dir MODEL` and "
-    "`colmap image_undistorter --image_path PHOTOS --input_path MODEL/colmap/sparse/0 --output_path OUTPUT --output_type COLMAP` "
-    "and use OUTPUT/sparse and OUTPUT/images"
-)
 
 
 def read_transforms(
@@ -58,8 +54,7 @@ def read_transforms(
     Raises
     ------
     InputError
-        If the file cannot be read, a size is not found, or a lens is distorted; the message names commands that
-        undistort.
+        If the file cannot be read, a size is not found, or photos cannot be freed of a lens.
     FormatError
         If the file breaks its format; the message names file, frame and key.
     """
@@ -139,11 +134,6 @@ def _camera(
     path: Path, top: Entry, frame: Entry, file_path: str, name: str, frame_change: _Similarity, ignore_distortion: bool
 ) -> Camera:
     distortion = _distortion(top, frame)
-    if distortion is not None and not ignore_distortion:
-        raise InputError(
-            f"{frame.place} ({name}): {distortion}, renders have none; {UNDISTORT}; "
-            "or use --ignore-distortion to take the poses alone, without photos"
-        )
     turn, position = frame_change.moved(*rigid(frame, "transform_matrix"))
     rotation = product(FLIP, turn.T)
     width, height = _size(path, top, frame, file_path)
@@ -154,7 +144,23 @@ def _camera(
         else (side - 1) / 2
         for key, side in (("cx", width), ("cy", height))
     )
-    return Camera(name, width, height, rotation, product(-rotation, position), fx, fy, cx, cy, distortion)
+    camera = Camera(name, width, height, rotation, product(-rotation, position), fx, fy, cx, cy, distortion)
+    if distortion is None or ignore_distortion:
+        return camera
+    straight = camera.behind(_lens(top, frame))
+    if straight is None:
+        raise InputError(
+            f"{frame.place} ({name}): {distortion}: no pinhole sees as far as this lens; use --ignore-distortion to take the "
+            "poses alone, without photos"
+        )
+    return straight
+
+
+def _lens(top: Entry, frame: Entry) -> Lens:
+    found = {k: _holder(top, frame, k).finite(k, "a finite number") if _has(top, frame, k) else 0.0 for k in DISTORTION}
+    if "FISHEYE" in _model(top, frame):
+        return Lens(tuple(found[f"k{i}"] for i in range(1, 5)), fisheye=True)
+    return Lens(tuple(found[f"k{i}"] for i in range(1, 7)), (found["p1"], found["p2"]))
 
 
 def _has(top: Entry, frame: Entry, key: str) -> bool:
@@ -166,13 +172,19 @@ def _holder(top: Entry, frame: Entry, key: str) -> Entry:
     return frame if frame.has(key) else top
 
 
-def _distortion(top: Entry, frame: Entry) -> str | None:
-    """The distortion of the lens, for messages; None for a pinhole. Raises for models that no pinhole resembles."""
+def _model(top: Entry, frame: Entry) -> str:
+    """The `camera_model`, by default OPENCV."""
     model = "OPENCV"
     if _has(top, frame, "camera_model"):
         model = _holder(top, frame, "camera_model").name("camera_model")
     if _has(top, frame, "is_fisheye") and _holder(top, frame, "is_fisheye").get("is_fisheye"):
         model = "OPENCV_FISHEYE"
+    return model
+
+
+def _distortion(top: Entry, frame: Entry) -> str | None:
+    """The distortion of the lens, for messages; None for a pinhole. Raises for models that no pinhole resembles."""
+    model = _model(top, frame)
     if model not in (*PINHOLES, *BENT):
         if "FISHEYE" not in model:
             raise InputError(f"{frame.place}: camera_model: expected PINHOLE or OPENCV, found {model!r}")

@@ -55,7 +55,7 @@ cameras_option = stack(
         VIEWS,
         "--ignore-distortion",
         is_flag=True,
-        help="Use cameras with lens distortion as if they had none. Their photos are not compared. Default: refuse them.",
+        help="Use cameras with lens distortion as if they had none. Their photos are not compared. Default: undistort photos.",
     ),
     option(
         VIEWS,

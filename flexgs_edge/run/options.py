@@ -89,7 +89,7 @@ class ViewOptions:
     cameras : str, optional
         A camera file, a folder with one, `auto`, or `none`. Default: the cameras beside the scene, else `auto`.
     ignore_distortion : bool
-        Use the poses of cameras with lens distortion, without their photos. Default: raise `InputError` for them.
+        Use the poses of cameras with lens distortion, without their photos. Default: undistort the photos.
     dataparser : str, optional
         nerfstudio's `dataparser_transforms.json` of the training, for poses of a transforms.json. Default: the one found.
     images : str, optional
