@@ -126,7 +126,7 @@ def read_colmap(path: str | os.PathLike[str], ignore_distortion: bool = False) -
     Raises
     ------
     InputError
-        If a file is missing or cannot be read, or photos cannot be freed of a lens.
+        If a file is missing or cannot be read.
     FormatError
         If a file breaks the format; the message names file and camera, image, line or byte.
     """
@@ -179,12 +179,7 @@ def _camera(path: Path, lens_file: Path, image: _Image, lenses: dict[int, _Lens]
         return camera
     make = LENSES.get(lens.model.name)
     straight = None if make is None else camera.behind(make(lens.parameters[lens.model.focals + 2 :]))
-    if straight is None:
-        raise InputError(
-            f"{lens_file}: camera {image.lens} has {distortion}, and photos cannot be freed of it; use --ignore-distortion "
-            "to take the poses alone, without photos"
-        )
-    return straight
+    return camera if straight is None else straight
 
 
 def _rotation(place: str, quaternion: Sequence[float]) -> np.ndarray:

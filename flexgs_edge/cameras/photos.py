@@ -185,8 +185,8 @@ def _refuse_bent(place: Path, cameras: Sequence[Camera]) -> None:
     bent = next((camera for camera in cameras if camera.distortion), None)
     if bent is not None:
         raise InputError(
-            f"{place}: photos cannot be compared: camera {bent.name!r} has {bent.distortion}; "
-            "leave the photos out (--images none)"
+            f"{place}: photos cannot be compared: camera {bent.name!r} has {bent.distortion}, which photos "
+            "cannot be freed of here; use --images none to take the poses alone"
         )
 
 

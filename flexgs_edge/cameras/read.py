@@ -52,7 +52,7 @@ def read_cameras(
     Raises
     ------
     InputError
-        If the path is missing or of an unknown kind, or a lens is distorted.
+        If the path is missing or of an unknown kind.
     FormatError
         If the file breaks its format.
     """

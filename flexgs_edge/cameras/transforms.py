@@ -54,7 +54,7 @@ def read_transforms(
     Raises
     ------
     InputError
-        If the file cannot be read, a size is not found, or photos cannot be freed of a lens.
+        If the file cannot be read, or a size is not found.
     FormatError
         If the file breaks its format; the message names file, frame and key.
     """
@@ -148,12 +148,7 @@ def _camera(
     if distortion is None or ignore_distortion:
         return camera
     straight = camera.behind(_lens(top, frame))
-    if straight is None:
-        raise InputError(
-            f"{frame.place} ({name}): {distortion}: no pinhole sees as far as this lens; use --ignore-distortion to take the "
-            "poses alone, without photos"
-        )
-    return straight
+    return camera if straight is None else straight
 
 
 def _lens(top: Entry, frame: Entry) -> Lens:

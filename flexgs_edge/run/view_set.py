@@ -153,7 +153,7 @@ def find_views(
     notes: tuple[str, ...] = ()
     if bent:
         notes = (f"{len(bent)} cameras have {bent[0]}: only their poses are used",)
-        if options.images is None:
+        if options.images is None and options.ignore_distortion:
             images = None
     background = options.background or (0.0, 0.0, 0.0)
     photos: Photos | None = None

@@ -94,7 +94,7 @@ def test_lenses_that_fold_back_are_refused(tmp_path: Path) -> None:
     for model, parameters in (("RADIAL", (-3.0, 0.0)), ("FOV", (0.9,))):
         focals = (FX,) if model == "RADIAL" else (FX, FY)
         write_colmap(tmp_path, [(1, model, WIDTH, HEIGHT, (*focals, CX, CY, *parameters))], [image], text=True)
-        with pytest.raises(InputError, match=f"lens distortion .COLMAP model {model}.*--ignore-distortion") as caught:
-            read_cameras(tmp_path)
-        assert "image_undistorter" not in str(caught.value)
-        assert read_cameras(tmp_path, ignore_distortion=True)[0].lens is None
+        (camera,) = read_cameras(tmp_path)  # its pose serves
+        assert camera.lens is None and camera.distortion == f"lens distortion (COLMAP model {model})"
+        with pytest.raises(InputError, match=f"COLMAP model {model}.*--images none"):
+            Photos.open(tmp_path, [camera])
