@@ -17,6 +17,12 @@ from flexgs_edge.cli import help_page, shared_options, talk
     required=True,
     help="File to write: .ply, .spz, .sog, .compressed.ply, .splat, .glb, or FOLDER/lod-meta.json (streamed SOG).",
 )
+@help_page.option(
+    help_page.OUTPUT,
+    "--force-lossy",
+    is_flag=True,
+    help="Write a scene far from zero also where the format's position error is more than a tenth of the smallest splat.",
+)
 @shared_options.spz_version_option
 @shared_options.reading_options
 @help_page.option(
@@ -31,6 +37,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
 def command(
     input: str,
     output: str,
+    force_lossy: bool,
     spz_version: int,
     frame: str | None,
     lod: int | None,
@@ -68,5 +75,5 @@ def command(
     from flexgs_edge.io.reading import Reading
 
     reading = Reading.of(frame, lod, sh_degree)
-    result = decompress(input, output, force, memory_limit, device, reading, spz_version)
+    result = decompress(input, output, force, memory_limit, device, reading, spz_version, force_lossy)
     talk.emit(result.summary(), result.to_json(), json_path, force)

@@ -42,6 +42,7 @@ def decompress(
     device: str | None = None,
     reading: Reading = AS_WRITTEN,
     spz_version: int = 3,
+    force_lossy: bool = False,
 ) -> DecompressResult:
     """Decode a scene to a PLY in INRIA's layout, or convert it to another format.
 
@@ -61,6 +62,8 @@ def decompress(
         Frame, level of detail and SH degree.
     spz_version : {3, 4}
         Version of a `.spz`.
+    force_lossy : bool
+        Write positions far from zero also where their error is more than a tenth of the smallest splat.
     device : str, optional
         Device that decodes: a processor as `devices` lists it, or `numpy`. Default: see `decoder`.
 
@@ -84,7 +87,7 @@ def decompress(
         check_folder(Path(output).parent, force)
     else:
         check_writable(output, force)
-    writing = Writing(spz_version)
+    writing = Writing(spz_version, force_lossy=force_lossy)
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(memory_limit)
     with clock.stage("open"):

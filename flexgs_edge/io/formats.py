@@ -31,6 +31,8 @@ class Format:
         Directions of the axes in files of this format.
     reach : float
         Largest coordinate that it holds, scene units.
+    digits : int or None
+        Binary digits of world coordinates; `None`: it holds the origin apart, in float64.
     max_degree : int
         Highest SH degree.
     one_degree : bool
@@ -50,6 +52,7 @@ class Format:
     writer: str | None = None
     frame: Frame = RDF
     reach: float = float("inf")
+    digits: int | None = 24
     max_degree: int = 3
     one_degree: bool = False
     row_bytes: float = 20.0
@@ -84,7 +87,7 @@ FORMATS: dict[str, Format] = {
     for format in (
         Format(
             ".spz", f"{_IO}.spz:read_spz", f"{_IO}.spz_writer:write_spz", RUB, reach=2.0**23 - 1,
-            max_degree=4, row_bytes=22.0, sh_bytes=5.5, marks_antialiased=True,
+            digits=23, max_degree=4, row_bytes=22.0, sh_bytes=5.5, marks_antialiased=True,
         ),
         Format(
             ".sog", f"{_IO}.sog:read_sog", f"{_IO}.sog_writer:write_sog",
@@ -104,7 +107,7 @@ FORMATS: dict[str, Format] = {
         Format(".ksplat", f"{_IO}.ksplat:read_ksplat"),
         Format(
             ".glb", f"{_IO}.gltf:read_gltf", f"{_IO}.glb_writer:write_glb", LUF,
-            one_degree=True, row_bytes=232.0, sh_bytes=180.0, memory=1024,
+            digits=None, one_degree=True, row_bytes=232.0, sh_bytes=180.0, memory=1024,
         ),
         Format(".gltf", f"{_IO}.gltf:read_gltf", frame=LUF),
     )

@@ -138,7 +138,7 @@ def _header(source: SceneSource, attributes: list[_Attribute]) -> bytes:
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0} | ({"translation": source.origin.tolist()} if np.any(source.origin) else {})],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,

@@ -49,10 +49,13 @@ class Writing:
         Version of a `.spz`. Older programs read only 3.
     antialiased : bool
         The model is antialiased; formats that can say so, do.
+    force_lossy : bool
+        Write positions far from zero also where their error is more than a tenth of the smallest splat.
     """
 
     spz_version: int = 3
     antialiased: bool = False
+    force_lossy: bool = False
 
     def __post_init__(self) -> None:
         if self.spz_version not in (3, 4):

@@ -15,7 +15,7 @@ from flexgs_edge.api.scene import Scene
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.io.decoded import OPACITY_LIMIT
-from flexgs_edge.io.exchange import read_foreign, write_foreign
+from flexgs_edge.io.exchange import read_foreign, write_foreign, written_order
 from flexgs_edge.io.formats import FORMATS, WRITTEN, format_of, written_format
 from flexgs_edge.io.frames import RDF, RUB, in_frame
 from flexgs_edge.io.ply import PlySource, write_ply
@@ -222,7 +222,7 @@ def test_opacities_of_zero_and_one_stay_finite(tmp_path: Path, suffix: str) -> N
     assert sigmoid(logits)[0] < 0.5 / 255 and sigmoid(logits)[3] > 254.5 / 255
 
 
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".splat", ".glb", ".spz"])
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".splat", ".spz"])
 def test_scenes_far_from_zero(tmp_path: Path, suffix: str) -> None:
     notes = write_foreign(tmp_path / f"a{suffix}", scene(50, 0, far=5000.0))
     assert notes == ("positions rounded to float32: the scene is far from zero",)
@@ -324,3 +324,35 @@ def test_another_reader_sees_the_same_scene(tmp_path: Path, suffix: str) -> None
         sigmoid(np.asarray(found.opacities).reshape(1, -1)), sigmoid(ours["opacity_logits"]), atol=1e-4
     )
     assert degrees_apart(np.asarray(found.quats).T, ours["quats"]).max() < 0.1
+
+
+def _utm() -> MemorySource:
+    return MemorySource(planes_of(scene(300, 0)), origin=[482312.0, 5456784.0, 312.0])
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".splat", ".spz", ".sog"])
+def test_positions_that_a_format_cannot_hold_are_refused(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    with pytest.raises(InputError, match=r"holds coordinates of 54567\d\d only to 0\.2?5, and the smallest splat"):
+        write_foreign(path, _utm())
+    assert not path.exists()
+    assert write_foreign(path, _utm(), writing=Writing(force_lossy=True))[-1].startswith("positions rounded")
+
+
+def test_a_glb_holds_the_origin_exactly(tmp_path: Path) -> None:
+    source = _utm()
+    assert write_foreign(tmp_path / "a.glb", source) == ()
+    back, rows = read_foreign(tmp_path / "a.glb"), written_order(source)
+    every = slice(0, source.count)
+    means = back.read(every, ["means"])["means"] + back.origin[:, None]
+    expected = source.read(every, ["means"])["means"][:, rows] + source.origin[:, None]
+    np.testing.assert_allclose(means, expected, rtol=0, atol=1e-5)
+
+
+def test_far_rows_come_last_by_octaves() -> None:
+    near = planes_of(scene(600, 0))
+    order = written_order(MemorySource(near))
+    means = near["means"].copy()
+    means[:, 7::100] *= 1e6
+    moved = written_order(MemorySource(near | {"means": means}))
+    assert set(moved[-6:]) == set(range(7, 600, 100)) and set(order[-6:]) != set(moved[-6:])
