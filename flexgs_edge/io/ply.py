@@ -322,8 +322,8 @@ def write_ply(
 ) -> tuple[str, ...]:
     """Write a scene in INRIA's layout: x y z, nx ny nz (zeros), f_dc, f_rest, opacity, scale, rot; little endian.
 
-    Properties are `float`. Positions are world positions. If the origin is not zero, they are `double`, since float32
-    would lose the digits that the origin kept. The source's `comments` are written to the header.
+    Properties are `float`. Positions are world positions. They are `double` only where the origin is not zero and
+    float32 does not hold them exactly. The source's `comments` are written to the header.
 
     Parameters
     ----------
@@ -348,7 +348,7 @@ def write_ply(
     BudgetError
         If the disk is full.
     """
-    wide = bool(np.any(source.origin != 0))
+    wide = bool(np.any(source.origin != 0)) and not _floats_hold(source, chunk_rows)
     dtype = inria_dtype(source.sh_degree, wide)
     kinds = {"<f4": "float", "<f8": "double"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {source.count}"]
@@ -368,9 +368,20 @@ def write_ply(
                     whole[name] = part[:, axis] + source.origin[axis]
                 file.write(whole.view(np.uint8).data)
             else:
+                if np.any(source.origin != 0):
+                    part[:, :3] = part[:, :3] + source.origin
                 file.write(part.astype("<f4", copy=False).data)
     where = ", ".join(f"{value:g}" for value in source.origin)
     return (f"positions written as double: the scene is far from zero (origin {where})",) if wide else ()
+
+
+def _floats_hold(source: SceneSource, chunk_rows: int) -> bool:
+    """Whether float32 holds every world position exactly, as it does for all that came from floats."""
+    for rows in source.chunks(chunk_rows):
+        world = source.read(rows, ["means"])["means"] + source.origin[:, None]
+        if not np.array_equal(world, world.astype(np.float32)):
+            return False
+    return True
 
 
 def inria_dtype(sh_degree: int, wide: bool = False) -> np.dtype:

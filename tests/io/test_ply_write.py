@@ -65,6 +65,17 @@ def test_a_scene_far_from_zero_is_written_in_float64(tmp_path: Path) -> None:
     assert np.abs(found - expected).max() < 1e-6
 
 
+def test_floats_far_from_zero_come_back_as_floats(tmp_path: Path) -> None:
+    rows = random_rows(50, 0)
+    for name in ("nx", "ny", "nz"):
+        rows[name] = 0.0
+    rows["x"] += np.float32(4e6)
+    path = write_rows(tmp_path / "a.ply", rows)
+    assert PlySource(path).origin[0] != 0
+    assert write_ply(tmp_path / "b.ply", PlySource(path)) == ()
+    assert (tmp_path / "b.ply").read_bytes() == path.read_bytes()
+
+
 def test_it_opens_in_plyfile(tmp_path: Path) -> None:
     from plyfile import PlyData
 
