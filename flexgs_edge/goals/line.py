@@ -52,11 +52,6 @@ def weighed(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
     This is the Illinois rule. The log of a loss is curved, so that plain false position would approach the target
     slowly.
-
-    Parameters
-    ----------
-    points : sequence of tuple
-        (position, excess) in the order in which they were measured, at least one.
     """
     sides = [excess <= 0.0 for _, excess in points]
     streak = next((count for count, side in enumerate(reversed(sides)) if side != sides[-1]), len(sides))

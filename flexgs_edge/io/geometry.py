@@ -17,11 +17,6 @@ def read_geometry(folder: Path, source: SceneSource, format: Format) -> tuple[Sc
 
     Positions, scales, rotations and opacities are the same as with SH.
 
-    Parameters
-    ----------
-    folder : Path
-        For the temporary file.
-
     Returns
     -------
     tuple

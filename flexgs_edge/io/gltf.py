@@ -77,12 +77,7 @@ def read_gltf(path: Path, name: str, reading: Reading) -> GltfSource:
 def splats_of(file: GltfFile, unpack: Callable[[bytes, str], DecodedSource]) -> GltfSource:
     """The splats that an open file shows. See `read_gltf` for errors.
 
-    Parameters
-    ----------
-    file : GltfFile
-        The file.
-    unpack : callable
-        Opens the bytes of a `.spz`; its second argument is their name for messages.
+    `unpack`: Opens the bytes of a `.spz`; its second argument is their name for messages.
     """
     return _Reader(file, unpack).scene()
 

@@ -66,17 +66,7 @@ def folder_pieces(folder: Path, name: str) -> Pieces:
 
 
 def zip_pieces(archive: zipfile.ZipFile, name: str, first: str) -> Pieces:
-    """Pieces in a zip.
-
-    Parameters
-    ----------
-    archive : zipfile.ZipFile
-        Open for as long as pieces are read.
-    name : str
-        What messages call it.
-    first : str
-        The piece that names the others. If it is not at the root but in one folder, that is where the others are.
-    """
+    """Pieces in a zip."""
     entries = {info.filename: info for info in archive.infolist()}
     homes = [entry[: -len(first)] for entry in entries if entry == first or entry.endswith(f"/{first}")]
     if not homes:

@@ -40,12 +40,7 @@ def unpack_small(codes: np.ndarray, mode: np.ndarray) -> np.ndarray:
 def rounded_quats(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Choose the form and the rounding of each quaternion.
 
-    Parameters
-    ----------
-    quats : np.ndarray
-        [n, 4] f64, unit quaternions w x y z.
-    log_scales : np.ndarray
-        [n, 3].
+    `quats`: [n, 4] f64, unit quaternions w x y z; `log_scales`: [n, 3].
 
     Returns
     -------

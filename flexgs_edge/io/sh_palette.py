@@ -37,12 +37,7 @@ def sh_palette(values: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     k-means follow. Vectors of zeros get an entry of zeros. Entries are in the order in which rows use them first, so
     that labels grow slowly, which costs few bits.
 
-    Parameters
-    ----------
-    values : np.ndarray
-        [n, d] finite f32, d at most 45.
-    most : int
-        Most entries, at least 2.
+    `values`: [n, d] finite f32, d at most 45.
 
     Returns
     -------

@@ -153,13 +153,6 @@ def parse_object(data: bytes, place: str) -> JsonObject:
 def parse_meta(data: bytes, place: str) -> SogMeta:
     """Check a `meta.json`.
 
-    Parameters
-    ----------
-    data : bytes
-        The text.
-    place : str
-        What messages call it.
-
     Raises
     ------
     FormatError

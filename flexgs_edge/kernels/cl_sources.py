@@ -106,15 +106,6 @@ def load_source(name: str, stats: int | None = None, form: str = "cpu") -> str:
 
     `#line` directives make the compiler name files and lines that a person can open.
 
-    Parameters
-    ----------
-    name : str
-        File name in the kernel folder, such as `project.cl`.
-    stats : int, optional
-        Kind of statistics, for the files of blends.
-    form : {"cpu", "gpu"}
-        Form of the blends that are built together with other kernels.
-
     Raises
     ------
     DeviceError

@@ -35,16 +35,7 @@ class Measured:
 def measure_forms(
     info: DeviceInfo, without: Collection[str] = (), say: Callable[[str], None] = lambda name: None
 ) -> tuple[list[Measured], str]:
-    """Time all forms that the device can take; returns them, the fastest first, and why the first of the others failed.
-
-    Parameters
-    ----------
-    info : DeviceInfo
-    without : collection of str
-        Names of forms to leave out, since they end the process.
-    say : callable, optional
-        Called with the name of each form before it is built.
-    """
+    """Time all forms that the device can take; returns them, the fastest first, and why the first of the others failed."""
     found: list[Measured] = []
     failed = ""
     written = False

@@ -59,13 +59,6 @@ class Arrays:
 def play(record: Record, backend: Backend, watch: Callable[[str], None] = lambda kernel: None) -> None:
     """Play `record` on `backend`. A device without threads is spared the kernels of the coder, which no run starts there.
 
-    Parameters
-    ----------
-    record : Record
-    backend : Backend
-    watch : callable, optional
-        Called with the name of each kernel before its first launch, which builds it.
-
     Raises
     ------
     WrongResult

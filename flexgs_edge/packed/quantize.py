@@ -151,14 +151,7 @@ def quantized_bytes(count: int, sh_count: int, sh_degree: int, bits: BitSpec, gr
 def quantize_array(values: np.ndarray, bits: int, groups: int) -> QuantizedArray:
     """Quantize an array that lies in memory.
 
-    Parameters
-    ----------
-    values : np.ndarray
-        [c, n] f32, finite, magnitudes up to `LARGEST`.
-    bits : int
-        1 to 16.
-    groups : int
-        0 for n = 0, else 1 to n.
+    `values`: [c, n] f32, finite, magnitudes up to `LARGEST`.
 
     Raises
     ------

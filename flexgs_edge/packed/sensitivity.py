@@ -51,17 +51,6 @@ def search_bits(
 ) -> tuple[BitSpec, list[Sensitivity]]:
     """Find the bits of every attribute.
 
-    Parameters
-    ----------
-    error : callable
-        Codes the scene with these bits, and gives the mean squared error against the original's renders.
-    sh_degree : int
-        SH degree of the scene.
-    sh_share : float
-        Share of the Gaussians with SH above degree 0.
-    allowed : float
-        Mean squared error of the allowed modelled drop (`flexgs_edge.quality.psnr.error_for_drop`).
-
     Returns
     -------
     tuple

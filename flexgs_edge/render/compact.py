@@ -67,11 +67,6 @@ def fill_compact(
 ) -> int:
     """Project the scene chunk by chunk, and give each view the splats that it shows, in row order.
 
-    Parameters
-    ----------
-    buffers : ViewBuffers
-        A chunk is projected into its `chunk` for one view after the other.
-
     Returns
     -------
     int

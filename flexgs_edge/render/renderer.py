@@ -251,10 +251,7 @@ class Renderer:
     def residual_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
         """Weights of each row in one view, and the weighted residual (`target` minus the view) at its pixels.
 
-        Parameters
-        ----------
-        target : np.ndarray
-            [3, H, W] f16, in the layout of `render_planes`.
+        `target`: [3, H, W] f16, in the layout of `render_planes`.
 
         Returns
         -------

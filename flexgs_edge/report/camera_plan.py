@@ -23,15 +23,7 @@ MOST_NAMES = 400
 
 
 def plans(rig: Rig, numbers: Mapping[str, int]) -> str:
-    """Draw both plans and their key.
-
-    Parameters
-    ----------
-    rig : Rig
-        Camera poses and points of the scene.
-    numbers : mapping
-        The page's number of each view with pictures, by the name of its camera.
-    """
+    """Draw both plans and their key."""
     across, away, up = axes(rig)
     low, high = extent(rig, np.stack([across, away, up]))
     # Both plans use one scale, so that they can be compared.

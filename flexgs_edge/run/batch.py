@@ -46,11 +46,6 @@ def scenes_of(inputs: Sequence[StrPath], output: StrPath | None, suffix: str) ->
     A folder that is no scene stands for the scenes directly in it, by name: files of known suffixes, and folders that are
     scenes. Hidden files and companions are left out, and the log names other files and folders. A folder without scenes
     stays as it is, and `check_place` says why.
-
-    Parameters
-    ----------
-    output : path or None
-        Folder that is written to. As an input, it does not stand for its own files that end in `suffix`.
     """
     found: dict[str, str] = {}
     for each in inputs:

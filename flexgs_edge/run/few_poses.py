@@ -84,17 +84,7 @@ def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
 
 
 def made_poses(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera]) -> list[Camera]:
-    """A nearer and a farther pose for each of some of the views that decide.
-
-    Parameters
-    ----------
-    renderer : Renderer
-        With nothing loaded.
-    source : SceneSource
-        The original.
-    cameras : sequence of Camera
-        The views that decide.
-    """
+    """A nearer and a farther pose for each of some of the views that decide."""
     some = evenly(cameras, MADE_FROM)
     depths = visible_depths(renderer, source, some)
     return [

@@ -32,17 +32,7 @@ ROW_BYTES = 59 * 4 * 4
 
 
 def live_scenes(run: Run[Options], path: str | os.PathLike[str], first: int) -> Live:
-    """What the live scenes of a report need.
-
-    Parameters
-    ----------
-    run : Run
-        Of a `compress` with views.
-    path : path
-        The `.fgs` that it wrote.
-    first : int
-        The camera to begin with.
-    """
+    """What the live scenes of a report need."""
     look = {"near": run.options.near, "background": run.options.background, "antialiased": run.options.antialiased}
     config = {**page_config("", run.seen.cameras, look), "first": first}
     size = os.stat(path).st_size
@@ -79,11 +69,7 @@ def _write_fine(source: SceneSource, place: Path) -> int:
 def fine_steps(means: np.ndarray, log_scales: np.ndarray, sh_degree: int) -> StepSizes:
     """Step sizes whose errors nobody sees; of positions, a sixteenth of the size of a small Gaussian.
 
-    Parameters
-    ----------
-    means, log_scales : np.ndarray
-        [3, n] f32.
-    sh_degree : int
+    `means`, `log_scales`: [3, n] f32.
     """
     small = float(np.exp(np.percentile(log_scales.max(axis=0), 10)))
     position, contraction = position_grid(means, max(small / 16, 2.0**-70))

@@ -54,13 +54,6 @@ def open_scene(path: str | os.PathLike[str], reading: Reading = AS_WRITTEN) -> S
 
     A folder that holds a `point_cloud.ply` stands for it.
 
-    Parameters
-    ----------
-    path : path
-        A file, packed with gzip or not, or a folder.
-    reading : Reading, optional
-        Frame and level of detail.
-
     Returns
     -------
     SceneSource

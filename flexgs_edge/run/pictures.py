@@ -56,17 +56,7 @@ def chosen_ranks(count: int) -> list[int]:
 
 
 def draw_shots(judge: Judge, scene: DeviceScene, quality: Quality, progress: Progress = SILENT) -> tuple[Shot, ...]:
-    """Draw and encode the pictures of some views, the worst view first.
-
-    Parameters
-    ----------
-    judge : Judge
-        Measured `quality`. Drawing reuses the memory that it holds for comparing views.
-    scene : DeviceScene
-        The decoded scene, loaded.
-    quality : Quality
-        Ranks the views.
-    """
+    """Draw and encode the pictures of some views, the worst view first."""
     order = quality.by_loss
     ranks = chosen_ranks(len(order))
     shots = []

@@ -160,10 +160,7 @@ def open_compression(
 ) -> Run[CompressOptions]:
     """Open what `compress` needs: check its files, open the scene and its views, and plan.
 
-    Parameters
-    ----------
-    output : path or None
-        The file to write; `None` in a dry run.
+    `output`: The file to write; `None` in a dry run.
 
     Raises
     ------

@@ -46,15 +46,6 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
     splats) are valid: they are read as the smallest finite log-scale of the scene. Logits of +-inf (opacities 1 and 0)
     are valid too: they are read as +-`OPACITY_LIMIT`.
 
-    Parameters
-    ----------
-    source : SceneSource
-        The scene.
-    drop_invalid : bool, optional
-        Leave invalid rows out. By default, they raise an error.
-    chunk_rows : int, optional
-        Rows held in memory at a time.
-
     Returns
     -------
     SceneSource

@@ -46,12 +46,7 @@ def band_matrices(turn: np.ndarray, degree: int = MAX_SH_DEGREE) -> list[np.ndar
     A turned Gaussian shows in direction d what it showed in direction `turn`^T d before. We write both as functions of
     many directions and solve for the coefficients; a band turns into itself, so that the solution is exact.
 
-    Parameters
-    ----------
-    turn : np.ndarray
-        [3, 3] f64, orthogonal; mirrors are allowed.
-    degree : int, optional
-        Highest band.
+    `turn`: [3, 3] f64, orthogonal; mirrors are allowed.
 
     Returns
     -------

@@ -71,22 +71,6 @@ def study_paper(
 ) -> PaperStudy:
     """Make the paper's experiments on every scene and write them to a folder.
 
-    Parameters
-    ----------
-    scenes : sequence of path
-        `.ply`, `.fgs` or model folders, one or more.
-    output : path
-        Folder of the results: index.html, and a folder for each scene with <experiment>.csv, .json, .png and .svg. It
-        appears when everything is done. With `force` it may replace files of these names in an existing folder.
-    options : CompressOptions, optional
-        Views, drawing, memory and device as for `compress`. `max_drop` and `effort` are those of the search.
-    progress : Progress, optional
-        Progress bars. Default: none.
-    experiments : sequence of callable, optional
-        Experiments for every scene, in this order. Default: all of `EXPERIMENTS`.
-    **words
-        Single options, by their names in `CompressOptions`.
-
     Raises
     ------
     FlexGSError

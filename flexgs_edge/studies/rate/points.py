@@ -215,15 +215,7 @@ def best_points(studied: StudyScene, variant: Variant, effort: str, ratios: Sequ
 
 
 def peer_points(studied: StudyScene, folder: Path) -> Found:
-    """Points of the whole scene, unpruned, in the formats of other programs.
-
-    Parameters
-    ----------
-    studied : StudyScene
-        The scene.
-    folder : Path
-        For the files, which are removed afterwards.
-    """
+    """Points of the whole scene, unpruned, in the formats of other programs."""
     found = NOTHING
     for suffix in PEERS:
         format = FORMATS[suffix]

@@ -53,27 +53,8 @@ def study_rate(
 ) -> RateStudy:
     """Measure bytes and quality of every method on a scene and write them to a folder.
 
-    Parameters
-    ----------
-    scene : path
-        Any scene that `compress` takes.
-    output : path
-        Folder of the results: index.html, and rate, fidelity and parts as .csv, .json, .png and .svg. It appears when
-        everything is done. With `force` it may replace files of these names in an existing folder.
-    options : CompressOptions, optional
-        Views, drawing, memory and device as for `compress`. `effort` is that of the curves.
-    progress : Progress, optional
-        Progress bars. Default: none.
-    ratios : sequence of float
-        PLY bytes over file bytes, for the curves.
-    ablations : sequence of float
-        PLY bytes over file bytes, for the points without a part. If empty, these are left out.
-    ablation_effort : str
-        Effort of these points, and of the curve that they are compared with.
-    distilled : sequence of float
-        PLY bytes over file bytes, for the points at the effort `max`. If empty, these are left out.
-    **words
-        Single options, by their names in `CompressOptions`.
+    `ratios`: PLY bytes over file bytes, for the curves; `ablations`: PLY bytes over file bytes, for the points without a
+    part; `distilled`: PLY bytes over file bytes, for the points at the effort `max`.
 
     Raises
     ------

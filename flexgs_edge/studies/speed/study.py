@@ -45,25 +45,6 @@ def study_speed(
 ) -> SpeedStudy:
     """Measure speed against accuracy on a scene and write it to a folder.
 
-    Parameters
-    ----------
-    scene : path
-        Any scene that `compress` takes.
-    output : path
-        Folder of the results: index.html, and every experiment's rows and chart as .csv, .json, .png and .svg. It appears when
-        everything is done. With `force` it may replace files of these names in an existing folder.
-    options : CompressOptions, optional
-        Views, drawing, memory and device as for `compress`. The target is that of the whole runs, and of the paper's search
-        that other parts build on.
-    progress : Progress, optional
-        Progress bars. Default: none.
-    parts : sequence of str
-        Names in `PARTS`. Default: all.
-    repeats : int
-        Rounds of timing. The shortest time counts.
-    **words
-        Single options, by their names in `CompressOptions`.
-
     Raises
     ------
     FlexGSError

@@ -63,24 +63,6 @@ def study_stability(
 ) -> StabilityStudy:
     """Find the conditions under which methods break on a scene, and write them to a folder.
 
-    Parameters
-    ----------
-    scene : path
-        Any scene that `compress` takes.
-    output : path
-        Folder of the results: index.html, and every experiment's rows and chart as .csv, .json, .png and .svg. It appears when
-        everything is done. With `force` it may replace files of these names in an existing folder.
-    options : CompressOptions, optional
-        Views, drawing, memory and device as for `compress`. The target is that of the compared results.
-    progress : Progress, optional
-        Progress bars. Default: none.
-    quick : bool
-        Measure only a few points of every experiment, on small views.
-    amounts : Amounts, optional
-        How many points, in place of the amounts that `quick` chooses.
-    **words
-        Single options, by their names in `CompressOptions`.
-
     Raises
     ------
     FlexGSError
