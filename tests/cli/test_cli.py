@@ -97,7 +97,7 @@ def test_words_of_the_options_are_those_of_the_library() -> None:
         assert plain == (getattr(defaults, name) or None), name
     for name in ("render", "evaluate", "score"):
         found = {p.name for p in importlib.import_module(f"flexgs_edge.cli.{name}").command.params}
-        assert set(ViewOptions.__dataclass_fields__) - found <= {"images", "holdout"}
+        assert set(ViewOptions.__dataclass_fields__) - found <= {"images", "holdout", "exposure"}
 
 
 def test_the_examples_of_help_and_readme_make_sense() -> None:
