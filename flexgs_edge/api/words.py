@@ -38,6 +38,7 @@ class CompressWords(TypedDict, total=False):
 
     ignore_distortion: bool
     dataparser: str | None
+    exposure: str
     holdout: int
     resolution: int
     near: float | None
@@ -68,6 +69,7 @@ class CompressWords(TypedDict, total=False):
     bits: str
     groups: int | None
     base_psnr: float
+    trust_views: bool
     effort: str
     best_effort: bool
     unseen: str
