@@ -85,7 +85,7 @@ Several scenes:
     "--max-worst-drop",
     metavar="DB",
     type=value_types.BOUND,
-    help="No view may lose more. Default: 1.5 times --max-drop, and 0.2.",
+    help="No view may lose more. Default: as the target allows.",
 )
 @option(
     REACH,

@@ -107,7 +107,7 @@ def _find_fault(run: Run[Options], renderer: Renderer, views: ViewSet) -> tuple[
     try:
         with renderer.load(run.source) as scene:
             if views.photos is None:
-                return _blind(views, _drawn(renderer, scene, [_small(views.cameras[i]) for i in indices]), indices)
+                return _blind(renderer, scene, views, indices)
             compared = _compare(renderer, scene, views, indices)
             likenesses = compared.likenesses
             known = [value for value in likenesses if not math.isnan(value)]
@@ -158,16 +158,20 @@ def _compare(renderer: Renderer, scene: DeviceScene, views: ViewSet, indices: li
     return _Compared(indices, cameras, _drawn(renderer, scene, cameras), [_photo(views, i) for i in indices])
 
 
-def _blind(views: ViewSet, renders: _Pictures, indices: list[int]) -> tuple[str, bool] | None:
+def _blind(renderer: Renderer, scene: DeviceScene, views: ViewSet, indices: list[int]) -> tuple[str, bool] | None:
     """Views, without photos, that show one colour: they see nothing of the scene, or stand in matter."""
-    blind = [index for index, render in zip(indices, renders, strict=True) if details(render) is None]
+    blind, inside = [], 0
+    for index in indices:
+        if details(renderer.render(scene, _small(views.cameras[index]))) is None:
+            blind.append(index)
+            inside += renderer.drawn_coverage() > 0.5
     if not blind:
         return None
     words = (
         f"{len(blind)} of {len(indices)} compared views show nothing but one colour ({_names(views, blind)}): their cameras look "
         "away from the scene, are far from it, or stand in matter. Are the cameras in the scene's frame?"
     )
-    return words, 2 * len(blind) > len(indices)
+    return words, 2 * inside > len(indices)
 
 
 def _names(views: ViewSet, indices: Sequence[int], most: int = 3) -> str:

@@ -22,6 +22,7 @@ from flexgs_edge.run.open_bench import open_bench
 from flexgs_edge.run.options import CompressOptions, ViewOptions
 from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.run.view_set import GivenViews
+from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.bench import Bench
 
 WIDTH = 120
@@ -142,15 +143,29 @@ def test_some_wrong_photos_are_a_warning(opened: Opened) -> None:
     )
 
 
-def test_views_that_see_nothing_are_refused_without_photos(opened: Opened) -> None:
+def test_views_that_see_nothing_are_warned_of_without_photos(opened: Opened) -> None:
     run, bench = opened
     away = [replace(c, rotation=np.diag([-1.0, 1.0, -1.0]) @ c.rotation) for c in run.seen.cameras]
     far = [replace(c, translation=np.diag([-1.0, 1.0, -1.0]) @ c.translation + [0, 0, -1e6]) for c in away]
     blind = replace(run, views=replace(run.seen, cameras=far, photos=None))
     assert frame_doubts(run.seen, run.scene) == ()
     assert "nothing of the scene in sight" in frame_doubts(blind.seen, run.scene)[0]
-    with pytest.raises(InputError, match="nothing but one colour"):
-        check_views(blind, bench, trusted=False)
+    (words,) = check_views(blind, bench, trusted=False).doubts
+    assert "15 of 15 compared views show nothing but one colour" in words
+
+
+def test_cameras_in_matter_are_refused_without_photos(opened: Opened) -> None:
+    run, bench = opened
+    wall = {
+        "means": np.zeros((3, 1), np.float32),
+        "log_scales": np.full((3, 1), 6.0, np.float32),
+        "quats": np.array([[1.0], [0.0], [0.0], [0.0]], np.float32),
+        "opacity_logits": np.full((1, 1), 9.0, np.float32),
+        "sh_dc": np.ones((3, 1), np.float32),
+    }
+    inside = replace(run.of_source(MemorySource(wall)), views=replace(run.seen, photos=None))
+    with pytest.raises(InputError, match="stand in matter"):
+        check_views(inside, bench, trusted=False)
 
 
 def test_compress_stops_and_evaluate_warns(opened: Opened, sample_dir: Path, tmp_path: Path) -> None:

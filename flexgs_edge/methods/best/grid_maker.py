@@ -27,7 +27,7 @@ from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import LAST, Schedule, distil, structure_of
 from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.best.search import FAR, Candidate
+from flexgs_edge.methods.best.search import Candidate
 from flexgs_edge.methods.best.selection import Kept, Selection
 from flexgs_edge.methods.best.snapshot import Snapshot
 from flexgs_edge.render.fit import sum_bytes
@@ -35,6 +35,8 @@ from flexgs_edge.scene.source import MemorySource, Planes
 
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
+FAR = 0.1
+"""Log of the share from which on we ask whether the descent mended anything."""
 PRICED, ABOVE = -0.035, 0.02
 """Expected log of the size after a descent over that before it, below 0 since bits cost; and how far above a size we aim, since
 results that are too large can be trimmed: docs/results/tuning.md#landing"""

@@ -38,9 +38,6 @@ LARGEST_STRIDE = 1.2
 """Largest change of the log of the multiplier beyond what is measured."""
 CLOSE_SIZE = 0.003
 """A candidate that is smaller than asked by no more than this ends a search for a size."""
-FLAT, FAR = 0.1, 0.1
-"""Where the log of the share falls at less than the first, over that of the multiplier, and exceeds the second, a smaller
-multiplier helps no more."""
 LEAST_CHANGE = 1e-3
 """Multipliers whose logs differ by less are the same."""
 
@@ -230,10 +227,6 @@ def next_place(steps: Sequence[Candidate], target: Target) -> float | None:
     slope = SIZE_SLOPE if by_size else SLOPE
     misses = next((count for count, step in enumerate(reversed(steps)) if step.holds), len(steps))
     points = [(math.log(step.multiplier), step.excess) for step in steps]
-    if misses > 1 and not by_size:
-        (before, worse), (place, excess) = points[-2:]
-        if place < before and excess > FAR and worse - excess < FLAT * (before - place):
-            return None
     place = next_point(weighed([(at, excess + FARTHER * misses) for at, excess in points]), slope, LARGEST_STRIDE)
     low, high = _bracket(points, slope)
     place = min(max(place, low), high)

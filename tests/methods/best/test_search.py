@@ -55,11 +55,10 @@ def test_no_two_candidates_are_alike() -> None:
 
 
 def test_out_of_reach_names_the_closest_point() -> None:
-    """Where smaller multipliers gain nothing, the search ends."""
     with pytest.raises(TargetError, match=r"drop <= 1 dB is out of reach.*drop 2\.000 dB at .*--best-effort"):
         search(floored(2.0), MaxDrop(1.0))
     found = search(floored(2.0), MaxDrop(1.0), best_effort=True)
-    assert not found.reached and len(found.steps) == 2
+    assert not found.reached and len(found.steps) == MOST_TRIED
     assert found.chosen.excess == min(step.excess for step in found.steps)
 
 
@@ -141,7 +140,6 @@ def test_a_miss_is_followed_by_a_smaller_multiplier_with_some_room() -> None:
     assert place is not None and -0.4 < place < -0.1 / 0.7
     place = next_place([step(0.1, 1.0), step(-0.3, 0.5)], MaxDrop(1.0))
     assert place is not None and math.log(0.5) < place < 0.0
-    assert next_place([step(0.5, 1.0), step(0.499, 0.3)], MaxDrop(1.0)) is None
     assert next_place([step(-7.0, 1e-30)], MinFidelity(40.0)) is not None
 
 
