@@ -15,6 +15,8 @@ ROTATION_TOLERANCE = 1e-3
 """Largest entry of |R R^T - 1|. Files keep 6 digits or more; a scaled or sheared matrix is off by far more."""
 MAX_SIDE = 65535
 """Most pixels of a side; a larger number means a damaged file (JPEG has this limit too)."""
+_SHOWN = 20
+"""Most keys in a message."""
 
 
 def load_json(path: Path) -> Any:
@@ -67,7 +69,8 @@ class Entry:
     def get(self, key: str) -> Any:
         """The value of a key, of any type."""
         if key not in self.entry:
-            raise FormatError(f"{self.place}: missing key {key!r}; found {', '.join(map(repr, self.entry)) or 'none'}")
+            found = ", ".join(map(brief, list(self.entry)[:_SHOWN])) + (", ..." if len(self.entry) > _SHOWN else "")
+            raise FormatError(f"{self.place}: missing key {key!r}; found {found or 'none'}")
         return self.entry[key]
 
     def fail(self, key: str, expected: str, found: str) -> FormatError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -52,9 +53,8 @@ def parse_json(block: bytes) -> object:
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     record = dict(pairs)
     if len(record) != len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise HeaderError(f"wanted each key once, got {twice!r} twice")
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise HeaderError(f"wanted each key once, got {brief(twice)} twice")
     return record
 
 

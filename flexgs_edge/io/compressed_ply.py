@@ -17,7 +17,7 @@ from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import FormatError
 from flexgs_edge.io.codes import nearest, opacities, with_largest, without_largest
 from flexgs_edge.io.decoded import DecodedSource, opacity_logits
-from flexgs_edge.io.ply_layout import PROGRAM, Element, PlyHeader, read_header
+from flexgs_edge.io.ply_layout import PROGRAM, Element, PlyHeader, left_out, read_header
 from flexgs_edge.io.reading import Reading, Writing
 from flexgs_edge.scene.source import REST_WIDTHS, Planes, Rows, SceneSource
 
@@ -141,7 +141,7 @@ def read_compressed_ply(path: Path, name: str, reading: Reading) -> CompressedPl
         places = [names.index(f"f_rest_{i}") for i in range(len(names))]
         sh = rows["sh"].view(np.uint8).reshape(-1, len(names))[:, places]
     source = CompressedPlySource(name, ranges, words, sh)
-    notes = [f"element {e.name!r} left out ({e.count} rows)" for e in header.elements if e.name not in elements]
+    notes = left_out([element for element in header.elements if element.name not in elements])
     if size > ends:
         notes.append(f"{size - ends} bytes behind the data ignored")
     source.notes = tuple(notes)

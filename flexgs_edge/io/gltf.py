@@ -52,6 +52,10 @@ _DEGREES = 3
 _NEGATIVE_SHARE = 0.01
 _ROWS_PER_BYTE = 16
 """Most Gaussians that a byte of the file may stand for: nodes can show one mesh many times, but not without end."""
+_MOST_PARTS = 1 << 12
+"""Most times that splats are shown: each read goes over all of them."""
+_SHOWN = 16
+"""Most notes of a scene, and extensions in a message."""
 
 
 def read_gltf(path: Path, name: str, reading: Reading) -> GltfSource:
@@ -67,9 +71,9 @@ def read_gltf(path: Path, name: str, reading: Reading) -> GltfSource:
     file = GltfFile(path, name)
     unknown = [word for word in file.json.texts("extensionsRequired") if not _is_known(word)]
     if unknown:
+        words = ", ".join(brief(word) for word in unknown[:_SHOWN]) + (", ..." if len(unknown) > _SHOWN else "")
         raise InputError(
-            f"{name}: needs extensions that we do not know: {', '.join(brief(word) for word in unknown)}; "
-            "convert it with a program that knows them"
+            f"{name}: needs extensions that we do not know: {words}; convert it with a program that knows them"
         )
     return splats_of(file, _unpack_spz)
 
@@ -120,6 +124,7 @@ class _Reader:
                 continue
             move = Move(shown.matrix)
             parts += [(part, move) for part in splats]
+            self._check_parts(len(parts))
             rows += sum(part.count for part in splats)
             held = self.file.size + sum(source.held_bytes for source in self.spz)
             if rows > _ROWS_PER_BYTE * held:
@@ -133,7 +138,8 @@ class _Reader:
             self.notes["animations left out"] = None
         held = self.file.held_bytes + sum(source.held_bytes for source in self.spz)
         source = GltfSource(self.file.name, parts, held)
-        source.notes = tuple(self.notes)
+        more = len(self.notes) - _SHOWN
+        source.notes = (*list(self.notes)[:_SHOWN], *((f"{more} further notes left out",) if more > 0 else ()))
         source.file_bytes = self.file.size
         marks = [bool(source.settings.get("antialiased")) for source in self.spz]
         if marks and all(marks) and not self.attributes:
@@ -169,7 +175,15 @@ class _Reader:
             splats: Splats = self._spz(primitive, spz) if spz is not None else self._attributes(primitive)
             if splats.count:
                 found.append(splats)
+                self._check_parts(len(found))
         return found
+
+    def _check_parts(self, parts: int) -> None:
+        if parts > _MOST_PARTS:
+            raise FormatError(
+                f"{self.file.name}: expected splats that are shown at most {_MOST_PARTS} times, in all meshes and nodes, "
+                "found more; join them"
+            )
 
     def _check_node(self, index: int) -> None:
         node = self.json.item("nodes", index, "nodes")

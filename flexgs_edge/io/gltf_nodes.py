@@ -87,15 +87,16 @@ def _local_matrix(node: Record) -> np.ndarray:
         matrix = node.numbers("matrix", tuple(np.eye(4).ravel())).reshape(4, 4).T
         matrix[3] = (0, 0, 0, 1)
         return matrix
-    move, scale = node.numbers("translation", (0, 0, 0)), node.numbers("scale", (1, 1, 1))
-    x, y, z, w = node.numbers("rotation", (0, 0, 0, 1))
-    quat = np.array([w, x, y, z])
-    largest = np.abs(quat).max()
-    if largest == 0:
-        raise node.fail("rotation", "a quaternion that is not zero", quat.tolist())
     matrix = np.eye(4)
-    matrix[:3, :3] = matrices((quat / largest)[:, None])[0] * scale
-    matrix[:3, 3] = move
+    if "rotation" in node:
+        x, y, z, w = node.numbers("rotation", (0, 0, 0, 1))
+        quat = np.array([w, x, y, z])
+        largest = np.abs(quat).max()
+        if largest == 0:
+            raise node.fail("rotation", "a quaternion that is not zero", quat.tolist())
+        matrix[:3, :3] = matrices((quat / largest)[:, None])[0]
+    matrix[:3, :3] *= node.numbers("scale", (1, 1, 1))
+    matrix[:3, 3] = node.numbers("translation", (0, 0, 0))
     return matrix
 
 

@@ -31,6 +31,8 @@ from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
 BLOCK_ROWS = 4096
 """Rows read at a time: 1 MB at SH degree 3, so that gathering stays in the processor's cache."""
+_BLOCK_BYTES = 1 << 22
+"""Most bytes of these rows: a file may have any number of properties."""
 _SPAN = 4
 """A list of rows is read as one span of the file if the span has at most this many rows for each wanted one."""
 _GAP = 64
@@ -208,7 +210,7 @@ class _FileRows:
     def __init__(self, path: Path, header: PlyHeader, stamp: tuple[int, int, int], block_rows: int) -> None:
         self.path, self.name, self.stamp = path, header.name, stamp
         self.offset, self.dtype = header.vertex_offset, header.vertex_dtype
-        self.block_rows = block_rows
+        self.block_rows = max(1, min(block_rows, _BLOCK_BYTES // self.dtype.itemsize))
 
     def blocks(self, rows: Rows) -> Iterator[tuple[slice, np.ndarray]]:
         size = rows.stop - rows.start if isinstance(rows, slice) else len(rows)

@@ -8,7 +8,7 @@ from typing import BinaryIO
 import numpy as np
 
 from flexgs_edge.constants import MAX_SH_DEGREE
-from flexgs_edge.errors import FormatError
+from flexgs_edge.errors import FormatError, brief
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
 from flexgs_edge.scene.source import REST_WIDTHS
 
@@ -33,11 +33,14 @@ _TYPES = {
 _NAMES = {kind: name for name, kind in reversed(_TYPES.items())}
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 1 << 20
-"""Most bytes of a header; those of scenes have 2 kB. A file without `end_header` is not read further."""
+_MOST_LINES = 1 << 13
+"""Most bytes and lines of a header; those of scenes have 2 kB in a hundred lines. What comes later is not looked at."""
 _SILENT = ("nx", "ny", "nz")
 """Properties of INRIA's layout without content (normals)."""
 RGB = ("red", "green", "blue")
 """8-bit colours, which nerfstudio's export has in place of `f_dc` with `--ply-color-mode rgb`."""
+_SHOWN = 8
+"""Most names in a message."""
 PROGRAM = "flexgs-edge"
 """First word of our comments."""
 SMOOTHING = "filter_3D"
@@ -111,7 +114,7 @@ class PlyHeader:
         for element in self.elements:
             if element.name == "vertex":
                 return element
-        names = ", ".join(element.name for element in self.elements) or "none"
+        names = _list([element.name for element in self.elements]) or "none"
         raise FormatError(f"{self.name}: no element 'vertex'; found {names}")
 
     @property
@@ -161,12 +164,14 @@ class PlyHeader:
         """
         for element in self.elements:
             if element.count and not element.properties:
-                raise FormatError(f"{self.name}: element {element.name!r} has {element.count} rows without properties")
+                raise FormatError(
+                    f"{self.name}: element {brief(element.name)} has {element.count} rows without properties"
+                )
         # In ascii, a value takes at least one character and a separator; the last value may lack the separator.
         exact = bool(self.order) and all(element.scalar for element in self.elements)
         least = sum(e.count * (e.row_size if self.order else 2 * len(e.properties)) for e in self.elements)
         found = size - self.data_offset
-        claims = ", ".join(f"{e.count} x {e.name}" for e in self.elements)
+        claims = _list([f"{e.count} x {e.name}" for e in self.elements])
         if found + (not self.order) < least:
             promised = f"{'' if exact else 'at least '}{least} bytes"
             raise FormatError(
@@ -185,6 +190,7 @@ def read_header(name: str, file: BinaryIO) -> PlyHeader:
         If the header breaks the format; the message names the line and what was expected there.
     """
     number, order, elements, comments, antialiased = 0, None, list[Element](), list[str](), None
+    names: set[tuple[str, ...]] = set()
     while True:
         number += 1
         raw = file.readline(_HEADER_LIMIT + 1 - min(file.tell(), _HEADER_LIMIT))
@@ -193,25 +199,27 @@ def read_header(name: str, file: BinaryIO) -> PlyHeader:
         if number == 1:
             if raw.rstrip(b"\r\n") != b"ply":
                 raise FormatError(f"{name}: not a PLY file: expected 'ply' in the first line, found {raw[:16]!r}")
-        elif not raw.endswith(b"\n"):
-            raise FormatError(f"{name}: the header has no 'end_header' line (looked at {file.tell()} bytes)")
+        elif not raw.endswith(b"\n") or number > _MOST_LINES:
+            looked = f"{file.tell()} bytes, {number} lines"
+            raise FormatError(f"{name}: the header has no 'end_header' line (looked at {looked})")
         elif words[:1] == ["end_header"]:
             break
         elif words[:1] == ["format"]:
             order = _format(place, words, order)
         elif words[:1] == ["element"]:
-            elements.append(_element(place, words, elements))
+            elements.append(_element(place, words, names))
         elif words[:1] == ["property"]:
             if not elements:
                 raise FormatError(f"{place}: a property before any element")
-            elements[-1].properties.append(_property(place, words, elements[-1]))
+            elements[-1].properties.append(_property(place, words, elements[-1].name, names))
         elif words[:2] == ["comment", PROGRAM]:
             comments.append(" ".join(words[1:]))
         elif words[:1] == ["comment"]:
             said = _antialiased(words[1:])
             antialiased = antialiased if said is None else said
         elif words and words[0] != "obj_info":
-            raise FormatError(f"{place}: expected format, element, property, comment or end_header, found {words[0]!r}")
+            found = brief(words[0])
+            raise FormatError(f"{place}: expected format, element, property, comment or end_header, found {found}")
     if order is None:
         raise FormatError(f"{name}: the header has no 'format' line; expected one of {', '.join(_FORMATS)}")
     return PlyHeader(name, order, elements, file.tell(), tuple(comments), antialiased)
@@ -236,33 +244,37 @@ def _format(place: str, words: list[str], order: str | None) -> str:
         raise FormatError(f"{place}: a second 'format' line")
     if len(words) != 3 or words[1] not in _FORMATS or words[2] != "1.0":
         raise FormatError(
-            f"{place}: expected 'format' and one of {', '.join(_FORMATS)}, 1.0; found {' '.join(words)!r}"
+            f"{place}: expected 'format' and one of {', '.join(_FORMATS)}, 1.0; found {' '.join(words)[:80]!r}"
         )
     return _FORMATS[words[1]]
 
 
-def _element(place: str, words: list[str], elements: list[Element]) -> Element:
+def _element(place: str, words: list[str], names: set[tuple[str, ...]]) -> Element:
     if len(words) != 3 or not (words[2].isascii() and words[2].isdigit()) or len(words[2]) > 18:
         raise FormatError(f"{place}: expected 'element NAME COUNT', found {' '.join(words)[:80]!r}")
-    if any(element.name == words[1] for element in elements):
-        raise FormatError(f"{place}: a second element {words[1]!r}")
+    _add(names, (words[1],), f"{place}: a second element {brief(words[1])}")
     return Element(words[1], int(words[2]))
 
 
-def _property(place: str, words: list[str], element: Element) -> Property:
+def _property(place: str, words: list[str], element: str, names: set[tuple[str, ...]]) -> Property:
     types = words[2:4] if words[1:2] == ["list"] else words[1:2]
     if len(words) != len(types) + (3 if words[1:2] == ["list"] else 2):
         raise FormatError(f"{place}: expected 'property TYPE NAME', found {' '.join(words)[:80]!r}")
     for name in types:
         if name not in _TYPES:
-            raise FormatError(f"{place}: unknown type {name!r}; expected one of {', '.join(_TYPES)}")
-    if any(p.name == words[-1] for p in element.properties):
-        raise FormatError(f"{place}: a second property {words[-1]!r} in element {element.name!r}")
+            raise FormatError(f"{place}: unknown type {brief(name)}; expected one of {', '.join(_TYPES)}")
+    _add(names, (element, words[-1]), f"{place}: a second property {brief(words[-1])} in element {brief(element)}")
     if len(types) == 2:
         if _TYPES[types[0]].startswith("f"):
             raise FormatError(f"{place}: a list's length has type {types[0]!r}; expected an integer type")
         return Property(words[-1], _TYPES[types[1]], _TYPES[types[0]])
     return Property(words[-1], _TYPES[types[0]])
+
+
+def _add(names: set[tuple[str, ...]], name: tuple[str, ...], twice: str) -> None:
+    if name in names:
+        raise FormatError(twice)
+    names.add(name)
 
 
 def gaussian_layout(header: PlyHeader) -> tuple[int, tuple[str, ...]]:
@@ -296,8 +308,13 @@ def gaussian_layout(header: PlyHeader) -> tuple[int, tuple[str, ...]]:
         notes.append(
             f"{SMOOTHING} applied to scales and opacities (Mip-Splatting; it dilates by 0.1 px^2, here it is 0.3)"
         )
-    notes += [f"element {e.name!r} left out ({e.count} rows)" for e in header.elements if e is not vertex]
-    return degree, tuple(notes)
+    return degree, (*notes, *left_out([element for element in header.elements if element is not vertex]))
+
+
+def left_out(elements: list[Element]) -> list[str]:
+    """Notes on elements that are not read."""
+    notes = [f"element {brief(element.name)} left out ({element.count} rows)" for element in elements[:_SHOWN]]
+    return notes + ([f"{len(elements) - _SHOWN} further elements left out"] if len(elements) > _SHOWN else [])
 
 
 def colour_names(header: PlyHeader) -> tuple[str, ...]:
@@ -320,6 +337,6 @@ def _sh_degree(name: str, by_name: dict[str, Property]) -> int:
     return REST_WIDTHS[found]
 
 
-def _list(names: list[str], shown: int = 8) -> str:
-    more = f" and {len(names) - shown} more" if len(names) > shown else ""
-    return ", ".join(names[:shown]) + more
+def _list(names: list[str]) -> str:
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(name[:80] for name in names[:_SHOWN]) + more

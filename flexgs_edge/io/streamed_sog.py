@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -53,9 +54,8 @@ def read_streamed_sog(path: Path, name: str, reading: Reading) -> StreamedSource
     levels = top.integer("lodLevels", 1, _MOST_LEVELS)
     files = top.names("filenames")
     ranges = _ranges(top, levels, len(files))
-    used = {part.file for level in ranges for part in level}
-    here = {file: is_there(path.parent, files[file], name) for file in used}
-    missing = [next((files[part.file] for part in level if not here[part.file]), None) for level in ranges]
+    here = cache(lambda file: is_there(path.parent, files[file], name))
+    missing = [next((files[part.file] for part in level if not here(part.file)), None) for level in ranges]
     level, notes = _chosen(reading.lod, [bool(level) for level in ranges], missing, name)
     scenes = {file: _open(path.parent, files[file], name) for file in sorted({part.file for part in ranges[level]})}
     _check_ranges(top, ranges[level], scenes, files)
