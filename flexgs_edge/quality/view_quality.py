@@ -110,13 +110,10 @@ class ViewQuality:
 
     @property
     def ssim_loss(self) -> float | None:
-        """The SSIM lost that counts, as `loss`; at least 0."""
-        if self.original_ssim is None or self.ssim_photo is None or self.ssim_original is None:
+        """SSIM lost against the photo, at least 0: a view that gains allows no more loss elsewhere; `None` without a photo."""
+        if self.original_ssim is None or self.ssim_photo is None:
             return None
-        modelled = self.far_base is not None
-        return (
-            modelled_ssim_drop(1.0 - self.ssim_original) if modelled else max(self.original_ssim - self.ssim_photo, 0.0)
-        )
+        return max(self.original_ssim - self.ssim_photo, 0.0)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from flexgs_edge.goals.promise import (
     MeanSsim,
     Promised,
     WorstView,
-    breaks_a_view,
     in_the_way,
     kept_promise,
     promised,
@@ -62,15 +61,6 @@ def test_shares_are_what_was_measured_over_what_is_allowed() -> None:
         assert PARTS[0].excess(found) == pytest.approx(math.log(1.3 / 1.7))
     kept = kept_promise(Promised(MaxDrop(1.0), PARTS), 1, GOOD)
     assert kept is not None and kept.share == pytest.approx(0.8) and kept.parts[0].share == pytest.approx(1.3 / 1.7)
-
-
-def test_a_view_breaks_where_its_bound_is_missed() -> None:
-    target = Promised(MaxDrop(1.0), PARTS)
-    for worst, breaks in ((1.0, False), (1.69, False), (1.71, True)):
-        found = Measurement(1.0, 40.0, 1.0, worst=Measurement(worst, 38.0, worst), usual=1.0)
-        assert breaks_a_view(target, found) is breaks
-        assert not breaks_a_view(MaxDrop(1.0), found)
-        assert not breaks_a_view(Promised(MaxDrop(1.0), PARTS[1:]), found)
 
 
 def test_what_was_not_measured_does_not_decide() -> None:
