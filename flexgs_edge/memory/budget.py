@@ -18,6 +18,9 @@ from flexgs_edge.units import format_mib
 
 LARGE = 2**20
 """A stage that takes so many bytes or more has the heaps of this process checked."""
+ROOM = 8 << 20
+"""Spare bytes of a limit that an error names. Pages of libraries, heaps of threads and the compiler take some MiB more in one run
+than in the next, mostly on a busy machine: docs/results/tuning.md#foresight"""
 
 
 @dataclass
@@ -83,10 +86,10 @@ class MemoryBudget:
             if size > self.free:
                 reclaim(size - self.free)
         if size > self.free:
-            enough = max(self.used + size, 0 if self.foreseen is None else self.foreseen())
+            enough = max(self.used + size, 0 if self.foreseen is None else self.foreseen()) + ROOM
             held = format_mib(self.used)
             found = f"needs {format_mib(size)} beside the {held} already held" if size else f"already holds {held}"
-            counted = ", which counts later stages too" if enough > self.used + size else ""
+            counted = ", which counts later stages too" if enough > self.used + size + ROOM else ""
             raise BudgetError(
                 f"{stage} {found}, but the memory limit is {format_mib(self.limit)}: "
                 f"use --memory-limit {format_mib(enough)} or more{counted}"

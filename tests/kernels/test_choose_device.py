@@ -218,23 +218,29 @@ SLOW = """__kernel void slow(__global const float *given, __global float *seen) 
   for (uint k = 0; k < 20000000; ++k) busy += 1.0f;
   seen[0] = given[0];
 }"""
+TRIES = 5
+"""On a busy machine the host may lie idle while a kernel runs, as if it waited."""
 
 
 def test_small_writes_do_not_wait(session: Session) -> None:
     """Kernels before a write see the old values, those after it the new ones, whatever becomes of the host's array."""
     given, seen = session.array((4,), np.float32), session.array((4,), np.float32)
     kernel = session.kernel(SLOW, "slow", (), "bb")
-    values = np.full(4, 1, np.float32)
-    session.write(given, values)
-    start = time.perf_counter()
-    session.launch("slow", kernel, (1,), (1,), (given, seen))
-    values[:] = 2
-    session.write(given, values)
-    values[:] = 3
-    behind = time.perf_counter() - start
-    assert session.read(seen, np.empty(1, np.float32)) == [1]
-    assert behind < (time.perf_counter() - start) / 2
-    assert (session.read(given) == 2).all()
+    for _ in range(TRIES):
+        values = np.full(4, 1, np.float32)
+        session.write(given, values)
+        start = time.perf_counter()
+        session.launch("slow", kernel, (1,), (1,), (given, seen))
+        values[:] = 2
+        session.write(given, values)
+        values[:] = 3
+        behind = time.perf_counter() - start
+        assert session.read(seen, np.empty(1, np.float32)) == [1]
+        early = behind < (time.perf_counter() - start) / 2
+        assert (session.read(given) == 2).all()
+        if early:
+            break
+    assert early
     # Another write to the same array comes after it, and so do values that are mapped.
     session.launch("slow", kernel, (1,), (1,), (given, seen))
     session.write(given, values)
@@ -259,13 +265,18 @@ def test_values_that_stay_are_not_waited_for(session: Session, waits: bool, monk
     given, seen = session.array((SMALL_WRITE // 4 + 1,), np.float32), session.array((1,), np.float32)
     kernel = session.kernel(SLOW, "slow", (), "bb")
     session.write(given, np.full(given.shape, 1, np.float32))
-    start = time.perf_counter()
-    session.launch("slow", kernel, (1,), (1,), (given, seen))
-    session.write(given, np.full(given.shape, 2, np.float32), stays=True)
-    early = session.read(seen, waits=False)
-    behind = time.perf_counter() - start
-    assert (session.read(given) == 2).all() and early == [1]
-    assert (behind > (time.perf_counter() - start) / 2) == waits
+    for _ in range(TRIES):
+        session.write(given, np.full(given.shape, 1, np.float32))
+        start = time.perf_counter()
+        session.launch("slow", kernel, (1,), (1,), (given, seen))
+        session.write(given, np.full(given.shape, 2, np.float32), stays=True)
+        found = session.read(seen, waits=False)
+        behind = time.perf_counter() - start
+        assert (session.read(given) == 2).all() and found == [1]
+        waited = behind > (time.perf_counter() - start) / 2
+        if waited == waits:
+            break
+    assert waited == waits
     given.release()
     seen.release()
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels.backend import TwinBackend
-from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.memory.budget import ROOM, MemoryBudget
 from flexgs_edge.memory.process import available_memory, current_rss, peak_rss
 from flexgs_edge.units import format_mib, format_size, parse_size
 
@@ -89,7 +89,7 @@ def test_rows_always_fit(limit: int, used: int, per_row: int, fixed: int, minimu
     except BudgetError as error:
         named = re.search(r"use --memory-limit (\S+) or more", str(error))
         assert named
-        enough = MemoryBudget(parse_size(named.group(1)), used)
+        enough = MemoryBudget(parse_size(named.group(1)) - ROOM, used)
         assert enough.rows("a stage", per_row, fixed, minimum) >= minimum
         assert budget.free < fixed + minimum * per_row
     else:
@@ -105,7 +105,7 @@ def test_require_says_what_and_how_much() -> None:
         "scoring needs 201MiB",
         "100MiB already held",
         "limit is 300MiB",
-        "use --memory-limit 301MiB or more",
+        "use --memory-limit 309MiB or more",  # and 8 MiB for what varies
     ):
         assert words in str(caught.value)
 
@@ -115,9 +115,9 @@ def test_errors_name_what_is_foreseen() -> None:
     budget.foreseen = lambda: 400 * 2**20
     budget.require("scoring", 200 * 2**20)
     for size, words in (
-        (201, "use --memory-limit 400MiB or more, which counts later stages too"),
-        (300, "use --memory-limit 400MiB or more"),
-        (301, "use --memory-limit 401MiB or more"),
+        (201, "use --memory-limit 408MiB or more, which counts later stages too"),
+        (300, "use --memory-limit 408MiB or more"),
+        (301, "use --memory-limit 409MiB or more"),
     ):
         with pytest.raises(BudgetError) as caught:
             budget.require("scoring", size * 2**20)
@@ -128,7 +128,7 @@ def test_what_is_held_already_is_found_by_the_next_stage() -> None:
     budget = MemoryBudget(300 * 2**20, 100 * 2**20)
     budget.hold(201 * 2**20)
     with pytest.raises(
-        BudgetError, match=r"the program already holds 301MiB, .* 300MiB: use --memory-limit 301MiB or more$"
+        BudgetError, match=r"the program already holds 301MiB, .* 300MiB: use --memory-limit 309MiB or more$"
     ):
         budget.require("the program", 0)
 
