@@ -106,6 +106,8 @@ def test_json_has_every_documented_key_and_no_infinity(done: tuple[Path, Compres
     assert list(record["run"]["stages"]) == [
         "open",
         "device",
+        "check views",
+        "fingerprint",
         "load",
         "references",
         "score",
@@ -249,7 +251,7 @@ def test_cameras_of_other_programs_beside_the_scene(tmp_path: Path, project: Pat
     lens = {"w": WIDTH, "h": HEIGHT, "fl_x": 40.0, "fl_y": 40.0, "cx": WIDTH / 2, "cy": HEIGHT / 2}
     pose = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, -5], [0, 0, 0, 1]]
     frames = [{"file_path": f"images/v{i:02}.png", "transform_matrix": pose} for i in range(VIEWS)]
-    rates: dict[str, Any] = {"method": "paper", "prune_rate": 0, "sh_rate": 0, "dry_run": True}
+    rates: dict[str, Any] = {"method": "paper", "prune_rate": 0, "sh_rate": 0, "dry_run": True, "trust_views": True}
     (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
     found = compress(scene, None, **rates).views
     assert found is not None and found.cameras == str(tmp_path / "transforms.json") and found.images is not None
