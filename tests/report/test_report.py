@@ -216,7 +216,7 @@ def hand_made(name: str, **changes: Any) -> tuple[CompressResult, Material]:
     result = CompressResult(
         scene, views, name, 100, 7, 3, 0.3, 0.4, "paper", name, "test", {"xyz": 16}, {"xyz": 1}, None, f"drop <= {name}",
         "drop", True, "held-out", SearchResult(steps[1], True, steps), (), Quality((ViewQuality(name, 1e-3, 2e-3, 1e-3),)),
-        "held-out", name, None, False, RUN,
+        "held-out", None, False, RUN,
     )  # fmt: skip
     shot = Shot(0, 0, 0, 1, 4, 3, b"a", b"b", b"c", b"f", b"d")
     eye = np.eye(3)[None].repeat(2, axis=0)
