@@ -194,7 +194,9 @@ def test_a_scene_behind_its_cameras(project: Path) -> None:
     assert words.startswith("100 % of the Gaussians lie behind all 1 cameras of cameras.json")
     assert "read as RUB" in words and "--frame RDF" in words
     assert frame_doubts(views(ahead, back), wrong) == ()
-    assert frame_doubts(views(ahead), replace(wrong, frame=load_scene(project / "rub.ply").frame)) == ()
+    assert "lie behind" not in " ".join(
+        frame_doubts(views(ahead), replace(wrong, frame=load_scene(project / "rub.ply").frame))
+    )
     assert frame_doubts(replace(views(ahead), cameras_from="auto"), wrong) == ()
     right = load_scene(project / "point_cloud.ply")
     assert frame_doubts(views(ahead), replace(right, frame=RUB)) == ()

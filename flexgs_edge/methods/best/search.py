@@ -26,7 +26,8 @@ Product = TypeVar("Product")
 """Type of the product of a candidate: a grid, or a finished file."""
 
 MOST, MOST_TRIED = 4, 6
-"""Most candidates, and most of them with those that lost Gaussians; while none holds, the second is the limit of both."""
+"""Most candidates, and most of them with those that lost Gaussians; while none holds, and of a size, the second is the limit
+of both."""
 PROBES = 4
 """Most probes before the first candidate."""
 AIM, FARTHER = -0.01, 0.05
@@ -177,7 +178,7 @@ def search(
             else:
                 maker.discard(product)
             close = best[0].holds and best[0].excess > -(CLOSE_SIZE if by_size else maker.close)
-            if close or len(steps) >= (most if best[0].holds else MOST_TRIED):
+            if close or len(steps) >= (most if best[0].holds and not by_size else MOST_TRIED):
                 break
             lost = [] if best[0].holds else lost_views(target, step.measurement)
             seen = bool(lost) and maker.see(lost)

@@ -89,7 +89,7 @@ def test_finished_files_fit(project: Path, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     limit = 6000 if suffix == ".spz" else 7500
     result = compress(project / "point_cloud.ply", path, max_size=limit, **FAST)
-    assert result.reached and 0.75 * limit < path.stat().st_size <= limit and result.size == path.stat().st_size
+    assert result.reached and 0.7 * limit < path.stat().st_size <= limit and result.size == path.stat().st_size
 
 
 def test_max_refits_more_where_nothing_descends(project: Path, tmp_path: Path) -> None:
