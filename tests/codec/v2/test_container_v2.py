@@ -187,7 +187,7 @@ def test_only_touched_chunks_are_decoded(tmp_path: Path) -> None:
 
 
 def test_a_scene_far_from_zero_is_decoded_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From file to PLY: the check of values has nothing to find in a grid. Far from zero, floats must first be known to hold it."""
+    """The check of values has nothing to find in a grid, but floats must first be known to hold the positions."""
     path = tmp_path / "a.fgs"
     write_grid(path, make_grid(300, 1), {}, chunk_rows=100)
     decoded: list[str] = []
