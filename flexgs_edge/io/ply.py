@@ -350,7 +350,8 @@ def write_ply(
     BudgetError
         If the disk is full.
     """
-    wide = bool(np.any(source.origin != 0)) and not _floats_hold(source, chunk_rows)
+    # What lies on a grid of ours (`valid`) is not decoded a second time to find out.
+    wide = bool(np.any(source.origin != 0)) and (source.valid or not _floats_hold(source, chunk_rows))
     dtype = inria_dtype(source.sh_degree, wide)
     kinds = {"<f4": "float", "<f8": "double"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {source.count}"]
