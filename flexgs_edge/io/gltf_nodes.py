@@ -24,6 +24,9 @@ _SAME = 1e-6
 _STILL = 1e-12
 """Largest difference from the identity that is rounding alone."""
 
+_MOVES = {"matrix", "rotation", "scale", "translation"}
+"""Keys of a node that move it."""
+
 Reader = Callable[[str], np.ndarray]
 """Gives the values of a field before they are moved, [width, n] f64."""
 
@@ -64,7 +67,7 @@ def shown_meshes(file: Record) -> Iterator[Shown]:
             raise FormatError(f"{file.name}: {asker}: {node.place} has two parents; expected a tree of nodes")
         seen.add(index)
         with np.errstate(over="ignore", invalid="ignore"):
-            matrix = parent @ _local_matrix(node)
+            matrix = parent @ _local_matrix(node) if _MOVES & node.value.keys() else parent
         if not np.isfinite(matrix).all():
             raise FormatError(f"{file.name}: {node.place}: its transform goes beyond float64; expected finite numbers")
         if "mesh" in node:

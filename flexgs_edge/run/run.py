@@ -15,6 +15,7 @@ from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.companions import companions_of, merge_companions
 from flexgs_edge.run.doubts import frame_doubts
 from flexgs_edge.run.inputs import LOG, CheckedScene, Options, ScenePlace, load_scene, resolve_drawing
+from flexgs_edge.run.open_scene import is_fgs, scene_file
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.outputs import NO_OUTPUT, Output, check_output
 from flexgs_edge.run.plan import Plan
@@ -139,7 +140,9 @@ def open_run(
             options, views = near_enough(options, views)
         if reporter is not None and views is not None:
             reporter.see_cameras(views, scene)
-        found = () if views is None else frame_doubts(views, scene)
+        # A page shows a `.fgs` as it is: the browser decodes it, and we do not.
+        unread = not photos and scene.path is not None and is_fgs(scene_file(scene.path))
+        found = () if views is None or unread else frame_doubts(views, scene)
         for warning in found:
             LOG.warning("warning: %s", warning)
     return Run(options, scene, views, None, budget, clock, progress, reporter, judged=judged, doubts=found)

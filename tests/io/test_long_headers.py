@@ -27,8 +27,8 @@ from sog_files import meta_of, sog_bytes, write_folder, write_streamed
 from synthetic import make_camera
 
 MANY = 100_000
-SECONDS = 3.0
-"""Processor seconds of each; a third of it where nothing else runs. Looking through all entries for each takes minutes."""
+SECONDS = 10.0
+"""Processor seconds of each; about 1 on an idle machine without coverage. Looking through all entries for each takes minutes."""
 VIEWS = 5_000
 """Whole cameras are many checks each."""
 ROWS = random_rows(5)
