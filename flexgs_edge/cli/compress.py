@@ -168,6 +168,7 @@ Several scenes:
     help="Format of the files in a folder OUT/, such as .spz. Default: .fgs.",
 )
 @shared_options.spz_version_option
+@shared_options.positions_options
 @option(
     OUTPUT,
     "--layers",

@@ -43,6 +43,21 @@ spz_version_option = option(
     show_default=True,
     help="Version of a .spz. Older programs read only 3.",
 )
+positions_options = stack(
+    option(
+        OUTPUT,
+        "--recenter",
+        is_flag=True,
+        help="Other programs' formats: move a scene far from zero to zero, and write the offset beside the file "
+        "(OUT.offset.json).",
+    ),
+    option(
+        OUTPUT,
+        "--force-lossy",
+        is_flag=True,
+        help="Other programs' formats: write positions that the format cannot hold, rounded. Default: refuse.",
+    ),
+)
 cameras_option = stack(
     option(
         VIEWS,

@@ -50,7 +50,8 @@ class Writing:
     antialiased : bool
         The model is antialiased; formats that can say so, do.
     force_lossy : bool
-        Write positions far from zero also where their error is more than a tenth of the smallest splat.
+        Write a scene also where the format moves most Gaussians by more than their own size, and a scene far from zero
+        also where the error is more than a tenth of the smallest splat.
     """
 
     spz_version: int = 3

@@ -223,6 +223,10 @@ class CompressOptions(ViewOptions):
         effort says.
     spz_version : {3, 4}
         Version of a `.spz` that is written. Older programs read only 3. Default: 3.
+    recenter : bool
+        Move a scene that lies far from zero to zero, and write the offset beside the file (other programs' formats).
+    force_lossy : bool
+        Write a scene also where another program's format cannot hold its positions.
     layers : int, optional
         Write the file in 1 to 4 layers, between which `trim` can cut it (`best`). Default: 1.
     preview : int, optional
@@ -269,6 +273,8 @@ class CompressOptions(ViewOptions):
     refit: bool = True
     distil: int | None = None
     spz_version: int = 3
+    recenter: bool = False
+    force_lossy: bool = False
     layers: int | None = None
     preview: int | None = None
     scratch: str | None = None
@@ -348,7 +354,7 @@ class CompressOptions(ViewOptions):
     @property
     def writing(self) -> Writing:
         """How a file of another program's format is written."""
-        return Writing(self.spz_version, bool(self.antialiased))
+        return Writing(self.spz_version, bool(self.antialiased), self.force_lossy)
 
     @property
     def unseen_share(self) -> float:

@@ -6,8 +6,11 @@ import os
 from dataclasses import dataclass, replace
 from typing import Generic
 
+import numpy as np
+
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import Target
+from flexgs_edge.io.exchange import MovedSource, check_positions
 from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import SILENT, Progress
@@ -172,7 +175,29 @@ def open_compression(
     """
     place = check_output(output, options)
     reporter = Reporter.maybe(options.report, options.force)
-    return replace(planned(open_run(path, options, progress, reporter, given=given)), output=place)
+    run = replace(planned(open_run(path, options, progress, reporter, given=given)), output=place)
+    with run.clock.stage("open"):
+        return _positioned(run)
+
+
+def _positioned(run: Run[CompressOptions]) -> Run[CompressOptions]:
+    """The same run with a scene whose positions the format holds: moved to zero with its cameras, if the user asks for it."""
+    format, origin = run.output.format, run.source.origin
+    if format is None:
+        return run
+    if run.options.recenter and np.any(origin):
+        views = run.views
+        if views is not None:
+            moved = [
+                replace(camera, translation=camera.translation + camera.rotation @ origin) for camera in views.cameras
+            ]
+            views = replace(views, cameras=moved)
+        run = run.of_source(MovedSource(run.source, np.zeros(3)))
+        run = replace(run, views=views, output=replace(run.output, offset=origin))
+    warnings = check_positions(run.source, format, run.options.force_lossy)
+    for warning in warnings:
+        LOG.warning("warning: %s", warning)
+    return replace(run, doubts=(*run.doubts, *warnings))
 
 
 def _beside(place: ScenePlace) -> Companions:
