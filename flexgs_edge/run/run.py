@@ -105,6 +105,7 @@ def open_run(
     photos: bool = True,
     judged_path: ScenePlace | None = None,
     given: GivenViews | None = None,
+    decodes: bool = True,
 ) -> Run[Options]:
     """Open a scene with its views (stage `open`).
 
@@ -119,6 +120,8 @@ def open_run(
         used where this one has none.
     given : GivenViews, optional
         Cameras and photos from memory, instead of those that the options name.
+    decodes : bool
+        The command decodes a `.fgs`. If not, nothing is read of it here either.
 
     Raises
     ------
@@ -143,8 +146,7 @@ def open_run(
             options, views = near_enough(options, views)
         if reporter is not None and views is not None:
             reporter.see_cameras(views, scene)
-        # A page shows a `.fgs` as it is: the browser decodes it, and we do not.
-        unread = not photos and scene.path is not None and is_fgs(scene_file(scene.path))
+        unread = not decodes and scene.path is not None and is_fgs(scene_file(scene.path))
         found = () if views is None or unread else frame_doubts(views, scene)
         for warning in found:
             LOG.warning("warning: %s", warning)
