@@ -23,6 +23,8 @@ from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.rotations import normalize_quats
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
+_FINER = 10.0
+"""A scene is too far from zero for a format if its positions would be so many times finer at zero."""
 _FAR = 16.0
 """Rows further than so many median distances from the median centre are far."""
 
@@ -179,7 +181,7 @@ class Rounding:
 
 def rounding_of(source: SceneSource, format: Format, chunk_rows: int = 65536) -> Rounding:
     """What a format does to the positions of a scene. Raises `InputError` for coordinates beyond its reach."""
-    origin = np.zeros(3) if format.keeps_origin else source.origin
+    origin = np.zeros(3) if format.keeps_origin else np.asarray(source.origin)
     largest, beyond = np.zeros(3), 0
     for rows in source.chunks(chunk_rows):
         sizes = np.abs(source.read(rows, ["means"])["means"] + origin[:, None])
@@ -204,8 +206,8 @@ def rounding_of(source: SceneSource, format: Format, chunk_rows: int = 65536) ->
 def check_positions(source: SceneSource, format: Format, force_lossy: bool = False) -> tuple[str, ...]:
     """Refuse a scene whose positions a format cannot hold, and warn of Gaussians that it moves.
 
-    Of a scene far from zero, every position is held to a tenth of the smallest splat. Of others, most Gaussians move by
-    less than their own size.
+    Of a scene far from zero, every position is held to a tenth of the smallest splat, or nearly as well as at zero. Of
+    others, most Gaussians move by less than their own size.
 
     Returns
     -------
@@ -213,8 +215,8 @@ def check_positions(source: SceneSource, format: Format, force_lossy: bool = Fal
         Warnings: empty, or how many Gaussians move by more than their own size.
     """
     found = rounding_of(source, format)
-    far = bool(np.any(source.origin)) and not format.keeps_origin
-    if far and found.error > found.smallest / 10 and not force_lossy:
+    too_coarse = found.error > found.smallest / 10 and bool(np.any(source.origin)) and not force_lossy
+    if too_coarse and found.error > _FINER * rounding_of(MovedSource(source, np.zeros(3)), format).error:
         raise InputError(
             f"{source.name}: {format.suffix} holds these coordinates only to {found.error:.2g}, and the smallest splat "
             f"measures {found.smallest:.2g}: use --recenter, which writes the offset beside the file, write a .glb or a .fgs, "
