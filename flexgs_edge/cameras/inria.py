@@ -21,12 +21,8 @@ def read_inria(path: str | os.PathLike[str]) -> list[Camera]:
     The file has no principal point, so it is the middle of the image: (W - 1) / 2, with integer pixel centres.
     The reference program drops folders and what follows the first dot from names: equal ones get `#` and their place.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    FormatError
-        If it is not JSON, not a list, empty, or an entry is wrong; the message names file, entry and field.
+    Raises `InputError` if the file cannot be read. Raises `FormatError` if it is not JSON, not a list, empty, or an
+    entry is wrong; the message names file, entry and field.
     """
     path = Path(path)
     return cameras_of_list(path, load_json(path))

@@ -22,12 +22,7 @@ _SHOWN = 20
 def load_json(path: Path) -> Any:
     """Load the value of a JSON file.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    FormatError
-        If it is not JSON.
+    Raises `InputError` if the file cannot be read. Raises `FormatError` if it is not JSON.
     """
     try:
         return json.loads(path.read_bytes())
@@ -48,12 +43,7 @@ def kind(value: Any) -> str:
 class Entry:
     """One object of a file, with its place for messages; every method raises `FormatError`.
 
-    Parameters
-    ----------
-    place : str
-        Such as "cameras.json: camera 3".
-    entry : Any
-        Must be an object.
+    `place`: such as "cameras.json: camera 3". `entry`: must be an object.
     """
 
     def __init__(self, place: str, entry: Any) -> None:

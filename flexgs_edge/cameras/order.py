@@ -26,15 +26,8 @@ def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, c
     for every chosen camera that has it from a near direction: 1 / (1 + sum of max(0, 1 - (1 - cosine) / `SAME_VIEW`)).
     Ties go to the lower index.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-    points : np.ndarray
-        [3, n] f64, a sample of the scene's positions, world coordinates.
-    near : float
-        Near plane, scene units.
-    count : int
-        Most cameras to choose.
+    `points`: [3, n] f64, a sample of the scene's positions, world coordinates. `near`: near plane, scene units.
+    `count`: most cameras to choose.
     """
     if not cameras:
         return []

@@ -33,28 +33,15 @@ def find_cameras(folder: str | os.PathLike[str]) -> Path | None:
 
 def read_cameras(
     path: str | os.PathLike[str],
-    ignore_distortion: bool = False,
+    ignore_distortion: bool = False,  # take the poses of distorted lenses; such cameras cannot be compared with photos
     dataparser: str | os.PathLike[str] | None = None,
 ) -> list[Camera]:
     """Read cameras from a file or folder, sorted by name.
 
-    Parameters
-    ----------
-    path : path
-        INRIA's cameras.json, a transforms.json, a file of a COLMAP model, or a folder that holds one of these (a COLMAP
-        model also in its `sparse/0` or `colmap/sparse/0`).
-    ignore_distortion : bool, optional
-        Take the poses of distorted lenses; such cameras cannot be compared with photos.
-
-    dataparser : path, optional
-        nerfstudio's `dataparser_transforms.json`, for a transforms.json. Default: the one that is found.
-
-    Raises
-    ------
-    InputError
-        If the path is missing or of an unknown kind.
-    FormatError
-        If the file breaks its format.
+    `path`: INRIA's cameras.json, a transforms.json, a file of a COLMAP model, or a folder that holds one of these (a
+    COLMAP model also in its `sparse/0` or `colmap/sparse/0`). `dataparser`: nerfstudio's `dataparser_transforms.json`,
+    for a transforms.json. Default: the one that is found. Raises `InputError` if the path is missing or of an unknown
+    kind. Raises `FormatError` if the file breaks its format.
     """
     place = Path(path)
     if place.is_dir():

@@ -39,37 +39,17 @@ LOG = logging.getLogger("flexgs_edge")
 def compress(
     input: ScenePlace,
     output: str | os.PathLike[str] | None,
-    options: CompressOptions | None = None,
-    progress: Progress = SILENT,
-    given: GivenViews | None = None,
-    **words: Any,
+    options: CompressOptions | None = None,  # what the command line would say
+    progress: Progress = SILENT,  # bars on long work
+    given: GivenViews | None = None,  # cameras and photos from memory
+    **words: Any,  # single options by the names of `CompressOptions`, such as `max_drop=0.5`
 ) -> CompressResult:
     """Compress a scene to the fewest bytes that hold a target.
 
-    Parameters
-    ----------
-    input : path or CheckedScene
-        A scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`), INRIA's model folder, or a scene that is open.
-    output : path or None
-        The `.fgs`, `.spz`, `.sog` or `.compressed.ply` to write (None, for a `.fgs`, only in a dry run).
-    options : CompressOptions, optional
-        What the command line would say.
-    progress : Progress, optional
-        Bars on long work.
-    given : GivenViews, optional
-        Cameras and photos from memory.
-    **words
-        Single options by the names of `CompressOptions`, such as `max_drop=0.5`.
-
-    Returns
-    -------
-    CompressResult
-        Sizes, quality of the decoded file, every step of the search, times.
-
-    Raises
-    ------
-    FlexGSError
-        `InputError`, `TargetError`, `DeviceError` or `BudgetError`; nothing is left behind then.
+    `input`: a scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`), INRIA's model folder, or a scene that is
+    open. `output`: the `.fgs`, `.spz`, `.sog` or `.compressed.ply` to write (None, for a `.fgs`, only in a dry run).
+    Returns sizes, quality of the decoded file, every step of the search, times. Raises `FlexGSError`: `InputError`,
+    `TargetError`, `DeviceError` or `BudgetError`; nothing is left behind then.
     """
     options = replace(options or CompressOptions(), **words)
     if options.target_is_default:

@@ -35,37 +35,17 @@ PICTURE_BYTES = 48
 
 
 def render_views(
-    input: str | Path,
-    output: str | Path,
-    options: ViewOptions | None = None,
-    views: Sequence[int] | None = None,
-    force: bool = False,
-    progress: Progress = SILENT,
-    **words: Any,
+    input: str | Path,  # a scene file or a model folder
+    output: str | Path,  # folder for the files; created if it does not exist
+    options: ViewOptions | None = None,  # options as on the command line
+    views: Sequence[int] | None = None,  # Indices of the views to draw, in order of name. Default: all views.
+    force: bool = False,  # Overwrite existing files. Default: raise `InputError`.
+    progress: Progress = SILENT,  # shows a bar
+    **words: Any,  # single options, by the names of `ViewOptions`
 ) -> RenderResult:
     """Draw views of a scene as PNG files, `<view name>.png`, with 8 bits per channel.
 
-    Parameters
-    ----------
-    input : path
-        A scene file or a model folder.
-    output : path
-        Folder for the files; created if it does not exist.
-    options : ViewOptions, optional
-        Options as on the command line.
-    views : sequence of int, optional
-        Indices of the views to draw, in order of name. Default: all views.
-    force : bool
-        Overwrite existing files. Default: raise `InputError`.
-    progress : Progress, optional
-        Shows a bar.
-    **words
-        Single options, by the names of `ViewOptions`.
-
-    Returns
-    -------
-    RenderResult
-        Files, and the time of each view.
+    Returns files, and the time of each view.
     """
     options = replace(options or ViewOptions(), **words)
     run = open_run(input, options, progress, photos=False)

@@ -25,38 +25,18 @@ from flexgs_edge.run.view_set import views_info
 
 
 def score_gaussians(
-    input: str | Path,
+    input: str | Path,  # a scene file or a model folder
     output: str | Path,
-    options: ViewOptions | None = None,
-    score: str = "gs",
-    force: bool = False,
-    progress: Progress = SILENT,
-    **words: Any,
+    options: ViewOptions | None = None,  # options as on the command line
+    score: str = "gs",  # The score to compute. Default: `gs`.
+    force: bool = False,  # Overwrite `output` if it exists. Default: raise `InputError`.
+    progress: Progress = SILENT,  # shows a bar
+    **words: Any,  # single options, by the names of `ViewOptions`
 ) -> ScoreResult:
     """Score every Gaussian over the training views, and save the scores.
 
-    Parameters
-    ----------
-    input : path
-        A scene file or a model folder.
-    output : path
-        The `.npz` file to write, as `score_cache` reads it: `scores` [N] f64, logarithms of the scores, -inf for Gaussians
-        that no view sees, and a fingerprint of what they depend on.
-    options : ViewOptions, optional
-        Options as on the command line.
-    score : {"gs", "meson"}
-        The score to compute. Default: `gs`.
-    force : bool
-        Overwrite `output` if it exists. Default: raise `InputError`.
-    progress : Progress, optional
-        Shows a bar.
-    **words
-        Single options, by the names of `ViewOptions`.
-
-    Returns
-    -------
-    ScoreResult
-        What was scored, times and memory.
+    `output`: the `.npz` file to write, as `score_cache` reads it: `scores` [N] f64, logarithms of the scores, -inf for
+    Gaussians that no view sees, and a fingerprint of what they depend on. Returns what was scored, times and memory.
     """
     options = replace(options or ViewOptions(), **words)
     if score not in SCORES:

@@ -9,18 +9,10 @@ from flexgs_edge.errors import InputError
 
 @dataclass(frozen=True, order=True)
 class Choice:
-    """How much to prune, in thousandths of the N rows.
+    """How much to prune, in thousandths of the N rows."""
 
-    Parameters
-    ----------
-    prune : int
-        Share of the rows that is removed (the paper's p).
-    sh : int
-        Share of the rows that loses its SH above degree 0 (the paper's s).
-    """
-
-    prune: int
-    sh: int
+    prune: int  # share of the rows that is removed (the paper's p)
+    sh: int  # share of the rows that loses its SH above degree 0 (the paper's s)
 
     def __post_init__(self) -> None:
         if self.prune < 0 or self.sh < 0 or self.prune + self.sh > 1000:

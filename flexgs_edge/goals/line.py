@@ -14,16 +14,10 @@ smooth."""
 def next_point(points: Iterable[tuple[float, float]], slope: float, stride: float, least: float = 0.2) -> float:
     """Position where the excess should be just below zero: false position, kept away from measured points.
 
-    Parameters
-    ----------
-    points : iterable of tuple
-        (position, excess) of the measured points, at least one.
-    slope : float
-        Excess per position, used before two points are measured. Its sign must be right.
-    stride : float
-        Largest move beyond all points; twice that once a slope has been measured.
-    least : float
-        A measured slope counts as at least this share of `slope`. Points that differ by chance have no slope of their own.
+    `points`: (position, excess) of the measured points, at least one. `slope`: excess per position, used before two
+    points are measured. Its sign must be right. `stride`: largest move beyond all points; twice that once a slope has
+    been measured. `least`: a measured slope counts as at least this share of `slope`. Points that differ by chance have
+    no slope of their own.
 
     >>> round(next_point([(0.0, -1.0), (1.0, 1.0)], 2.0, 1.0), 3)
     0.495

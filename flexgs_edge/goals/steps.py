@@ -19,32 +19,15 @@ REFINE_STEPS = {"fast": 4, "balanced": 10, "max": 32}
 
 @dataclass(frozen=True)
 class Step:
-    """One point of a search.
+    """One point of a search."""
 
-    Parameters
-    ----------
-    choice : Choice
-        Prune rate and SH rate, in thousandths.
-    size : int
-        Exact bytes of the file.
-    measurement : Measurement or None
-        Quality; `None` if size alone decided.
-    excess : float
-        By how much the point misses the target; zero or less holds.
-    phase : {"list", "refine", "confirm", "fixed", "multiplier"}
-        Part of the search that asked for the point.
-    seconds : float
-        Wall time of the measurement.
-    estimated : bool
-        `measurement` comes from a part of the pixels, and `excess` is an estimate for all of them.
-    """
-
-    choice: Choice
-    size: int
-    measurement: Measurement | None
-    excess: float
-    phase: Phase
-    seconds: float
+    choice: Choice  # prune rate and SH rate, in thousandths
+    size: int  # exact bytes of the file
+    measurement: Measurement | None  # quality; `None` if size alone decided
+    excess: float  # by how much the point misses the target; zero or less holds
+    phase: Phase  # part of the search that asked for the point
+    seconds: float  # wall time of the measurement
+    # `measurement` comes from a part of the pixels, and `excess` is an estimate for all of them.
     estimated: bool = False
 
     @property
@@ -55,43 +38,21 @@ class Step:
 
 @dataclass(frozen=True)
 class Scored:
-    """The camera poses that a search by measured costs has scored.
+    """The camera poses that a search by measured costs has scored."""
 
-    Parameters
-    ----------
-    poses : int
-        Scored poses.
-    made : int
-        Generated poses among them (`--views-margin`).
-    unseen : int
-        Gaussians that could show, but that no scored pose sees.
-    """
-
-    poses: int
-    made: int
-    unseen: int
+    poses: int  # scored poses
+    made: int  # generated poses among them (`--views-margin`)
+    unseen: int  # Gaussians that could show, but that no scored pose sees
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The answer of a search, and the points on the way to it.
+    """The answer of a search, and the points on the way to it."""
 
-    Parameters
-    ----------
-    chosen : Step
-        The point to write.
-    reached : bool
-        The target holds at `chosen`; only `--best-effort` accepts a point that misses.
-    steps : tuple of Step
-        All points, in order.
-    scored : Scored or None
-        The poses behind the scores; `None` for searches that are given scores.
-    """
-
-    chosen: Step
-    reached: bool
-    steps: tuple[Step, ...]
-    scored: Scored | None = None
+    chosen: Step  # the point to write
+    reached: bool  # the target holds at `chosen`; only `--best-effort` accepts a point that misses
+    steps: tuple[Step, ...]  # all points, in order
+    scored: Scored | None = None  # the poses behind the scores; `None` for searches that are given scores
 
 
 class Point(Protocol):

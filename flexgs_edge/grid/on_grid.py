@@ -42,19 +42,8 @@ def steps_of(comments: Sequence[str]) -> StepSizes | None:
 def on_grid(planes: Planes, steps: StepSizes, origin: np.ndarray) -> GridScene | None:
     """Put values on a grid, but only if each of them lies on it to the bit; the grid then loses nothing.
 
-    Parameters
-    ----------
-    planes : mapping
-        {field: [width, n] f32}, finite.
-    steps : StepSizes
-        From a comment, which may not belong to these values.
-    origin : np.ndarray
-        [3] f64.
-
-    Returns
-    -------
-    GridScene or None
-        None if a value does not lie on the grid.
+    `planes`: {field: [width, n] f32}, finite. `steps`: from a comment, which may not belong to these values. `origin`:
+    [3] f64. Returns none if a value does not lie on the grid.
     """
     rest = planes["sh_rest"]
     bands = rest.reshape(3, len(rest) // 3, rest.shape[1])

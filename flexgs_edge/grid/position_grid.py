@@ -21,12 +21,7 @@ def position_grid(means: np.ndarray, step: float) -> tuple[float, Contraction | 
     Where the grid is too small for the scene, positions beyond a radius are contracted. The radius is the largest for which all
     fit, so that as many positions as possible stay as they are.
 
-    Parameters
-    ----------
-    means : np.ndarray
-        [3, n] f32, finite.
-    step : float
-        Step size as wanted.
+    `means`: [3, n] f32, finite. `step`: step size as wanted.
     """
     ranges = np.array(plane_ranges(means), np.float64)
     if not len(ranges) or np.ptp(ranges, axis=1).max() <= (2**POSITION_BITS - 2) * step:

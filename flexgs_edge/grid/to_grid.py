@@ -20,45 +20,21 @@ from flexgs_edge.scene.rotations import canonical_axes
 
 
 def to_grid(
-    planes: Planes,
-    sh_degrees: np.ndarray,
-    steps: StepSizes,
-    origin: np.ndarray | Sequence[float],
-    layer: np.ndarray | None = None,
-    storage: Storage = IN_MEMORY,
-    rename: bool = True,
+    planes: Planes,  # {field: [width, n] f32}, finite; `means` relative to `origin`
+    sh_degrees: np.ndarray,  # [n], the SH degree to keep for each row; higher coefficients are left out
+    steps: StepSizes,  # needs one SH step for each degree kept
+    origin: np.ndarray | Sequence[float],  # [3] f64
+    layer: np.ndarray | None = None,  # [n], 0 to 255
+    storage: Storage = IN_MEMORY,  # holds the grid
+    rename: bool = True,  # take the form with the smallest rotation; False keeps rotations and scales as they are
 ) -> tuple[GridScene, np.ndarray]:
     """Put a scene on a grid.
 
     A Gaussian has 24 equal forms, since its axes can be permuted and reversed. By default we write the form with the
     smallest rotation, which needs the fewest bits.
 
-    Parameters
-    ----------
-    planes : mapping
-        {field: [width, n] f32}, finite; `means` relative to `origin`.
-    sh_degrees : np.ndarray
-        [n], the SH degree to keep for each row; higher coefficients are left out.
-    steps : StepSizes
-        Needs one SH step for each degree kept.
-    origin : array_like
-        [3] f64.
-    layer : np.ndarray, optional
-        [n], 0 to 255.
-    storage : Storage, optional
-        Holds the grid.
-    rename : bool
-        Take the form with the smallest rotation; False keeps rotations and scales as they are.
-
-    Returns
-    -------
-    tuple
-        The `GridScene`, and [n] i64: the input row of each of its rows.
-
-    Raises
-    ------
-    InputError
-        If a value is not finite, or its code is out of range; nothing is clipped.
+    Returns the `GridScene`, and [n] i64: the input row of each of its rows. Raises `InputError` if a value is not
+    finite, or its code is out of range; nothing is clipped.
     """
     count = planes["means"].shape[1]
     degrees = _bytes("sh_degrees", sh_degrees, count, MAX_SH_DEGREE)

@@ -15,14 +15,8 @@ _ROUNDS = 10
 def best_codebook(values: np.ndarray, weights: np.ndarray | None = None, size: int = 256) -> np.ndarray:
     """[at most size] f64, ascending, rounded to float32: the values that stand for `values` best.
 
-    Parameters
-    ----------
-    values : np.ndarray
-        [n] finite f32; at least one.
-    weights : np.ndarray, optional
-        [n], how much the error of each counts; 1 by default.
-    size : int, optional
-        Most values.
+    `values`: [n] finite f32; at least one. `weights`: [n], how much the error of each counts; 1 by default. `size`:
+    most values.
     """
     order = np.argsort(values, kind="stable")
     ordered = values[order].astype(np.float64)

@@ -25,16 +25,8 @@ def opacities(logits: np.ndarray) -> np.ndarray:
 def without_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Leave out the largest component of unit quaternions: the others tell it.
 
-    Parameters
-    ----------
-    quats : np.ndarray
-        [4, n], components in any order.
-
-    Returns
-    -------
-    tuple of np.ndarray
-        [n] i64, the place of the largest; and [3, n] f64, the others in their order. q and -q are one rotation: the
-        signs are those that make the largest positive.
+    `quats`: [4, n], components in any order. Returns [n] i64, the place of the largest; and [3, n] f64, the others in
+    their order. q and -q are one rotation: the signs are those that make the largest positive.
     """
     wide = quats.astype(np.float64)
     largest = np.abs(wide).argmax(axis=0)

@@ -29,15 +29,9 @@ _ODD_AXES = (
 
 @dataclass(frozen=True)
 class Frame:
-    """Directions of the axes, relative to RDF.
+    """Directions of the axes, relative to RDF."""
 
-    Parameters
-    ----------
-    name : str
-        Three letters, such as `RUB`.
-    """
-
-    name: str
+    name: str  # three letters, such as `RUB`
 
     def __post_init__(self) -> None:
         letters = tuple(zip(_POSITIVE, _NEGATIVE, strict=True))

@@ -58,10 +58,7 @@ class _Attribute:
 def write_glb(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
     """Write a scene. See `io.formats.Format.writer` for the arguments.
 
-    Raises
-    ------
-    InputError
-        If the file would have more than 4 GiB, the most that a `.glb` can have.
+    Raises `InputError` if the file would have more than 4 GiB, the most that a `.glb` can have.
     """
     attributes = _attributes(source.sh_degree)
     header = _header(source, attributes)

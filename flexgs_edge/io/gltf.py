@@ -61,12 +61,8 @@ _SHOWN = 16
 def read_gltf(path: Path, name: str, reading: Reading) -> GltfSource:
     """Open a `.glb` or `.gltf`. See `io.formats.Format.reader` for the arguments.
 
-    Raises
-    ------
-    InputError
-        If it shows no Gaussians, or needs an extension that we do not know.
-    FormatError
-        If it is damaged.
+    Raises `InputError` if it shows no Gaussians, or needs an extension that we do not know. Raises `FormatError` if it
+    is damaged.
     """
     file = GltfFile(path, name)
     unknown = [word for word in file.json.texts("extensionsRequired") if not _is_known(word)]

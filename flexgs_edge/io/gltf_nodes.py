@@ -33,30 +33,17 @@ Reader = Callable[[str], np.ndarray]
 
 @dataclass(frozen=True)
 class Shown:
-    """A mesh that a node shows.
+    """A mesh that a node shows."""
 
-    Parameters
-    ----------
-    mesh : int
-        Index of the mesh.
-    node : int
-        Index of the node.
-    matrix : np.ndarray
-        [4, 4] f64, from the mesh to the world.
-    """
-
-    mesh: int
-    node: int
-    matrix: np.ndarray
+    mesh: int  # index of the mesh
+    node: int  # index of the node
+    matrix: np.ndarray  # [4, 4] f64, from the mesh to the world
 
 
 def shown_meshes(file: Record) -> Iterator[Shown]:
     """All meshes that the default scene shows: the named one, else the first; without scenes, all nodes.
 
-    Raises
-    ------
-    FormatError
-        If nodes do not form trees, or a transform is not finite.
+    Raises `FormatError` if nodes do not form trees, or a transform is not finite.
     """
     seen: set[int] = set()
     waiting = [(index, np.eye(4), asker) for index, asker in reversed(_roots(file))]
@@ -106,10 +93,7 @@ def _local_matrix(node: Record) -> np.ndarray:
 class Move:
     """What a matrix makes of Gaussians.
 
-    Parameters
-    ----------
-    matrix : np.ndarray
-        [4, 4] f64.
+    `matrix`: [4, 4] f64.
     """
 
     def __init__(self, matrix: np.ndarray) -> None:

@@ -78,14 +78,8 @@ class SpzSplats:
 class GltfSource(DecodedSource):
     """The splats of a glTF, one after the other.
 
-    Parameters
-    ----------
-    name : str
-        The user's path, for messages.
-    parts : sequence of (Splats, Move)
-        Gaussians, and where they are shown.
-    held_bytes : int
-        Bytes of their packed values.
+    `name`: the user's path, for messages. `parts`: Gaussians, and where they are shown. `held_bytes`: bytes of their
+    packed values.
     """
 
     def __init__(self, name: str, parts: Sequence[tuple[Splats, Move]], held_bytes: int) -> None:

@@ -30,25 +30,10 @@ def unpacked(
 ) -> SceneSource:
     """Unpack a file into the folder that TMPDIR names, and open it there.
 
-    Parameters
-    ----------
-    path : Path
-        The packed file.
-    name : str
-        The user's path, for messages.
-    open_file : callable
-        Opens the unpacked file.
-    least_free : int, optional
-        Bytes of the temporary disk that must stay free.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    FormatError
-        If it is no whole gzip file, or unpacks to far more than a scene would.
-    BudgetError
-        If the temporary disk has no room for it.
+    `path`: the packed file. `name`: the user's path, for messages. `open_file`: opens the unpacked file. `least_free`:
+    bytes of the temporary disk that must stay free. Raises `InputError` if the file cannot be read. Raises
+    `FormatError` if it is no whole gzip file, or unpacks to far more than a scene would. Raises `BudgetError` if the
+    temporary disk has no room for it.
     """
     check_readable(path, name)
     folder = tempfile.TemporaryDirectory(prefix="flexgs-")

@@ -64,30 +64,14 @@ _LEVELS = (_Level("<f4", "<f4", "<f4"), _Level("<u2", "<f2", "<f2"), _Level("<u2
 
 @dataclass(frozen=True)
 class _Section:
-    """Gaussians with the same layout.
+    """Gaussians with the same layout."""
 
-    Parameters
-    ----------
-    table : np.ndarray
-        [n, bytes of a row] u8.
-    sh_degree : int
-        0 to 3.
-    ends : np.ndarray
-        [buckets] i64, the row behind each bucket that has Gaussians.
-    centres : np.ndarray
-        [buckets, 3] f32.
-    step : float
-        Unit of the positions, scene units.
-    middle : int
-        Code of a bucket's centre.
-    """
-
-    table: np.ndarray
-    sh_degree: int
-    ends: np.ndarray
-    centres: np.ndarray
-    step: float
-    middle: int
+    table: np.ndarray  # [n, bytes of a row] u8
+    sh_degree: int  # 0 to 3
+    ends: np.ndarray  # [buckets] i64, the row behind each bucket that has Gaussians
+    centres: np.ndarray  # [buckets, 3] f32
+    step: float  # unit of the positions, scene units
+    middle: int  # code of a bucket's centre
 
 
 class KsplatSource(DecodedSource):
@@ -146,10 +130,7 @@ def _sh_places(section_degree: int, degree: int) -> np.ndarray:
 def read_ksplat(path: Path, name: str, reading: Reading) -> KsplatSource:
     """Open a `.ksplat`; see `Format.reader`.
 
-    Raises
-    ------
-    FormatError
-        If the file breaks the format.
+    Raises `FormatError` if the file breaks the format.
     """
     data = np.fromfile(path, np.uint8)
     if len(data) < _HEADER_BYTES:

@@ -55,10 +55,7 @@ def find_companions(path: str | os.PathLike[str]) -> Companions:
     photos in another place. It may also tell that the model is antialiased; the reference program leaves `antialiasing`
     out.
 
-    Raises
-    ------
-    FormatError
-        If `cfg_args` cannot be understood.
+    Raises `FormatError` if `cfg_args` cannot be understood.
     """
     place = Path(path)
     folder = place if place.is_dir() else place.parent

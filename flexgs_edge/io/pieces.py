@@ -28,10 +28,7 @@ _DAMAGED = (
 def piece_place(folder: Path, piece: str, name: str) -> Path:
     """The file of a piece below a folder.
 
-    Raises
-    ------
-    FormatError
-        If the name leads out of the folder, also by a link.
+    Raises `FormatError` if the name leads out of the folder, also by a link.
     """
     inside = f"{name}: {brief(piece)}: expected the name of a file in its folder or below it"
     if not piece or "\\" in piece or ":" in piece or os.path.isabs(piece) or ".." in piece.split("/"):
@@ -97,10 +94,7 @@ def zip_pieces(archive: zipfile.ZipFile, name: str, first: str) -> Pieces:
 def open_zip(path: Path, name: str) -> zipfile.ZipFile:
     """Open a zip; `name` is what messages call it.
 
-    Raises
-    ------
-    FormatError
-        If it is none.
+    Raises `FormatError` if it is none.
     """
     path.stat()  # the file can be read, or this error says why not
     try:

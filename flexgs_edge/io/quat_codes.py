@@ -42,11 +42,8 @@ def rounded_quats(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray
 
     `quats`: [n, 4] f64, unit quaternions w x y z; `log_scales`: [n, 3].
 
-    Returns
-    -------
-    tuple of np.ndarray
-        The codes of the three smaller components, [n, 3] u8; the place of the largest, [n]; and the old axis behind each
-        axis of the form, [n, 3].
+    Returns the codes of the three smaller components, [n, 3] u8; the place of the largest, [n]; and the old axis behind
+    each axis of the form, [n, 3].
     """
     # float32: the last bits of exp differ between machines, and must not decide.
     scales = np.exp(log_scales - log_scales.max(axis=1, keepdims=True)).astype(np.float32).astype(np.float64)

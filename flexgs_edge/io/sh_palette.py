@@ -39,10 +39,7 @@ def sh_palette(values: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
 
     `values`: [n, d] finite f32, d at most 45.
 
-    Returns
-    -------
-    tuple of np.ndarray
-        [n] i64, the entry of each row, and [entries, d] f32.
+    Returns [n] i64, the entry of each row, and [entries, d] f32.
     """
     step = _step(values)
     whole = np.empty(values.shape, np.int16)
@@ -109,10 +106,7 @@ def _merged(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Merge points in pairs until `most` clusters are left.
 
-    Returns
-    -------
-    tuple of np.ndarray
-        [m] i64, the cluster of each point; [most, d] f32, their means in whole numbers; [most] i64, their groups.
+    Returns [m] i64, the cluster of each point; [most, d] f32, their means in whole numbers; [most] i64, their groups.
     """
     labels, entries, heavy, homes = np.arange(len(points)), points, weights, _closest(points, centres)
     while len(entries) > most:

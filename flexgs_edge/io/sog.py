@@ -55,19 +55,9 @@ def read_sog_folder(path: Path, name: str, reading: Reading) -> SogSource:
 def read_pieces(pieces: Pieces, meta_name: str, name: str) -> SogSource:
     """Open a scene whose pieces are given.
 
-    Parameters
-    ----------
-    pieces : callable
-        Gives the bytes of `meta.json` and of pictures.
-    meta_name : str
-        Name of the piece that names the others.
-    name : str
-        What messages call the scene.
-
-    Raises
-    ------
-    FormatError
-        If a piece is missing or damaged, or does not fit the others.
+    `pieces`: gives the bytes of `meta.json` and of pictures. `meta_name`: name of the piece that names the others.
+    `name`: what messages call the scene. Raises `FormatError` if a piece is missing or damaged, or does not fit the
+    others.
     """
     meta = parse_meta(pieces(meta_name), f"{name}: {META}")
     data = {key: pieces(piece) for key, piece in meta.files.items()}
@@ -82,14 +72,8 @@ def read_pieces(pieces: Pieces, meta_name: str, name: str) -> SogSource:
 class SogSource(DecodedSource):
     """A SOG scene, with the bytes of its pictures in memory.
 
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    meta : SogMeta
-        Its checked description.
-    data : dict
-        The coded pictures, by the keys of `SogMeta.files`.
+    `name`: what messages call it. `meta`: its checked description. `data`: the coded pictures, by the keys of
+    `SogMeta.files`.
     """
 
     def __init__(self, name: str, meta: SogMeta, data: dict[str, bytes]) -> None:

@@ -39,10 +39,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 def write_sog(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
     """Write a `.sog`; see `write_foreign`.
 
-    Raises
-    ------
-    InputError
-        If the scene has more Gaussians than a picture has pixels.
+    Raises `InputError` if the scene has more Gaussians than a picture has pixels.
     """
     if source.count > _LARGEST_SIDE**2:
         raise InputError(

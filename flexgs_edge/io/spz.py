@@ -49,18 +49,8 @@ _MOST_PACKED = 1032
 class SpzSource(DecodedSource):
     """A `.spz`: its codes, decoded when they are read.
 
-    Parameters
-    ----------
-    name : str
-        The user's path, for messages.
-    header : SpzHeader
-        What the file says.
-    arrays : list of np.ndarray
-        [bytes] u8 each, unpacked, in the order of `header.widths`.
-    frame : Frame or None
-        The frame that the file states.
-    notes : tuple of str
-        On what was left out.
+    `name`: the user's path, for messages. `header`: what the file says. `arrays`: [bytes] u8 each, unpacked, in the
+    order of `header.widths`. `frame`: the frame that the file states. `notes`: on what was left out.
     """
 
     def __init__(
@@ -97,10 +87,7 @@ class SpzSource(DecodedSource):
 def read_spz(path: Path, name: str, reading: Reading) -> SpzSource:
     """Open a `.spz`; see `Format.reader`.
 
-    Raises
-    ------
-    FormatError
-        If the file breaks the format or unpacks to more than its header says.
+    Raises `FormatError` if the file breaks the format or unpacks to more than its header says.
     """
     with open(path, "rb") as file:
         return parse_spz(file, name, reading)

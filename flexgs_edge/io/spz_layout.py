@@ -45,27 +45,13 @@ _SHOWN = 4
 
 @dataclass(frozen=True)
 class SpzHeader:
-    """A checked header.
+    """A checked header."""
 
-    Parameters
-    ----------
-    version : int
-        1 to 4.
-    count : int
-        Gaussians.
-    sh_degree : int
-        0 to 4.
-    fraction_bits : int
-        Bits behind the point of coordinates; version 1 has none.
-    flags : int
-        Bits; see `ANTIALIASED` and `EXTENDED`.
-    """
-
-    version: int
-    count: int
-    sh_degree: int
-    fraction_bits: int
-    flags: int = 0
+    version: int  # 1 to 4
+    count: int  # Gaussians
+    sh_degree: int  # 0 to 4
+    fraction_bits: int  # bits behind the point of coordinates; version 1 has none
+    flags: int = 0  # bits; see `ANTIALIASED` and `EXTENDED`
 
     @property
     def widths(self) -> dict[str, int]:
@@ -94,10 +80,7 @@ class SpzHeader:
 def parse_header(name: str, head: bytes) -> SpzHeader:
     """Check the first 16 bytes of an unpacked stream, or of version 4.
 
-    Raises
-    ------
-    FormatError
-        If a field is not as the format has it.
+    Raises `FormatError` if a field is not as the format has it.
     """
     if len(head) < HEADER.size:
         raise FormatError(f"{name}: truncated: expected a header of {HEADER.size} bytes, found {len(head)}")
@@ -114,17 +97,8 @@ def parse_header(name: str, head: bytes) -> SpzHeader:
 def parse_extensions(name: str, block: bytes, asked: Frame | None) -> tuple[Frame | None, tuple[str, ...]]:
     """Find the frame that extensions state, and notes on those that are left out.
 
-    Parameters
-    ----------
-    block : bytes
-        Records of type (u32), length (u32) and content.
-    asked : Frame or None
-        The user's frame: what the file says of it then does not matter.
-
-    Raises
-    ------
-    FormatError
-        If the stated frame is unknown or not one of ours.
+    `block`: records of type (u32), length (u32) and content. `asked`: the user's frame: what the file says of it then
+    does not matter. Raises `FormatError` if the stated frame is unknown or not one of ours.
     """
     frame, others, at = None, dict[str, None](), 0
     while at + 8 <= len(block):

@@ -92,11 +92,8 @@ class DeviceInfo:
 def list_devices(self_test: bool = True) -> list[DeviceInfo]:
     """Every device of every OpenCL platform, in the order of the OpenCL loader.
 
-    Parameters
-    ----------
-    self_test : bool
-        Build and run a small kernel on each device, and compare its result with NumPy's. Before a device is used, it must
-        pass more than this: `flexgs_edge.kernels.tested`.
+    `self_test`: build and run a small kernel on each device, and compare its result with NumPy's. Before a device is
+    used, it must pass more than this: `flexgs_edge.kernels.tested`.
     """
     import pyopencl as cl
 
@@ -197,17 +194,10 @@ def _first_line(text: str) -> str:
 def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceInfo, str]:
     """Choose the device that `spec` names; returns it with the reason.
 
-    Parameters
-    ----------
-    spec : str or None
-        An index, `cpu`, `gpu`, or a part of the name of a device or platform. None, the default, takes the first GPU
-        that passed the self-test, else PoCL's CPU device, else any other CPU device.
-
-    Raises
-    ------
-    DeviceError
-        If no device matches, or the one that matches failed its self-test; the message lists all devices. We never take
-        another device than the one asked for.
+    `spec`: an index, `cpu`, `gpu`, or a part of the name of a device or platform. None, the default, takes the first
+    GPU that passed the self-test, else PoCL's CPU device, else any other CPU device. Raises `DeviceError` if no device
+    matches, or the one that matches failed its self-test; the message lists all devices. We never take another device
+    than the one asked for.
     """
     listing = "; ".join(f"[{d.index}] {d.name} ({d.platform}, {d.type}): {d.self_test}" for d in devices)
     if not devices:

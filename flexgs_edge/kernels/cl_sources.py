@@ -34,10 +34,7 @@ def kernel_dir() -> Path:
     The order is: the folder that FLEXGS_KERNEL_DIR names; `cl_kernels` inside the installed package (a wheel puts it
     there); `cl_kernels` beside the package (a checkout, an unpacked sdist, an editable install).
 
-    Raises
-    ------
-    DeviceError
-        If that folder holds no `common.clh`.
+    Raises `DeviceError` if that folder holds no `common.clh`.
     """
     override = os.environ.get(KERNEL_DIR_VARIABLE)
     package = Path(__file__).resolve().parents[1]
@@ -106,10 +103,7 @@ def load_source(name: str, stats: int | None = None, form: str = "cpu") -> str:
 
     `#line` directives make the compiler name files and lines that a person can open.
 
-    Raises
-    ------
-    DeviceError
-        If the folder or the file is missing.
+    Raises `DeviceError` if the folder or the file is missing.
     """
     folder = kernel_dir()
     parts = ['#line 1 "constants.py, as printed by flexgs_edge.kernels.cl_sources"\n', constants_header()]

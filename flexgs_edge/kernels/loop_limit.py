@@ -29,10 +29,7 @@ def steps_of(name: str, size: tuple[int, ...], args: tuple[Any, ...]) -> int:
 def check_steps(info: DeviceInfo, name: str, size: tuple[int, ...], args: tuple[Any, ...]) -> None:
     """Refuse a launch whose loops the device would leave early, since its results would be wrong.
 
-    Raises
-    ------
-    DeviceError
-        With what to do.
+    Raises `DeviceError` with what to do.
     """
     steps = steps_of(name, size, args)
     if steps > info.loop_steps:

@@ -31,34 +31,17 @@ GPU_BLOCKS = (64, 256)
 
 
 class OpenCLBackend:
-    """Kernels and memory of one OpenCL device.
-
-    Parameters
-    ----------
-    info : DeviceInfo
-        The device.
-    budget : MemoryBudget
-        Counts all buffers.
-    width : int, optional
-        Lanes of a vector: 16, 8, 4 or 1; in the GPU form 4 or 1.
-    form : {"cpu", "gpu"}, optional
-        Form of the blend kernel: one work-item a tile, or one work-group a tile.
-    written_fma : bool, optional
-        Whether `fma` is written out.
-
-    By default, all three are what the self-test found to be fastest (`DeviceInfo.form`); if it has not run, they follow
-    the device's type.
-    """
+    """Kernels and memory of one OpenCL device."""
 
     is_numpy = False
 
     def __init__(
         self,
-        info: DeviceInfo,
-        budget: MemoryBudget,
-        width: int | None = None,
-        form: str | None = None,
-        written_fma: bool | None = None,
+        info: DeviceInfo,  # the device
+        budget: MemoryBudget,  # counts all buffers
+        width: int | None = None,  # lanes of a vector: 16, 8, 4 or 1; in the GPU form 4 or 1
+        form: str | None = None,  # form of the blend kernel: one work-item a tile, or one work-group a tile
+        written_fma: bool | None = None,  # whether `fma` is written out
     ) -> None:
         start = time.perf_counter()
         self.session = Session(info, budget)

@@ -23,10 +23,7 @@ def context_of(device: cl.Device) -> cl.Context:
 def built_program(context: cl.Context, source: str, options: tuple[str, ...]) -> tuple[cl.Program, float]:
     """The program of `source`, built with `options`, and the seconds that building took: 0 if this process had it.
 
-    Raises
-    ------
-    cl.Error
-        If it does not build.
+    Raises `cl.Error` if it does not build.
     """
     key, seconds = (context.int_ptr, source, options), 0.0
     if key not in _PROGRAMS:

@@ -59,12 +59,8 @@ class Arrays:
 def play(record: Record, backend: Backend, watch: Callable[[str], None] = lambda kernel: None) -> None:
     """Play `record` on `backend`. A device without threads is spared the kernels of the coder, which no run starts there.
 
-    Raises
-    ------
-    WrongResult
-        With the kernel, the first wrong value, and what was expected.
-    DeviceError, BudgetError
-        From the backend.
+    Raises `WrongResult` with the kernel, the first wrong value, and what was expected. Raises `DeviceError,
+    BudgetError` : From the backend.
     """
     arrays, seen = Arrays(record, backend), set[str]()
     try:

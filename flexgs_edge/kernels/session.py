@@ -61,12 +61,7 @@ class DeviceArray:
 class Session:
     """Context, in-order queue, kernels and buffers of one device.
 
-    Parameters
-    ----------
-    info : DeviceInfo
-        From `choose_device`.
-    budget : MemoryBudget
-        Counts all buffers.
+    `info`: from `choose_device`. `budget`: counts all buffers.
     """
 
     def __init__(self, info: DeviceInfo, budget: MemoryBudget) -> None:
@@ -89,10 +84,8 @@ class Session:
     def kernel(self, source: str, name: str, options: tuple[str, ...], signature: str) -> cl.Kernel:
         """The kernel `name` of `source`, built with `options`; `signature` has one letter (u i f b) for each argument.
 
-        Raises
-        ------
-        DeviceError
-            If the program does not build; the message has the device, the options and the compiler's words.
+        Raises `DeviceError` if the program does not build; the message has the device, the options and the compiler's
+        words.
         """
         try:
             program, seconds = built_program(self.context, source, options)

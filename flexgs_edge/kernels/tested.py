@@ -31,11 +31,7 @@ _warned: set[str] = set()
 def with_verdict(info: DeviceInfo, anew: bool = False) -> DeviceInfo:
     """`info` with the verdict of the self-test: a kept one, or that of a test made now.
 
-    Parameters
-    ----------
-    info : DeviceInfo
-    anew : bool
-        Test the device even if there is a verdict.
+    `anew`: test the device even if there is a verdict.
     """
     key = key_of(info)
     verdict = None if anew else _known.get(key) or kept_verdict(key)
@@ -58,10 +54,7 @@ def with_verdict(info: DeviceInfo, anew: bool = False) -> DeviceInfo:
 def choose_tested(spec: str | None) -> tuple[DeviceInfo, str]:
     """Choose a device as `choose_device` does, and test those that are in question, one after the other.
 
-    Raises
-    ------
-    DeviceError
-        As `choose_device`.
+    Raises `DeviceError`: As `choose_device`.
     """
     devices = list_devices(self_test=False)
     while True:

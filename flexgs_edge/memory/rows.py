@@ -71,12 +71,7 @@ def blocks(count: int, rows: int = BLOCK_ROWS) -> Iterator[slice]:
 def fetch(values: np.ndarray, rows: slice) -> None:
     """Ask the kernel to read rows of every plane of a mapped array at once; no effect on arrays in memory.
 
-    Parameters
-    ----------
-    values : np.ndarray
-        [..., n].
-    rows : slice
-        `slice(start, stop)`.
+    `values`: [..., n]. `rows`: `slice(start, stop)`.
     """
     held = map_of(values)
     if held is None or not hasattr(mmap, "MADV_WILLNEED"):
@@ -93,14 +88,7 @@ def fetch(values: np.ndarray, rows: slice) -> None:
 def copy_rows(values: np.ndarray, rows: slice, out: np.ndarray) -> None:
     """Copy `values[..., rows]` to `out`; a mapped array is read from its file, without the interpreter's lock.
 
-    Parameters
-    ----------
-    values : np.ndarray
-        [..., n], planes C-contiguous.
-    rows : slice
-        `slice(start, stop)`.
-    out : np.ndarray
-        [..., stop - start], of the same type.
+    `values`: [..., n], planes C-contiguous. `rows`: `slice(start, stop)`. `out`: [..., stop - start], of the same type.
     """
     copy_all_rows([(values, out)], rows)
 
@@ -185,16 +173,8 @@ def take_rows(values: np.ndarray, rows: np.ndarray, out: np.ndarray, whole_bytes
     For files, rows out of order are taken plane by plane, two planes at a time, so that memory holds the planes in use.
     A loop over parts of the rows would read all planes once a part: docs/results/tuning.md#disks
 
-    Parameters
-    ----------
-    values : np.ndarray
-        [..., n].
-    rows : np.ndarray
-        [m], row numbers in any order.
-    out : np.ndarray
-        [..., m], of the same type.
-    whole_bytes : int
-        Bytes of the largest plane that may be held in memory as a whole; two are held at a time.
+    `values`: [..., n]. `rows`: [m], row numbers in any order. `out`: [..., m], of the same type. `whole_bytes`: bytes
+    of the largest plane that may be held in memory as a whole; two are held at a time.
     """
     planes = [(values[place], out[place]) for place in np.ndindex(values.shape[:-1])]
     if not planes:

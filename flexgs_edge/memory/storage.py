@@ -88,22 +88,9 @@ class ScratchStorage(Storage):
     The files have no names, so their disk space is free again however the process ends. Their blocks are reserved
     before use, so that a full disk raises an error instead of a signal in the middle of a copy.
 
-    Parameters
-    ----------
-    folder : path
-        On a disk.
-    limit : int
-        Bytes that the process may hold; larger limits let larger planes be held as a whole.
-    least : int
-        Arrays of fewer bytes always stay in memory.
-    whole : int
-        See `WHOLE_BYTES`.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist, cannot be written to, or lies in memory (a tmpfs would take the memory it should
-        save).
+    `folder`: on a disk. `limit`: bytes that the process may hold; larger limits let larger planes be held as a whole.
+    `least`: arrays of fewer bytes always stay in memory. `whole`: see `WHOLE_BYTES`. Raises `InputError` if the folder
+    does not exist, cannot be written to, or lies in memory (a tmpfs would take the memory it should save).
     """
 
     spills = True

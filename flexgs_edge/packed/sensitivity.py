@@ -21,24 +21,12 @@ ALLOWED_DROP = 0.3
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """The sensitivity of one attribute.
+    """The sensitivity of one attribute."""
 
-    Parameters
-    ----------
-    attribute : str
-        Name in `--bits`.
-    rise : float
-        Rise of the mean squared error if only this attribute goes from 8 to 4 bits.
-    saved_bits : float
-        Bits saved for each Gaussian.
-    moved : bool
-        The attribute is coded at 4 bits.
-    """
-
-    attribute: str
-    rise: float
-    saved_bits: float
-    moved: bool
+    attribute: str  # name in `--bits`
+    rise: float  # rise of the mean squared error if only this attribute goes from 8 to 4 bits
+    saved_bits: float  # bits saved for each Gaussian
+    moved: bool  # the attribute is coded at 4 bits
 
     @property
     def loss(self) -> float:
@@ -51,10 +39,7 @@ def search_bits(
 ) -> tuple[BitSpec, list[Sensitivity]]:
     """Find the bits of every attribute.
 
-    Returns
-    -------
-    tuple
-        The bits, and the sensitivities, least sensitive attribute first.
+    Returns the bits, and the sensitivities, least sensitive attribute first.
     """
     base = BitSpec(xyz=POSITION, dc=HIGH, scale=HIGH, rot=HIGH, opacity=HIGH, rest=HIGH)
     floor = error(base)

@@ -28,19 +28,9 @@ BACKBONE_URL = f"https://download.pytorch.org/models/{BACKBONE}"
 class Lpips:
     """Perceptual distance of two images: 0 for identical ones, smaller is better (AlexNet, version 0.1, on the CPU).
 
-    Parameters
-    ----------
-    budget : MemoryBudget
-        Memory for the libraries and for images of `pixels` pixels is taken from it until `close`.
-    pixels : int
-        Pixels of the largest image.
-
-    Raises
-    ------
-    InputError
-        If a package or the weights of AlexNet are missing; the message tells what to install, or where to put the file.
-    BudgetError
-        If they do not fit into the memory limit.
+    `budget`: memory for the libraries and for images of `pixels` pixels is taken from it until `close`. `pixels`:
+    pixels of the largest image. Raises `InputError` if a package or the weights of AlexNet are missing; the message
+    tells what to install, or where to put the file. Raises `BudgetError` if they do not fit into the memory limit.
     """
 
     def __init__(self, budget: MemoryBudget, pixels: int) -> None:

@@ -37,15 +37,7 @@ def ssims(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> l
     It takes a Gaussian window of sigma 1.5, population covariance, a data range of 1, and only windows inside the
     image. scikit-image gives the same with `gaussian_weights=True, use_sample_covariance=False, data_range=1`.
 
-    Parameters
-    ----------
-    pairs : sequence of two arrays
-        [H, W, 3] f32; clamped to [0, 1] here.
-
-    Returns
-    -------
-    list of float or None
-        `None` for images with a side below 11 pixels.
+    `pairs`: [H, W, 3] f32; clamped to [0, 1] here. Returns `None` for images with a side below 11 pixels.
     """
     if not pairs or min(pairs[0][0].shape[:2]) < SSIM_WINDOW:
         return [None] * len(pairs)

@@ -59,10 +59,7 @@ class WaitingView:
     def fill(self, buffers: ViewBuffers) -> np.ndarray:
         """Copy all splats into the buffers of a view, which must have room for them.
 
-        Returns
-        -------
-        np.ndarray
-            [count] u32, the splats' rows of the scene.
+        Returns [count] u32, the splats' rows of the scene.
         """
         self._wait()
         self._backend.mark()()  # the view before may still be drawn from these buffers
@@ -130,11 +127,8 @@ class ViewsAhead:
     ) -> tuple[int, int, np.ndarray | None]:
         """Put the splats that a view shows into its buffers.
 
-        Returns
-        -------
-        tuple
-            The number of splats, the row of the scene up to which they were counted, and their rows ([m] u32).
-            The rows are None if the buffers have no room.
+        Returns the number of splats, the row of the scene up to which they were counted, and their rows ([m] u32). The
+        rows are None if the buffers have no room.
         """
         assert buffers.rows is not None
         record = camera_record(camera, scene.origin, near)

@@ -29,16 +29,13 @@ LARGER = 1.001
 class ChunkBounds:
     """Bounds of the blocks of one chunk of a scene: ROW_BLOCK rows each, in row order.
 
-    Parameters
-    ----------
-    middle, half : np.ndarray
-        [3, blocks] f64, centre and half size of the box around the means, scene units relative to the origin.
-    extent : np.ndarray
-        [blocks] f64, largest standard deviation of any Gaussian along any of its own axes, scene units.
+    `middle`, `half`: [3, blocks] f64, centre and half size of the box around the means, scene units relative to the
+    origin.
     """
 
     middle: np.ndarray
     half: np.ndarray
+    # [blocks] f64, largest standard deviation of any Gaussian along any of its own axes, scene units.
     extent: np.ndarray
 
     @classmethod

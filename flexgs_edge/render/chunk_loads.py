@@ -30,23 +30,15 @@ class Loading:
 class ChunkLoads:
     """The chunks that one view asks for, in turn; close when done.
 
-    Parameters
-    ----------
-    backend : Backend
-    planes : ChunkPlanes
-        Fills the chunks.
-    may_stay : callable
-        Whether a chunk of so many rows may get arrays of its own, which outlive this object.
-    may_add : callable
-        Whether memory has room for one chunk of so many rows beyond `SLOTS`.
+    `may_stay`: whether a chunk of so many rows may get arrays of its own, which outlive this object.
     """
 
     def __init__(
         self,
         backend: Backend,
-        planes: ChunkPlanes,
+        planes: ChunkPlanes,  # fills the chunks
         may_stay: Callable[[int], bool],
-        may_add: Callable[[int], bool],
+        may_add: Callable[[int], bool],  # whether memory has room for one chunk of so many rows beyond `SLOTS`
     ) -> None:
         self._backend, self._planes, self._may_stay, self._may_add = backend, planes, may_stay, may_add
         self._loader = ThreadPoolExecutor(1, "load")

@@ -67,10 +67,7 @@ def fill_compact(
 ) -> int:
     """Project the scene chunk by chunk, and give each view the splats that it shows, in row order.
 
-    Returns
-    -------
-    int
-        The row of the scene that was reached. It stops early if a view has no more room.
+    Returns the row of the scene that was reached. It stops early if a view has no more room.
     """
 
     def wanted(bounds: ChunkBounds) -> bool:

@@ -43,42 +43,21 @@ AHEAD_SHARE = 8
 
 @dataclass(frozen=True)
 class Fit:
-    """How a scene and its views share memory. Pictures and sums have the same bits with any values.
+    """How a scene and its views share memory. Pictures and sums have the same bits with any values."""
 
-    Parameters
-    ----------
-    chunk_rows : int
-        Most rows of a chunk: 60 MB of planes at SH degree 3, large enough to hide the cost of a launch.
-    least_rows : int
-        Rows of the smallest chunk of a streamed scene.
-    compact_rows : int
-        Rows of a chunk if views are compact: 33 MB, with all that projecting it takes.
-    pairs : int
-        Most pairs of a batch: 40 MiB, enough to draw most views in one batch.
-    capacity_step : int
-        Compact views make room for multiples of so many rows, so that views of about one size share their buffers.
-    first_share : int
-        A compact view first gets room for one in so many of the scene's rows.
-    spare_share : int
-        Chunks of a compact scene stay on the backend only if one in so many bytes of the limit is free. At 1, none
-        stays.
-    ahead : int
-        Views that are projected together with the current one.
-    resident : bool
-        Keep a scene that fits on the backend; if False, always stream it.
-    whole_views : bool
-        Give a view room for all rows of its scene if memory allows; if False, all views are compact.
-    """
-
+    # Most rows of a chunk: 60 MB of planes at SH degree 3, large enough to hide the cost of a launch.
     chunk_rows: int = 1 << 18
-    least_rows: int = 1 << 10
-    compact_rows: int = 1 << 16
-    pairs: int = 1 << 21
+    least_rows: int = 1 << 10  # rows of the smallest chunk of a streamed scene
+    compact_rows: int = 1 << 16  # rows of a chunk if views are compact: 33 MB, with all that projecting it takes
+    pairs: int = 1 << 21  # most pairs of a batch: 40 MiB, enough to draw most views in one batch
+    # Compact views make room for multiples of so many rows, so that views of about one size share their buffers.
     capacity_step: int = 1 << 16
-    first_share: int = 4
+    first_share: int = 4  # a compact view first gets room for one in so many of the scene's rows
+    # Chunks of a compact scene stay on the backend only if one in so many bytes of the limit is free. At 1, none stays.
     spare_share: int = 4
-    ahead: int = 3
-    resident: bool = True
+    ahead: int = 3  # views that are projected together with the current one
+    resident: bool = True  # keep a scene that fits on the backend; if False, always stream it
+    # Give a view room for all rows of its scene if memory allows; if False, all views are compact.
     whole_views: bool = True
 
     def capacity(self, count: int, share: float) -> int:
@@ -94,12 +73,8 @@ DEFAULT = Fit()
 class ViewSize:
     """The size of a view's buffers, apart from their rows.
 
-    Parameters
-    ----------
-    width, height : int
-        Pixels.
-    sort_blocks, tile_blocks : int
-        Work-items of the backend for the depth sort and for the tile lists.
+    `width`, `height`: pixels. `sort_blocks`, `tile_blocks`: work-items of the backend for the depth sort and for the
+    tile lists.
     """
 
     width: int

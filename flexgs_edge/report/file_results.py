@@ -139,18 +139,10 @@ class ScoreResult:
 
 @dataclass(frozen=True)
 class VerifyResult:
-    """Result of `verify`: the parts of a file and their verdicts.
+    """Result of `verify`: the parts of a file and their verdicts."""
 
-    Parameters
-    ----------
-    path : str
-        The file.
-    sections : tuple of Section
-        Name, offset, bytes and verdict of each part, in the order of the file.
-    """
-
-    path: str
-    sections: tuple[Section, ...]
+    path: str  # the file
+    sections: tuple[Section, ...]  # name, offset, bytes and verdict of each part, in the order of the file
 
     @property
     def ok(self) -> bool:
@@ -217,23 +209,14 @@ class TrimResult:
 class ViewResult:
     """Result of `view`: the scene that was shown, and where.
 
-    Parameters
-    ----------
-    scene : SceneInfo
-        The input.
-    size, views : int
-        Bytes of the `.fgs` that was shown, and cameras to choose from.
-    place : str
-        The page that was written, or the address that was served.
-    page_size : int or None
-        Bytes of the page that was written.
+    `size`, `views`: bytes of the `.fgs` that was shown, and cameras to choose from.
     """
 
-    scene: SceneInfo
+    scene: SceneInfo  # the input
     size: int
     views: int
-    place: str
-    page_size: int | None
+    place: str  # the page that was written, or the address that was served
+    page_size: int | None  # bytes of the page that was written
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
@@ -260,21 +243,11 @@ class ViewResult:
 
 @dataclass(frozen=True)
 class DevicesResult:
-    """Result of `devices`: the OpenCL devices, and the chosen one.
+    """Result of `devices`: the OpenCL devices, and the chosen one."""
 
-    Parameters
-    ----------
-    devices : tuple of DeviceInfo
-        Limits and self-test verdict of each device.
-    chosen : int or None
-        Index of the chosen device; `None` if no device works, or not the one asked for.
-    reason : str
-        Why this device was chosen, or why none was.
-    """
-
-    devices: tuple[DeviceInfo, ...]
-    chosen: int | None
-    reason: str
+    devices: tuple[DeviceInfo, ...]  # limits and self-test verdict of each device
+    chosen: int | None  # index of the chosen device; `None` if no device works, or not the one asked for
+    reason: str  # why this device was chosen, or why none was
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""

@@ -49,28 +49,17 @@ _STYLE: dict[Any, Any] = {
 class Series:
     """Points of one kind. Points whose y is None are left out.
 
-    Parameters
-    ----------
-    label : str
-        Name in the legend.
-    x, y : sequence
-        Coordinates of the points.
-    line : bool
-        Join the points by a line.
-    published : bool
-        The figures come from the paper and not from this run: draw grey, open marks.
-    notes : sequence of str
-        Text beside each point.
-    broken : sequence of float
-        x of points to cross out, where quality counts as broken. Points without a y are crossed out at the top of the chart.
+    `x`, `y`: coordinates of the points.
     """
 
-    label: str
+    label: str  # name in the legend
     x: Sequence[float]
     y: Sequence[float | None]
-    line: bool = True
-    published: bool = False
-    notes: Sequence[str] = ()
+    line: bool = True  # join the points by a line
+    published: bool = False  # the figures come from the paper and not from this run: draw grey, open marks
+    notes: Sequence[str] = ()  # text beside each point
+    # x of points to cross out, where quality counts as broken. Points without a y are crossed out at the top of the
+    # chart.
     broken: Sequence[float] = ()
 
 
@@ -78,114 +67,65 @@ class Series:
 class LineChart:
     """Curves over a common axis.
 
-    Parameters
-    ----------
-    limit : float, optional
-        Mark this y with a line, such as a target.
-    doublings : bool
-        Show x in powers of two.
-    megabytes : bool
-        Show x in MB, on a log scale.
-    magnitudes : bool
-        Show y on a log scale that is linear below `LINEAR_BELOW`, for losses below and far above 1 dB in one chart.
-    floating : bool
-        y need not start at zero, such as for fidelity.
-    log_x, log_y : bool
-        Use a plain log scale, such as for times. All values must be above zero.
-    front : sequence of (x, y)
-        Pareto front: points that no other point beats, joined by steps under the series.
-    upright : (x, str), optional
-        Mark this x with a line and its text: a point without a y.
+    `log_x`, `log_y`: use a plain log scale, such as for times. All values must be above zero.
     """
 
     title: str
     x_label: str
     y_label: str
     series: tuple[Series, ...]
-    limit: float | None = None
-    doublings: bool = False
+    limit: float | None = None  # mark this y with a line, such as a target
+    doublings: bool = False  # show x in powers of two
+    # Show y on a log scale that is linear below `LINEAR_BELOW`, for losses below and far above 1 dB in one chart.
     magnitudes: bool = False
-    megabytes: bool = False
-    floating: bool = False
+    megabytes: bool = False  # show x in MB, on a log scale
+    floating: bool = False  # y need not start at zero, such as for fidelity
     log_x: bool = False
     log_y: bool = False
+    # Pareto front: points that no other point beats, joined by steps under the series.
     front: Sequence[tuple[float, float]] = ()
-    upright: tuple[float, str] | None = None
+    upright: tuple[float, str] | None = None  # mark this x with a line and its text: a point without a y
 
 
 @dataclass(frozen=True)
 class BarChart:
-    """Grouped bars from zero, each with its value.
-
-    Parameters
-    ----------
-    groups : sequence of str
-        Along the axis.
-    bars : dict
-        One value per group, by label.
-    limit : float, optional
-        Mark this level with a line, and bars above it with a cross.
-    """
+    """Grouped bars from zero, each with its value."""
 
     title: str
     y_label: str
-    groups: Sequence[str]
-    bars: dict[str, Sequence[float | None]]
+    groups: Sequence[str]  # along the axis
+    bars: dict[str, Sequence[float | None]]  # one value per group, by label
     digits: int = 2
-    limit: float | None = None
+    limit: float | None = None  # mark this level with a line, and bars above it with a cross
 
 
 @dataclass(frozen=True)
 class DotChart:
-    """Grouped dots on a log axis with text beside them, for values of many magnitudes.
-
-    Parameters
-    ----------
-    groups : sequence of str
-        Along the axis.
-    dots : dict
-        One value per group, by label. Values of zero or below stand at the bottom as "none". None is left out.
-    words : dict
-        Text beside each dot, arranged as `dots`.
-    """
+    """Grouped dots on a log axis with text beside them, for values of many magnitudes."""
 
     title: str
     y_label: str
-    groups: Sequence[str]
+    groups: Sequence[str]  # along the axis
+    # One value per group, by label. Values of zero or below stand at the bottom as "none". None is left out.
     dots: dict[str, Sequence[float | None]]
-    words: dict[str, Sequence[str]]
+    words: dict[str, Sequence[str]]  # text beside each dot, arranged as `dots`
 
 
 @dataclass(frozen=True)
 class PlaneChart:
-    """A grid of cells over the prune rate and the SH rate, with lines and points on it.
-
-    Parameters
-    ----------
-    cells : dict
-        Value of each cell, by its centre (x, y).
-    step : float
-        Side of a cell.
-    top : float
-        Values from here up share the last colour.
-    frontier : sequence of (x, y)
-        Line on which the limit is reached.
-    marked : sequence of (x, y)
-        Cells to mark with a dot: the paper's candidates.
-    path : sequence of (x, y)
-        Points that a search visited, in order. The last one is its result.
-    """
+    """A grid of cells over the prune rate and the SH rate, with lines and points on it."""
 
     title: str
     x_label: str
     y_label: str
     colour_label: str
-    cells: dict[tuple[float, float], float]
-    step: float
-    top: float
-    frontier: Sequence[tuple[float, float]]
+    cells: dict[tuple[float, float], float]  # value of each cell, by its centre (x, y)
+    step: float  # side of a cell
+    top: float  # values from here up share the last colour
+    frontier: Sequence[tuple[float, float]]  # line on which the limit is reached
     frontier_label: str
-    marked: Sequence[tuple[float, float]]
+    marked: Sequence[tuple[float, float]]  # cells to mark with a dot: the paper's candidates
+    # Points that a search visited, in order. The last one is its result.
     path: Sequence[tuple[float, float]] = field(default=())
     answer: tuple[float, float] | None = None
 

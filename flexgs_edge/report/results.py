@@ -36,68 +36,15 @@ from flexgs_edge.units import format_size
 class CompressResult:
     """Result of `compress`.
 
-    Parameters
-    ----------
-    scene, views : SceneInfo, ViewsInfo or None
-        The input scene, and the views; `views` is `None` for a run without cameras.
-    output : str or None
-        The file written; `None` in a dry run.
-    size : int
-        Bytes of the file. A dry run gives the exact size that the file would have.
-    count, sh_count : int
-        Gaussians kept, and those of them with SH above degree 0.
-    prune_rate, sh_rate : float
-        Shares of all Gaussians: those removed, and those kept without their SH.
-    method, score, select : str
-        Options of the run.
-    bits : dict
-        Bits per attribute (`paper`).
-    groups : dict
-        Quantization groups per channel, by attribute (`paper`).
-    steps : dict or None
-        Step sizes by attribute (`best`).
-    target : str or None
-        The target in words; `None` for fixed rates.
-    decided_by : str or None
-        `drop`, `modelled drop`, `fidelity` or `size`; `None` for fixed rates.
-    reached : bool or None
-        Whether the deciding views meet the target; `None` for fixed rates.
-    decision_views : str
-        The kind of views that decided: `held-out`, `training` or `none`.
-    search : SearchResult or None
-        Every step of the search; `None` for fixed rates.
-    sensitivity : tuple of Sensitivity
-        Loss per attribute and bit width, as `--bits auto` measured it.
-    quality : Quality or None
-        Quality of the decoded file over `quality_views`; `None` without cameras.
-    quality_views : str
-        The kind of views that `quality` is measured on: `held-out`, `training` or `none`.
-    score_cache : str or None
-        File that keeps the scores between runs.
-    scores_reused : bool
-        Whether the scores came from that file.
-    run : RunInfo
-        Times, memory and device.
-    format : str
-        `fgs`, `spz`, `sog` or `compressed.ply`.
-    file_sh_degree : int or None
-        SH degree of the file.
-    scored : Scored or None
-        Scored views and unseen Gaussians of a search by measured costs (`best`).
-    training_fidelity : float or None
-        Fidelity of the decoded file on some training views, dB. Measured only if `quality` comes from held-out views.
-    warnings : tuple of str
-        Reasons to trust the figures less. Each names a number and what to do.
-    promise : KeptPromise or None
-        How the bounds beside the target stand on the deciding views; `None` without such bounds.
-    preview_bytes : int
-        Bytes of the file that are its preview (`best`); 0 if it has none.
+    `scene`, `views`: the input scene, and the views; `views` is `None` for a run without cameras. `count`, `sh_count`:
+    Gaussians kept, and those of them with SH above degree 0. `prune_rate`, `sh_rate`: shares of all Gaussians: those
+    removed, and those kept without their SH. `method`, `score`, `select`: options of the run.
     """
 
     scene: SceneInfo
     views: ViewsInfo | None
-    output: str | None
-    size: int
+    output: str | None  # the file written; `None` in a dry run
+    size: int  # Bytes of the file. A dry run gives the exact size that the file would have.
     count: int
     sh_count: int
     prune_rate: float
@@ -105,27 +52,29 @@ class CompressResult:
     method: str
     score: str | None
     select: str
-    bits: dict[str, int]
-    groups: dict[str, int]
-    steps: dict[str, Any] | None
-    target: str | None
-    decided_by: str | None
-    reached: bool | None
-    decision_views: str
-    search: SearchResult | None
-    sensitivity: tuple[Sensitivity, ...]
-    quality: Quality | None
-    quality_views: str
-    score_cache: str | None
-    scores_reused: bool
-    run: RunInfo
-    format: str = "fgs"
-    file_sh_degree: int | None = None
-    scored: Scored | None = None
+    bits: dict[str, int]  # bits per attribute (`paper`)
+    groups: dict[str, int]  # quantization groups per channel, by attribute (`paper`)
+    steps: dict[str, Any] | None  # step sizes by attribute (`best`)
+    target: str | None  # the target in words; `None` for fixed rates
+    decided_by: str | None  # `drop`, `modelled drop`, `fidelity` or `size`; `None` for fixed rates
+    reached: bool | None  # whether the deciding views meet the target; `None` for fixed rates
+    decision_views: str  # the kind of views that decided: `held-out`, `training` or `none`
+    search: SearchResult | None  # every step of the search; `None` for fixed rates
+    sensitivity: tuple[Sensitivity, ...]  # loss per attribute and bit width, as `--bits auto` measured it
+    quality: Quality | None  # quality of the decoded file over `quality_views`; `None` without cameras
+    quality_views: str  # the kind of views that `quality` is measured on: `held-out`, `training` or `none`
+    score_cache: str | None  # file that keeps the scores between runs
+    scores_reused: bool  # whether the scores came from that file
+    run: RunInfo  # times, memory and device
+    format: str = "fgs"  # `fgs`, `spz`, `sog` or `compressed.ply`
+    file_sh_degree: int | None = None  # SH degree of the file
+    scored: Scored | None = None  # scored views and unseen Gaussians of a search by measured costs (`best`)
+    # Fidelity of the decoded file on some training views, dB. Measured only if `quality` comes from held-out views.
     training_fidelity: float | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # Reasons to trust the figures less. Each names a number and what to do.
+    # How the bounds beside the target stand on the deciding views; `None` without such bounds.
     promise: KeptPromise | None = None
-    preview_bytes: int = 0
+    preview_bytes: int = 0  # bytes of the file that are its preview (`best`); 0 if it has none
 
     @property
     def ratio(self) -> float:

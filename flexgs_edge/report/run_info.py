@@ -13,31 +13,20 @@ PLY_HEADER_MOST = 4096
 class RunInfo:
     """Times, memory and device of a run.
 
-    Parameters
-    ----------
-    seconds : float
-        Wall seconds of the whole run.
-    stages : dict
-        Wall seconds by stage, in order of first entry.
-    startup_seconds, compile_seconds : float
-        Seconds to open the device, and to build kernels. The stages that first needed them include both.
-    memory_limit, peak_memory : int
-        The limit, and the largest resident memory of the process, bytes. With scratch files the peak includes their cached
-        pages, which the operating system keeps until it needs the memory.
-    peak_anonymous, scratch : int or None
-        The largest sampled resident memory that no file backs, and the most bytes in scratch files. `None` without scratch
-        files.
-    device : dict or None
-        The device that ran the kernels; `None` if nothing was drawn.
+    `startup_seconds`, `compile_seconds`: seconds to open the device, and to build kernels. The stages that first needed
+    them include both. `memory_limit`, `peak_memory`: the limit, and the largest resident memory of the process, bytes.
+    With scratch files the peak includes their cached pages, which the operating system keeps until it needs the memory.
+    `peak_anonymous`, `scratch`: the largest sampled resident memory that no file backs, and the most bytes in scratch
+    files. `None` without scratch files.
     """
 
-    seconds: float
-    stages: dict[str, float]
+    seconds: float  # wall seconds of the whole run
+    stages: dict[str, float]  # wall seconds by stage, in order of first entry
     startup_seconds: float
     compile_seconds: float
     memory_limit: int
     peak_memory: int
-    device: dict[str, Any] | None
+    device: dict[str, Any] | None  # the device that ran the kernels; `None` if nothing was drawn
     peak_anonymous: int | None = None
     scratch: int | None = None
 
@@ -60,27 +49,17 @@ class RunInfo:
 class SceneInfo:
     """An input scene.
 
-    Parameters
-    ----------
-    path : str
-        As given.
-    count, sh_degree : int
-        Gaussians and SH degree.
-    ply_bytes, ply_bytes_without_normals : int
-        Bytes of the scene as a PLY in INRIA's layout, and without its normals.
-    notes : tuple of str
-        Values that the reader left out or changed.
-    bytes : int or None
-        Bytes of the input file, or of all files that were read; `None` for a scene from memory.
+    `count`, `sh_degree`: Gaussians and SH degree. `ply_bytes`, `ply_bytes_without_normals`: bytes of the scene as a PLY
+    in INRIA's layout, and without its normals.
     """
 
-    path: str
+    path: str  # as given
     count: int
     sh_degree: int
     ply_bytes: int
     ply_bytes_without_normals: int
-    notes: tuple[str, ...] = ()
-    bytes: int | None = None
+    notes: tuple[str, ...] = ()  # values that the reader left out or changed
+    bytes: int | None = None  # bytes of the input file, or of all files that were read; `None` for a scene from memory
 
     @property
     def plain(self) -> bool:

@@ -127,10 +127,7 @@ def output_names(scenes: Sequence[str], suffix: str) -> list[str]:
     >>> output_names(["x/a.ply", "y/a.ply"], ".fgs")
     ['x-a.ply.fgs', 'y-a.ply.fgs']
 
-    Raises
-    ------
-    InputError
-        If two names stay the same.
+    Raises `InputError` if two names stay the same.
     """
     parts = [_parts(scene) for scene in scenes]
     depths = [0] * len(scenes)

@@ -65,21 +65,9 @@ def doubts(
 ) -> tuple[str, ...]:
     """Warnings of a run, as sentences for a person.
 
-    Parameters
-    ----------
-    views : ViewSet
-        All views of the run.
-    scored : Scored or None
-        Numbers of scored views and of unseen Gaussians; `None` if the search measured no costs.
-    count : int
-        Gaussians of the scene.
-    trained, held_out : float or None
-        Mean fidelity on training views and on held-out views, dB; `None` if not measured.
-
-    Returns
-    -------
-    tuple of str
-        Empty if there is nothing to warn of.
+    `views`: all views of the run. `scored`: numbers of scored views and of unseen Gaussians; `None` if the search
+    measured no costs. `count`: Gaussians of the scene. `trained`, `held_out`: mean fidelity on training views and on
+    held-out views, dB; `None` if not measured. Returns empty if there is nothing to warn of.
     """
     found = []
     if trained is not None and held_out is not None and trained - held_out > FIT_GAP:

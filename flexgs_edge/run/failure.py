@@ -16,18 +16,10 @@ TRACEBACKS = logging.getLogger("flexgs_edge.tracebacks")
 
 @dataclass(frozen=True)
 class Failure:
-    """An error in words.
+    """An error in words."""
 
-    Parameters
-    ----------
-    words : str
-        One line that starts in lower case.
-    exit_code : int
-        `INTERNAL` for a fault of ours.
-    """
-
-    words: str
-    exit_code: int
+    words: str  # one line that starts in lower case
+    exit_code: int  # `INTERNAL` for a fault of ours
 
     @property
     def line(self) -> str:

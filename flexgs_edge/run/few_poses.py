@@ -24,29 +24,15 @@ MADE_FROM = 6
 
 
 class FewPoses:
-    """Renders of the original from a few poses, and the fidelity of other scenes there.
-
-    Parameters
-    ----------
-    renderer : Renderer
-        Draws both scenes.
-    original : DeviceScene
-        The loaded original; the constructor draws its references.
-    cameras : sequence of Camera
-        The poses, at full resolution.
-    covered_decides : bool
-        As for `Quality`: fidelity is over covered pixels.
-    progress : Progress, optional
-        Shows a bar while the references are drawn.
-    """
+    """Renders of the original from a few poses, and the fidelity of other scenes there."""
 
     def __init__(
         self,
-        renderer: Renderer,
-        original: DeviceScene,
-        cameras: Sequence[Camera],
-        covered_decides: bool,
-        progress: Progress = SILENT,
+        renderer: Renderer,  # draws both scenes
+        original: DeviceScene,  # the loaded original; the constructor draws its references
+        cameras: Sequence[Camera],  # the poses, at full resolution
+        covered_decides: bool,  # as for `Quality`: fidelity is over covered pixels
+        progress: Progress = SILENT,  # shows a bar while the references are drawn
     ) -> None:
         self._renderer = renderer
         self._cameras = [camera.every(STEP) for camera in cameras]

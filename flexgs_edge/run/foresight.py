@@ -24,17 +24,9 @@ def foresee(
 
     Call it before the device is opened, and again when it is open.
 
-    Parameters
-    ----------
-    run : Run
-        With views.
-    opened : bool
-        The device is open, and its memory is taken from the budget.
-    search : callable, optional
-        Bytes that the search, or what the command does in its place, needs beside the comparison of views. Default: those
-        of drawing one view.
-    compares : bool
-        Views are compared (default), not drawn alone.
+    `run`: with views. `opened`: the device is open, and its memory is taken from the budget. `search`: bytes that the
+    search, or what the command does in its place, needs beside the comparison of views. Default: those of drawing one
+    view. `compares`: views are compared (default), not drawn alone.
     """
     budget, plan, views = run.budget, run.plan, run.seen
     reporting = views.held_out or views.train

@@ -22,12 +22,7 @@ from flexgs_edge.views.bench import Bench
 class Judges:
     """The judge that decides and the one that reports, the same object unless training poses decide; close when done.
 
-    Parameters
-    ----------
-    run : Run
-        Planned, with views.
-    bench : Bench
-        Draws.
+    `run`: planned, with views. `bench`: draws.
     """
 
     def __init__(self, run: Run[Any], bench: Bench) -> None:

@@ -18,22 +18,9 @@ from flexgs_edge.views.worker import Drawing
 def open_bench(run: Run[Any], cluster: str | None = None) -> Bench:
     """Open the renderer, and the cluster if there is one. Close the bench when done.
 
-    Parameters
-    ----------
-    run : Run
-        Names the device, and pays for memory.
-    cluster : str, optional
-        Address of a Dask scheduler, or `local:N`. Each worker gets the run's whole memory limit. Default: no cluster.
-
-    Returns
-    -------
-    Bench
-        Opening it is timed as the stages `device` and `cluster`.
-
-    Raises
-    ------
-    DeviceError
-        If the named device does not exist or failed its self-test.
+    `run`: names the device, and pays for memory. `cluster`: address of a Dask scheduler, or `local:N`. Each worker gets
+    the run's whole memory limit. Default: no cluster. Opening it is timed as the stages `device` and `cluster`.
+    Raises `DeviceError` if the named device does not exist or failed its self-test.
     """
     options: ViewOptions = run.options
     assert options.near is not None and options.background is not None

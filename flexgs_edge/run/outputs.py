@@ -14,18 +14,10 @@ from flexgs_edge.run.options import CompressOptions
 
 @dataclass(frozen=True)
 class Output:
-    """Where a compressed scene goes.
+    """Where a compressed scene goes."""
 
-    Parameters
-    ----------
-    path : Path or None
-        The file to write; `None` in a dry run.
-    format : Format or None
-        Another program's format; `None` for a `.fgs`.
-    """
-
-    path: Path | None = None
-    format: Format | None = None
+    path: Path | None = None  # the file to write; `None` in a dry run
+    format: Format | None = None  # another program's format; `None` for a `.fgs`
 
 
 NO_OUTPUT = Output()

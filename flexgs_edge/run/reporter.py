@@ -37,17 +37,8 @@ PAGE, RECORD = "index.html", "result.json"
 class Reporter:
     """Collects the contents of a report during a run, and writes them at the end.
 
-    Parameters
-    ----------
-    folder : path
-        Created at the end if it does not exist. The constructor only checks that it can be written.
-    force : bool
-        Overwrite an earlier report.
-
-    Raises
-    ------
-    InputError
-        If the report cannot be written there.
+    `folder`: created at the end if it does not exist. The constructor only checks that it can be written. `force`:
+    overwrite an earlier report. Raises `InputError` if the report cannot be written there.
     """
 
     def __init__(self, folder: str | Path, force: bool) -> None:

@@ -46,16 +46,9 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
     splats) are valid: they are read as the smallest finite log-scale of the scene. Logits of +-inf (opacities 1 and 0)
     are valid too: they are read as +-`OPACITY_LIMIT`.
 
-    Returns
-    -------
-    SceneSource
-        `source` itself, or a lazy source over it, with a note on the rows that were left out or clamped. A scene whose
-        opacities and scales look activated is warned of.
-
-    Raises
-    ------
-    InputError
-        If the scene is empty or has invalid rows. The message tells how many, in which fields, and the first row.
+    Returns `source` itself, or a lazy source over it, with a note on the rows that were left out or clamped. A scene
+    whose opacities and scales look activated is warned of. Raises `InputError` if the scene is empty or has invalid
+    rows. The message tells how many, in which fields, and the first row.
     """
     if source.count == 0:
         raise InputError(f"{source.name}: the scene is empty: it has no Gaussians")

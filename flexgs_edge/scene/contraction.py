@@ -24,18 +24,10 @@ _SAMPLE, _FEWEST = 4096, 32
 
 @dataclass(frozen=True)
 class Contraction:
-    """A contraction of positions.
+    """A contraction of positions."""
 
-    Parameters
-    ----------
-    centre : tuple of float
-        Relative to the scene's origin.
-    radius : float
-        Positions within it stay as they are.
-    """
-
-    centre: tuple[float, float, float]
-    radius: float
+    centre: tuple[float, float, float]  # relative to the scene's origin
+    radius: float  # positions within it stay as they are
 
     def contract(self, means: np.ndarray) -> np.ndarray:
         """[3, n] f64, contracted positions."""

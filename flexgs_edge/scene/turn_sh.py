@@ -48,10 +48,7 @@ def band_matrices(turn: np.ndarray, degree: int = MAX_SH_DEGREE) -> list[np.ndar
 
     `turn`: [3, 3] f64, orthogonal; mirrors are allowed.
 
-    Returns
-    -------
-    list of np.ndarray
-        [2 l + 1, 2 l + 1] f64 for l = 1 to `degree`: new coefficients from old ones.
+    Returns [2 l + 1, 2 l + 1] f64 for l = 1 to `degree`: new coefficients from old ones.
     """
     directions = _spread(_DIRECTIONS)
     before, after = sh_functions(degree, product(turn.T, directions)), sh_functions(degree, directions)

@@ -58,32 +58,16 @@ class Point:
 
 
 class StudyScene:
-    """A scene, its judge and everything measured so far.
-
-    Parameters
-    ----------
-    name : str
-        Name of the scene, for tables and folders.
-    run : Run
-        As for `compress`. The plan's views and figure decide here too.
-    bench : Bench
-        Draws the views.
-    judge : Judge
-        Prepared, with the original's renders.
-    orders : dict
-        [N] i64 by name of the score: rows, least important first.
-    has_sh : np.ndarray
-        [N] bool, rows with SH that are not zero.
-    """
+    """A scene, its judge and everything measured so far."""
 
     def __init__(
         self,
-        name: str,
-        run: Run[CompressOptions],
-        bench: Bench,
-        judge: Judge,
-        orders: dict[str, np.ndarray],
-        has_sh: np.ndarray,
+        name: str,  # name of the scene, for tables and folders
+        run: Run[CompressOptions],  # As for `compress`. The plan's views and figure decide here too.
+        bench: Bench,  # draws the views
+        judge: Judge,  # prepared, with the original's renders
+        orders: dict[str, np.ndarray],  # [N] i64 by name of the score: rows, least important first
+        has_sh: np.ndarray,  # [N] bool, rows with SH that are not zero
     ) -> None:
         self.name, self.run, self.bench, self.judge, self.orders, self.has_sh = name, run, bench, judge, orders, has_sh
         self._evaluators: dict[str, SceneEvaluator] = {}
@@ -213,10 +197,7 @@ def open_study_scene(
 ) -> Iterator[StudyScene]:
     """Open a scene, draw the original's renders and score every Gaussian, as `compress --method paper` does.
 
-    Raises
-    ------
-    FlexGSError
-        As `compress`.
+    Raises `FlexGSError`: As `compress`.
     """
     # Studies compare methods by the mean alone, each with the poses that it is given.
     options = replace(options, promise="mean")

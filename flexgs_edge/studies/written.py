@@ -66,18 +66,10 @@ class SceneStudy:
 
 @dataclass(frozen=True)
 class WrittenStudy:
-    """The results of a study of one scene, and their folder.
+    """The results of a study of one scene, and their folder."""
 
-    Parameters
-    ----------
-    output : str
-        The folder.
-    scene : SceneStudy
-        The results.
-    """
-
-    output: str
-    scene: SceneStudy
+    output: str  # the folder
+    scene: SceneStudy  # the results
 
     command: ClassVar[str]
 

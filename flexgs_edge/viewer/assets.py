@@ -43,13 +43,8 @@ def entries_of(kind: str) -> dict[str, str]:
 def web_files(version: int = 1, kind: str = PLAIN) -> dict[str, str]:
     """Texts of all files that the viewer needs, by their path below `web/`.
 
-    Parameters
-    ----------
-    version : int
-        Container version of the scene. A page of a scene of version 2 reads no other files, so that it is short; one of a
-        scene of version 1 reads both.
-    kind : str
-        Kind of the scene.
+    `version`: container version of the scene. A page of a scene of version 2 reads no other files, so that it is short;
+    one of a scene of version 1 reads both. `kind`: kind of the scene.
     """
     folder = web_folder()
     places = [place for pattern in _PATTERNS for place in sorted(folder.glob(pattern))]

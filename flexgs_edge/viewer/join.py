@@ -25,17 +25,8 @@ def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:
     modules but the entries share one scope, since that makes the script shorter: no two of them may have one name at their
     top, and none may import under another name.
 
-    Parameters
-    ----------
-    files : mapping
-        Texts by path.
-    entries : mapping
-        Paths of the modules to run, by name.
-
-    Raises
-    ------
-    ValueError
-        For an import, export or name of a form that is not understood, and for a name that two modules have.
+    `files`: texts by path. `entries`: paths of the modules to run, by name. Raises `ValueError` for an import, export
+    or name of a form that is not understood, and for a name that two modules have.
     """
     parts: dict[str, str] = {}
     for path in entries.values():

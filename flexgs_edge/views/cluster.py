@@ -45,18 +45,9 @@ class Cluster:
 
     Worker processes on this machine take seconds to start. Until then, the caller draws the views itself.
 
-    Parameters
-    ----------
-    address : str
-        Address of a Dask scheduler, such as `tcp://10.0.0.5:8786`, or `local:N` for N single-threaded processes on this
-        machine.
-    drawing : Drawing
-        How workers draw.
-
-    Raises
-    ------
-    InputError
-        If the package is missing, the address is wrong, nobody answers, or workers run another version of this program.
+    `address`: address of a Dask scheduler, such as `tcp://10.0.0.5:8786`, or `local:N` for N single-threaded processes
+    on this machine. `drawing`: how workers draw. Raises `InputError` if the package is missing, the address is wrong,
+    nobody answers, or workers run another version of this program.
     """
 
     _starting: Future[None] | None = None

@@ -35,10 +35,7 @@ def visible_depths(renderer: Renderer, source: SceneSource, cameras: Sequence[Ca
 
     A camera that sees nothing there gets the median of the others. If no camera sees anything, all get 1.
 
-    Returns
-    -------
-    list of float
-        Scene units, one for each camera.
+    Returns scene units, one for each camera.
     """
     means = source.read(slice(0, source.count), ["means"])["means"]
     depths = []

@@ -35,10 +35,7 @@ class DenseSums:
     def of(self, parts: Iterable[Part], base: int) -> Any:
         """Spread listed sums over all rows of the chunk that begins at row `base`; rows not listed get zero.
 
-        Returns
-        -------
-        array of the backend
-            [stride, planes, 2] u32, valid until the next call.
+        Returns [stride, planes, 2] u32, valid until the next call.
         """
         self._backend.mark()()
         # Copying a row as one element is faster than plane by plane.

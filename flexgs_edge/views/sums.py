@@ -38,13 +38,7 @@ Maker = Callable[[Chunk], ChunkSums]
 class ViewSums:
     """Sums over the views of a scene.
 
-    Parameters
-    ----------
-    bench : Bench
-        Draws the views.
-    scene : DeviceScene
-    makers : sequence of callable
-        Each makes one kind of sums for a chunk.
+    `bench`: draws the views. `makers`: each makes one kind of sums for a chunk.
     """
 
     def __init__(self, bench: Bench, scene: DeviceScene, makers: Sequence[Maker]) -> None:
@@ -56,26 +50,15 @@ class ViewSums:
 
     def draw(
         self,
-        kind: str,
+        kind: str,  # name of the method of `Renderer` that gives a view's sums
         cameras: Sequence[Camera],
         references: Callable[[int], np.ndarray] | None = None,
-        pictures: bool = False,
+        pictures: bool = False,  # whether the caller will use the yielded callables
     ) -> Iterator[Callable[[], np.ndarray]]:
         """Draw views and add their sums, one view for each step of the iterator, in order, here or on the cluster.
 
-        Parameters
-        ----------
-        kind : str
-            Name of the method of `Renderer` that gives a view's sums.
-        references : callable, optional
-            Gives the target of a view by its place among `cameras`, if that method takes one.
-        pictures : bool
-            Whether the caller will use the yielded callables.
-
-        Yields
-        ------
-        callable
-            Gives the view's picture for `References.add`; valid until the next step.
+        `references`: gives the target of a view by its place among `cameras`, if that method takes one. Yields gives
+        the view's picture for `References.add`; valid until the next step.
         """
         renderer, scene, cluster = self._renderer, self._scene, self._bench.ready_cluster
         if cluster is None or scene.source is None:

@@ -24,24 +24,13 @@ ONE = 256
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """Rows of one pass, and their neighbours.
+    """Rows of one pass, and their neighbours."""
 
-    Parameters
-    ----------
-    rows : slice
-        The rows, with a step.
-    known : slice
-        The rows decoded before.
-    weights : np.ndarray or None
-        [2 * reach, m] f32 weights of the neighbours, with a sum of about 256; None for the first pass.
-    stride : int
-        `rows` holds one in so many rows of the pass; 1 for all.
-    """
-
-    rows: slice
-    known: slice
+    rows: slice  # the rows, with a step
+    known: slice  # the rows decoded before
+    # [2 * reach, m] f32 weights of the neighbours, with a sum of about 256; None for the first pass.
     weights: np.ndarray | None
-    stride: int = 1
+    stride: int = 1  # `rows` holds one in so many rows of the pass; 1 for all
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +44,8 @@ class Plan:
 def plan_passes(position: np.ndarray, reach: int, stride: int = 1) -> Plan:
     """Plan the passes over the rows of a chunk.
 
-    Parameters
-    ----------
-    position : np.ndarray
-        [3, n], integer cells.
-    reach : int
-        Neighbours on each side.
-    stride : int, optional
-        Take a sample of one in so many rows of each pass; 1 by default, for all rows.
+    `position`: [3, n], integer cells. `reach`: neighbours on each side. `stride`: take a sample of one in so many rows
+    of each pass; 1 by default, for all rows.
     """
     count = position.shape[1]
     near = Features(1, count)
@@ -106,12 +89,7 @@ def _neighbours(known: np.ndarray, count: int, reach: int, stride: int) -> np.nd
 def neighbour_features(values: np.ndarray, step: Pass) -> tuple[np.ndarray, ...]:
     """Weighted mean and spread of the neighbours in a pass, each [m] f32 in 1/256; an empty tuple in the first pass.
 
-    Parameters
-    ----------
-    values : np.ndarray
-        [n] f32 values of the channel; those at `step.known` are decoded.
-    step : Pass
-        The pass.
+    `values`: [n] f32 values of the channel; those at `step.known` are decoded. `step`: the pass.
     """
     if step.weights is None:
         return ()

@@ -16,18 +16,8 @@ def decode_chunk(
 ) -> ChunkCodes:
     """Decode the codes of a chunk; raises `StreamError` for bytes that no encoder writes.
 
-    Parameters
-    ----------
-    model : Model
-        The model of the file.
-    rows : int
-        Rows of the chunk.
-    data : bytes
-        The whole chunk.
-    base_only : bool, optional
-        Stop before the SH; False by default.
-    cost : np.ndarray, optional
-        [alphabets] f64, to which the bits of each alphabet are added.
+    `model`: the model of the file. `rows`: rows of the chunk. `data`: the whole chunk. `base_only`: stop before the SH;
+    False by default. `cost`: [alphabets] f64, to which the bits of each alphabet are added.
     """
     stream = Decoder(data, lane_count(rows))
     codes = walk_chunk(rows, model.depth, model.sh_degree, DecodePort(model, stream, cost), None, base_only)

@@ -129,24 +129,16 @@ class Encoded:
 
 def encode_grid(
     grid: GridScene,
-    chunk_rows: int = CHUNK_ROWS,
+    chunk_rows: int = CHUNK_ROWS,  # most rows of a chunk
     device: Device | None = None,
-    storage: Storage = IN_MEMORY,
+    storage: Storage = IN_MEMORY,  # holds the symbols: two or three bytes a code beside the grid
     threads: int | None = None,
 ) -> Encoded:
     """Fit a model to a scene and count its symbols; `Encoded.streams` then codes the chunks.
 
-    Parameters
-    ----------
-    grid : GridScene
-    chunk_rows : int
-        Most rows of a chunk.
-    device : Device, optional
-        Counts the symbols, with the same result. It takes a kilobyte for each row of the chunks in work.
-    storage : Storage
-        Holds the symbols: two or three bytes a code beside the grid.
-    threads : int, optional
-        Groups that are fitted at once, and chunks that NumPy codes at once. Default: as many as suit this machine.
+    `device`: counts the symbols, with the same result. It takes a kilobyte for each row of the chunks in work.
+    `threads`: groups that are fitted at once, and chunks that NumPy codes at once. Default: as many as suit this
+    machine.
     """
     cells, low, depth = cells_of(grid, storage)
     layers = np.bincount(grid.layer, minlength=1).tolist()

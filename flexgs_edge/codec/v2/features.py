@@ -20,17 +20,8 @@ _PRODUCT = 1 << 17
 class Features:
     """Features of all rows, and a bound on each feature.
 
-    Parameters
-    ----------
-    width, count : int
-        Number of features and of rows.
-
-    Attributes
-    ----------
-    values : np.ndarray
-        [width, count] f32, integers in 1/256.
-    largest : np.ndarray
-        [width] f64, the largest magnitude of each feature.
+    `width`, `count`: number of features and of rows. `values`: [width, count] f32, integers in 1/256. `largest`:
+    [width] f64, the largest magnitude of each feature.
     """
 
     def __init__(self, width: int, count: int) -> None:

@@ -24,15 +24,8 @@ nothing."""
 def fit_levels(counts: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Levels of all alphabets.
 
-    Parameters
-    ----------
-    counts : sequence of np.ndarray
-        For each alphabet, [t, a] i64, the symbols of each table; t is at least 1.
-
-    Returns
-    -------
-    list of np.ndarray
-        For each alphabet, [t, a] u8. A symbol that was counted has a level above 0.
+    `counts`: for each alphabet, [t, a] i64, the symbols of each table; t is at least 1. Returns for each alphabet, [t,
+    a] u8. A symbol that was counted has a level above 0.
     """
     levels = [to_levels(rows) for rows in counts]
     for _ in range(ROUNDS):

@@ -32,22 +32,8 @@ _ROTATION_STEP_MOST = 2.0**38
 class GridSource(SceneSource):
     """A `.fgs` file of version 2 as a scene.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    container : GridContainer, optional
-        The file, if it is open, or its `Preview`.
-
-    Attributes
-    ----------
-    settings : dict
-        How the file was made.
-
-    Raises
-    ------
-    FormatError
-        If the file differs from the format; a damaged chunk raises it when it is read.
+    `path`: the file. `container`: the file, if it is open, or its `Preview`. `settings`: how the file was made. Raises
+    `FormatError` if the file differs from the format; a damaged chunk raises it when it is read.
     """
 
     def __init__(self, path: str | os.PathLike[str], container: GridContainer | None = None) -> None:
@@ -137,12 +123,8 @@ class GridSource(SceneSource):
     def on_device(self, device: Device, chunks: int) -> Iterator[None]:
         """Decode on a device inside this context, several chunks at once; the results are the same.
 
-        Parameters
-        ----------
-        device : Device
-            A kernel backend whose work-items run as threads of a processor.
-        chunks : int
-            Chunks decoded at once; see `device_bytes` for their memory.
+        `device`: a kernel backend whose work-items run as threads of a processor. `chunks`: chunks decoded at once; see
+        `device_bytes` for their memory.
         """
         longest = max((entry.section.length for entry in self._entries), default=0)
         self._kernel = ChunkKernel(device, self._model, self._most_rows, longest, chunks)
@@ -179,10 +161,7 @@ class GridSource(SceneSource):
     def whole_in_order(self, threads: int) -> Iterator[None]:
         """Decode chunks ahead inside this context, in which all fields of all rows are read from first to last.
 
-        Parameters
-        ----------
-        threads : int
-            Chunks that are held beside the current one; 1 decodes none ahead. A device decodes one group ahead.
+        `threads`: chunks that are held beside the current one; 1 decodes none ahead. A device decodes one group ahead.
         """
         if self._kernel is not None:
             self._tables = in_order(self._tables_of, self._groups(), 1, always=True)

@@ -54,47 +54,23 @@ _OPTIONAL = "channels", "preview_bytes"
 class GridHeader:
     """The header of a version 2 file.
 
-    Parameters
-    ----------
-    count, sh_degree : int
-        As in `GridScene`.
-    origin : tuple of float
-        World position that positions are relative to.
-    steps : dict
-        The step sizes, from `StepSizes.to_json`.
-    layers : tuple of int
-        Rows of each layer.
-    chunk_rows : int
-        Rows of a chunk; the last chunk of a layer may have fewer.
-    depth : int
-        Levels of the octrees.
-    low : tuple of int
-        Position code of the octrees' first cell.
-    model_bytes : int
-        Bytes of the model.
-    settings : dict
-        How the file was made.
-    cut_from : dict or None
-        `bytes`, `count` and `layers` of the file that this one was cut from.
-    channels : Channels or None
-        Sizes that readers need not decode chunks for; None in files that were cut, and in files of early writers.
-    preview_bytes : int or None
-        Bytes of the preview, a small file of the same scene; None if there is none.
+    `count`, `sh_degree`: as in `GridScene`.
     """
 
     count: int
     sh_degree: int
-    origin: tuple[float, float, float]
-    steps: dict[str, Any]
-    layers: tuple[int, ...]
-    chunk_rows: int
-    depth: int
-    low: tuple[int, int, int]
-    model_bytes: int
-    settings: dict[str, Any]
-    cut_from: dict[str, int] | None = None
+    origin: tuple[float, float, float]  # world position that positions are relative to
+    steps: dict[str, Any]  # the step sizes, from `StepSizes.to_json`
+    layers: tuple[int, ...]  # rows of each layer
+    chunk_rows: int  # rows of a chunk; the last chunk of a layer may have fewer
+    depth: int  # levels of the octrees
+    low: tuple[int, int, int]  # position code of the octrees' first cell
+    model_bytes: int  # bytes of the model
+    settings: dict[str, Any]  # how the file was made
+    cut_from: dict[str, int] | None = None  # `bytes`, `count` and `layers` of the file that this one was cut from
+    # Sizes that readers need not decode chunks for; None in files that were cut, and in files of early writers.
     channels: Channels | None = None
-    preview_bytes: int | None = None
+    preview_bytes: int | None = None  # bytes of the preview, a small file of the same scene; None if there is none
     block: int = 0
     version: int = 2
 

@@ -115,25 +115,9 @@ def walk_chunk(
 ) -> ChunkCodes:
     """Code a chunk.
 
-    Parameters
-    ----------
-    rows : int
-        Rows of the chunk.
-    depth : int
-        Depth of the octree.
-    sh_degree : int
-        SH degree of the scene.
-    port : Port
-        Codes the batches.
-    codes : ChunkCodes, optional
-        Codes to encode; None to decode.
-    base_only : bool
-        Stop before the SH.
-
-    Returns
-    -------
-    ChunkCodes
-        The codes; without SH if `base_only`.
+    `rows`: rows of the chunk. `depth`: depth of the octree. `sh_degree`: SH degree of the scene. `port`: codes the
+    batches. `codes`: codes to encode; None to decode. `base_only`: stop before the SH. Returns the codes; without SH if
+    `base_only`.
     """
     cells = walk_positions(rows, depth, port, codes)
     position = unmorton(cells)

@@ -32,24 +32,14 @@ MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
 
 @dataclass
 class RemovalCosts:
-    """Squared errors summed over pixels, three channels and the scored poses.
+    """Squared errors summed over pixels, three channels and the scored poses."""
 
-    Attributes
-    ----------
-    removal : np.ndarray
-        [N] f64, cost of removing the Gaussian. It is exact if the hits of all other splats stay the same.
-    weight2 : np.ndarray
-        [N] f64, sum of squared weights (alpha T)^2; 0 for Gaussians that no pose sees.
-    sh : np.ndarray
-        [D, N] f64, cost of keeping SH only up to degree L = 0 .. D-1, with `sh_mean[L]` added to the colour.
-    sh_mean : np.ndarray
-        [D, 3, N] f32, mean colour over poses (weighted by weight2) of the bands above L.
-    """
-
+    # [N] f64, cost of removing the Gaussian. It is exact if the hits of all other splats stay the same.
     removal: np.ndarray
-    weight2: np.ndarray
+    weight2: np.ndarray  # [N] f64, sum of squared weights (alpha T)^2; 0 for Gaussians that no pose sees
+    # [D, N] f64, cost of keeping SH only up to degree L = 0 .. D-1, with `sh_mean[L]` added to the colour.
     sh: np.ndarray
-    sh_mean: np.ndarray
+    sh_mean: np.ndarray  # [D, 3, N] f32, mean colour over poses (weighted by weight2) of the bands above L
 
     @classmethod
     def of(cls, parts: Sequence[CostParts], storage: Storage = IN_MEMORY) -> RemovalCosts:
@@ -81,17 +71,13 @@ class RemovalCosts:
 class CostParts:
     """Sums over a part of the poses, from which costs are computed; sums over other parts can be added.
 
-    Attributes
-    ----------
-    removal, weight2 : np.ndarray
-        [N] f64, as in `RemovalCosts`.
-    moments : np.ndarray
-        [D, 4, N] f64, sums over the colour of the bands above each degree: three of squared weight times colour, one of
-        squared weight times squared colour.
+    `removal`, `weight2`: [N] f64, as in `RemovalCosts`.
     """
 
     removal: np.ndarray
     weight2: np.ndarray
+    # [D, 4, N] f64, sums over the colour of the bands above each degree: three of squared weight times colour, one of
+    # squared weight times squared colour.
     moments: np.ndarray
 
     def take(self, rows: np.ndarray, storage: Storage = IN_MEMORY) -> CostParts:
@@ -111,12 +97,8 @@ PART_NAMES = ("removal", "weight2", "moments")
 def cost_sums(renderer: Renderer, degree: int, first: int = 0) -> Maker:
     """Maker of the sums over views from which costs are computed.
 
-    Parameters
-    ----------
-    degree : int
-        SH degree of the scene, or 0 to leave the costs of dropping SH degrees out.
-    first : int
-        Plane of a view's sums at which the removal sums begin.
+    `degree`: SH degree of the scene, or 0 to leave the costs of dropping SH degrees out. `first`: plane of a view's
+    sums at which the removal sums begin.
     """
     return partial(_ChunkCosts, renderer, degree, first)
 
@@ -139,27 +121,13 @@ def put_costs(parts: CostParts, rows: slice, sums: Any) -> None:
 
 
 def measure_costs(
-    bench: Bench,
-    scene: DeviceScene,
-    cameras: Sequence[Camera],
-    sh_costs: bool = True,
-    progress: Progress = SILENT,
+    bench: Bench,  # draws the views
+    scene: DeviceScene,  # loaded with room for the sums of this pass
+    cameras: Sequence[Camera],  # the scored poses
+    sh_costs: bool = True,  # Measure the costs of dropping SH degrees too (default). Otherwise their arrays are empty.
+    progress: Progress = SILENT,  # told of each view
 ) -> RemovalCosts:
-    """Measure costs in one pass, which takes about twice the time of rendering the poses.
-
-    Parameters
-    ----------
-    bench : Bench
-        Draws the views.
-    scene : DeviceScene
-        Loaded with room for the sums of this pass.
-    cameras : sequence of Camera
-        The scored poses.
-    sh_costs : bool
-        Measure the costs of dropping SH degrees too (default). Otherwise their arrays are empty.
-    progress : Progress
-        Told of each view.
-    """
+    """Measure costs in one pass, which takes about twice the time of rendering the poses."""
     degree = scene.sh_degree if sh_costs else 0
     costs = ViewSums(bench, scene, [cost_sums(bench.renderer, degree)])
     try:

@@ -49,21 +49,11 @@ def rate_from(fidelity: float | None) -> float:
 
 @dataclass(frozen=True)
 class Descents:
-    """The descents of a search.
+    """The descents of a search."""
 
-    Parameters
-    ----------
-    steps : int
-        Of the descent to a candidate; 0 for none.
-    poses : int
-        Scored poses.
-    lead : float
-        By how much SSIM is nearer to its bound than the mean, as for `structure_of`.
-    """
-
-    steps: int
-    poses: int
-    lead: float = 0.0
+    steps: int  # of the descent to a candidate; 0 for none
+    poses: int  # scored poses
+    lead: float = 0.0  # by how much SSIM is nearer to its bound than the mean, as for `structure_of`
 
     @property
     def passes(self) -> float:

@@ -23,12 +23,8 @@ SETTINGS_MOST = 1536
 class GridCoder:
     """Codes grids. The last one stays coded, so that writing it only copies bytes.
 
-    Parameters
-    ----------
-    renderer : Renderer
-        Its device codes if it can.
-    settings_room : int
-        Most bytes of the settings in the header. The search counts them before they are known.
+    `renderer`: its device codes if it can. `settings_room`: most bytes of the settings in the header. The search counts
+    them before they are known.
     """
 
     def __init__(self, renderer: Renderer, settings_room: int = SETTINGS_MOST) -> None:

@@ -45,37 +45,17 @@ results that are too large can be trimmed: docs/results/tuning.md#landing"""
 class GridMaker:
     """Makes grids that are coded in container version 2; a `Maker`.
 
-    Parameters
-    ----------
-    rounds : PruneRounds
-        Rounds of pruning; more are done when they are needed.
-    size_of : callable
-        Bytes of a grid's file.
-    measure : callable
-        Quality of planes.
-    effort : Effort
-        How much work to spend.
-    refit : bool
-        Refit the colours of each candidate (default).
-    steps : int
-        Views that the descent to a candidate looks at. 0 (default): colours are refitted instead.
-    see : callable, optional
-        Scores poses beside these of the views that decide, as `Maker.see`.
-
-    Attributes
-    ----------
-    selection : Selection
-        Which Gaussians stay.
+    `see`: scores poses beside these of the views that decide, as `Maker.see`. `selection`: which Gaussians stay.
     """
 
     def __init__(
         self,
-        rounds: PruneRounds,
-        size_of: Callable[[GridScene], int],
-        measure: Measure,
-        effort: Effort,
-        refit: bool = True,
-        steps: int = 0,
+        rounds: PruneRounds,  # rounds of pruning; more are done when they are needed
+        size_of: Callable[[GridScene], int],  # bytes of a grid's file
+        measure: Measure,  # quality of planes
+        effort: Effort,  # how much work to spend
+        refit: bool = True,  # refit the colours of each candidate (default)
+        steps: int = 0,  # Views that the descent to a candidate looks at. 0 (default): colours are refitted instead.
         see: Callable[[Sequence[int], int], bool] | None = None,
     ) -> None:
         self.rounds, self.size_of, self.measure = rounds, size_of, measure

@@ -26,16 +26,8 @@ class Measure(Protocol):
 class Guess:
     """Guesses the excess of planes.
 
-    Parameters
-    ----------
-    measure : callable
-        Quality of planes.
-
-    Attributes
-    ----------
-    lead : float
-        By how much SSIM is nearer to its bound than the mean, as a log. That changes little with compression or by a refit, so it
-        is not measured each time: docs/results/tuning.md#lead
+    `measure`: quality of planes. `lead`: by how much SSIM is nearer to its bound than the mean, as a log. That changes
+    little with compression or by a refit, so it is not measured each time: docs/results/tuning.md#lead
     """
 
     def __init__(self, measure: Measure) -> None:

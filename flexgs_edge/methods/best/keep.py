@@ -55,18 +55,9 @@ def kept_as_it_is(
     Nothing is lost then. Another search would prune and round the scene once more:
     docs/results/tuning.md#kept-as-it-is.
 
-    Parameters
-    ----------
-    run : Run
-        Planned. Only a `.fgs`, or an unchanged PLY that a `.fgs` was decompressed to, lies on a grid.
-    bench : Bench
-        Draws the views.
-    coder : GridCoder
-        Tells the bytes of the file.
-    judge : Judge
-        Prepared on the views that decide.
-    settings_known : bool
-        The header will hold what `make_settings` returns (default). Otherwise the size leaves room for any settings.
+    `run`: planned. Only a `.fgs`, or an unchanged PLY that a `.fgs` was decompressed to, lies on a grid. `bench`: draws
+    the views. `coder`: tells the bytes of the file. `judge`: prepared on the views that decide. `settings_known`: the
+    header will hold what `make_settings` returns (default). Otherwise the size leaves room for any settings.
     """
     source, target = run.source, run.target
     limit, steps = target.limit_bytes, steps_of(source.comments)

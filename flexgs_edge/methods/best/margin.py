@@ -27,16 +27,8 @@ def margin_of(
 ) -> list[Camera]:
     """Five made poses for every eight.
 
-    Parameters
-    ----------
-    renderer : Renderer
-        With nothing loaded.
-    source : SceneSource
-        The original.
-    poses : sequence of Camera
-        Poses that are scored, the most important first.
-    cameras : sequence of Camera
-        All training poses.
+    `renderer`: with nothing loaded. `source`: the original. `poses`: poses that are scored, the most important first.
+    `cameras`: all training poses.
     """
     moved = [place for place in range(len(poses)) if place % EVERY in TIMES]
     depths = dict(zip(moved, visible_depths(renderer, source, [poses[place] for place in moved]), strict=True))

@@ -64,19 +64,9 @@ MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
 def compress(run: Run[CompressOptions], bench: Bench) -> Made:
     """Compress a scene into a `.fgs` of version 2.
 
-    Parameters
-    ----------
-    run : Run
-        Planned, with views and a target.
-    bench : Bench
-        Draws the views. Its renderer gets the storage that the search needs.
-
-    Raises
-    ------
-    TargetError
-        When nothing holds and `best_effort` is not set.
-    BudgetError
-        When the scene does not fit.
+    `run`: planned, with views and a target. `bench`: draws the views. Its renderer gets the storage that the search
+    needs. Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene
+    does not fit.
     """
     output = run.output.path
     with Judges(run, bench) as judges:
@@ -193,14 +183,7 @@ def grid_maker(options: CompressOptions, coder: GridCoder, kind: type[GridMaker]
 def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge) -> ScoredPoses:
     """`scored_poses` for a run.
 
-    Parameters
-    ----------
-    run : Run
-        Planned.
-    bench : Bench
-        Its renderer has nothing loaded.
-    judge : Judge
-        On the views that decide.
+    `run`: planned. `bench`: its renderer has nothing loaded. `judge`: on the views that decide.
     """
     return scored_poses(
         run.seen.of(run.seen.train),
@@ -214,36 +197,17 @@ def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge) -> Score
 
 
 def search_best(
-    make: MakerOf[Product],
-    run: Run[CompressOptions],
-    bench: Bench,
-    poses: ScoredPoses,
-    judge: Judge,
-    checkpoint: Checkpoint | None = None,
+    make: MakerOf[Product],  # `grid_maker`, or what makes a file of another format
+    run: Run[CompressOptions],  # Planned. The storage of `bench.renderer` holds its scene as a whole.
+    bench: Bench,  # draws the views
+    poses: ScoredPoses,  # from `scored_poses`
+    judge: Judge,  # prepared on the views that decide
+    checkpoint: Checkpoint | None = None,  # keeps the rounds for a later run (`--resume`)
 ) -> tuple[Product, SearchResult]:
     """Search, and return the product to write and all candidates that led to it.
 
-    Parameters
-    ----------
-    make : callable
-        `grid_maker`, or what makes a file of another format.
-    run : Run
-        Planned. The storage of `bench.renderer` holds its scene as a whole.
-    bench : Bench
-        Draws the views.
-    poses : ScoredPoses
-        From `scored_poses`.
-    judge : Judge
-        Prepared on the views that decide.
-    checkpoint : Checkpoint, optional
-        Keeps the rounds for a later run (`--resume`).
-
-    Raises
-    ------
-    TargetError
-        When nothing holds and `best_effort` is not set.
-    BudgetError
-        When the scene does not fit.
+    Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene does not
+    fit.
     """
     with (
         open_rounds(run, bench, poses.cameras, checkpoint=checkpoint, known=poses.known) as rounds,
@@ -274,30 +238,14 @@ def search_best(
 
 @contextmanager
 def open_rounds(
-    run: Run[CompressOptions],
-    bench: Bench,
-    scored: Sequence[Camera],
-    make: Callable[..., PruneRounds] = PruneRounds,
-    checkpoint: Checkpoint | None = None,
-    known: KnownErrors | None = None,
+    run: Run[CompressOptions],  # planned
+    bench: Bench,  # draws the views
+    scored: Sequence[Camera],  # from `scored_poses`
+    make: Callable[..., PruneRounds] = PruneRounds,  # builds the rounds from the arguments of `PruneRounds`
+    checkpoint: Checkpoint | None = None,  # keeps the rounds for a later run
+    known: KnownErrors | None = None,  # from `scored_poses`; descents look at poses by it
 ) -> Iterator[PruneRounds]:
-    """Open the rounds of pruning for one search, or for several that share them, the weakest compression first.
-
-    Parameters
-    ----------
-    run : Run
-        Planned.
-    bench : Bench
-        Draws the views.
-    scored : sequence of Camera
-        From `scored_poses`.
-    make : callable, optional
-        Builds the rounds from the arguments of `PruneRounds`.
-    checkpoint : Checkpoint, optional
-        Keeps the rounds for a later run.
-    known : KnownErrors, optional
-        From `scored_poses`; descents look at poses by it.
-    """
+    """Open the rounds of pruning for one search, or for several that share them, the weakest compression first."""
     renderer, source, options, budget = bench.renderer, run.source, run.options, run.budget
     foreign, fine = run.output.format is not None, is_fine(options, source)
     storage, steps = renderer.storage, distil_steps(options, len(scored), source.count, foreign, fine)

@@ -32,12 +32,12 @@ POINTS = 512
 
 
 def needed_poses(
-    scored: Sequence[Camera],
-    given: Sequence[Camera],
-    rest: Sequence[Camera],
+    scored: Sequence[Camera],  # poses that are scored already, given and made ones
+    given: Sequence[Camera],  # the given ones among them
+    rest: Sequence[Camera],  # Given poses that are not scored. They may be needed as they are.
     deciding: Sequence[Camera],
-    points: np.ndarray,
-    near: float,
+    points: np.ndarray,  # [3, n] f64, a sample of the scene's positions, world coordinates
+    near: float,  # near plane, scene units
 ) -> list[Camera]:
     """The poses that add enough to what the scored ones see, each next one the one that adds most.
 
@@ -45,20 +45,7 @@ def needed_poses(
     `covering_order`, and less if it shows the point smaller: by the square of the ratio of its sizes in both pictures.
     What a pose adds is the mean over the points in its picture. Occlusion is ignored.
 
-    Parameters
-    ----------
-    scored : sequence of Camera
-        Poses that are scored already, given and made ones.
-    given : sequence of Camera
-        The given ones among them.
-    rest : sequence of Camera
-        Given poses that are not scored. They may be needed as they are.
-    deciding : sequence of Camera
-        The views that decide. They are not scored, but poses half way to them are, if they are needed.
-    points : np.ndarray
-        [3, n] f64, a sample of the scene's positions, world coordinates.
-    near : float
-        Near plane, scene units.
+    `deciding`: the views that decide. They are not scored, but poses half way to them are, if they are needed.
     """
     points = points[:, :: -(-points.shape[1] // POINTS)] if points.shape[1] else points
     there = [_seen(camera, points, near) for camera in scored]
@@ -84,12 +71,7 @@ def needed_poses(
 def poses_beside(view: Camera, given: Sequence[Camera]) -> list[Camera]:
     """Poses half way between a view and the given poses nearest to it.
 
-    Parameters
-    ----------
-    view : Camera
-        A view that lost too much.
-    given : sequence of Camera
-        The given poses that are scored.
+    `view`: a view that lost too much. `given`: the given poses that are scored.
     """
     return [between(given[place], view) for place in nearest(view, given, BESIDE)]
 

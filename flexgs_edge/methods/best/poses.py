@@ -32,39 +32,18 @@ BESIDE_FINER = 2.0
 
 @dataclass(frozen=True)
 class ScoredPoses:
-    """The scored poses, the most important first.
+    """The scored poses, the most important first."""
 
-    Parameters
-    ----------
-    cameras : list of Camera
-        At every pixel, or at as many as the scene's Gaussians need.
-    made : int
-        How many of them were generated (`--views-margin`).
-    known : KnownErrors, optional
-        What decides how often descents look at a pose. Default: all alike.
-    given : tuple of Camera
-        The given ones among them, at every pixel.
-    step : float
-        Mean distance in pixels between the points that we look at.
-    """
-
-    cameras: list[Camera]
-    made: int = 0
-    known: KnownErrors | None = None
-    given: tuple[Camera, ...] = ()
-    step: float = 1.0
+    cameras: list[Camera]  # at every pixel, or at as many as the scene's Gaussians need
+    made: int = 0  # how many of them were generated (`--views-margin`)
+    known: KnownErrors | None = None  # What decides how often descents look at a pose. Default: all alike.
+    given: tuple[Camera, ...] = ()  # the given ones among them, at every pixel
+    step: float = 1.0  # mean distance in pixels between the points that we look at
 
     def beside(self, views: Sequence[Camera], renderer: Renderer, source: SceneSource) -> list[Camera]:
         """Further poses beside views that lost too much, and nearer and farther ones of these.
 
-        Parameters
-        ----------
-        views : sequence of Camera
-            The views.
-        renderer : Renderer
-            With nothing loaded.
-        source : SceneSource
-            The original.
+        `views`: the views. `renderer`: with nothing loaded. `source`: the original.
         """
         poses = [pose for view in views for pose in poses_beside(view, self.given)]
         poses += margin_of(renderer, source, poses, self.given)
@@ -72,12 +51,12 @@ class ScoredPoses:
 
 
 def scored_poses(
-    cameras: Sequence[Camera],
-    options: CompressOptions,
-    renderer: Renderer,
-    source: SceneSource,
+    cameras: Sequence[Camera],  # all training poses
+    options: CompressOptions,  # effort, target and `makes_poses`
+    renderer: Renderer,  # with nothing loaded
+    source: SceneSource,  # the original
     covered_decides: bool = False,
-    deciding: Sequence[Camera] = (),
+    deciding: Sequence[Camera] = (),  # the views that decide
     photo: Callable[[int, np.ndarray], np.ndarray] | None = None,
 ) -> ScoredPoses:
     """Choose as many poses as the effort scores. Each next pose is the one that adds most to what those before it see.
@@ -86,23 +65,9 @@ def scored_poses(
 
     With `makes_poses`, generated poses come on top: see `margin_of` and `needed_poses`.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        All training poses.
-    options : CompressOptions
-        Effort, target and `makes_poses`.
-    renderer : Renderer
-        With nothing loaded.
-    source : SceneSource
-        The original.
-    covered_decides : bool
-        As for `Quality`: only pixels that the scene covers count as pixels to look at. Default: all pixels count.
-    deciding : sequence of Camera
-        The views that decide.
-    photo : callable, optional
-        The photo of one of these ([H, W, 3] f32) by its place and a render, if photos decide. Poses then get pixels by
-        `view_weights`. Default: alike.
+    `covered_decides`: as for `Quality`: only pixels that the scene covers count as pixels to look at. Default: all
+    pixels count. `photo`: the photo of one of these ([H, W, 3] f32) by its place and a render, if photos decide. Poses
+    then get pixels by `view_weights`. Default: alike.
     """
     plan = EFFORTS[options.effort]
     positions = some_positions(source)

@@ -54,33 +54,15 @@ TRIES, LESS = 3, 0.97
 
 
 def make_preview(
-    grid: GridScene,
-    most: int,
-    bits: BitModel,
-    bench: Bench,
-    cameras: Sequence[Camera],
-    settings: Mapping[str, Any],
-    progress: Progress = SILENT,
+    grid: GridScene,  # the whole scene
+    most: int,  # bytes of the preview
+    bits: BitModel,  # bits of the scene's Gaussians
+    bench: Bench,  # Draws the views. Its renderer has nothing loaded.
+    cameras: Sequence[Camera],  # the scored poses; a part of them decides
+    settings: Mapping[str, Any],  # those of the scene's file; the preview is drawn like it
+    progress: Progress = SILENT,  # told of each view
 ) -> bytes:
-    """A file of at most `most` bytes, without SH; no bytes if there is no room for one.
-
-    Parameters
-    ----------
-    grid : GridScene
-        The whole scene.
-    most : int
-        Bytes of the preview.
-    bits : BitModel
-        Bits of the scene's Gaussians.
-    bench : Bench
-        Draws the views. Its renderer has nothing loaded.
-    cameras : sequence of Camera
-        The scored poses; a part of them decides.
-    settings : mapping
-        Those of the scene's file; the preview is drawn like it.
-    progress : Progress
-        Told of each view.
-    """
+    """A file of at most `most` bytes, without SH; no bytes if there is no room for one."""
     if grid.count == 0:
         return b""
     storage = bench.renderer.storage
@@ -108,16 +90,8 @@ def make_preview(
 class _Coded:
     """A file of some planes without SH, on a coarser grid than that of the whole scene.
 
-    Parameters
-    ----------
-    planes : dict
-        Stored planes ([width, n] f32 by field).
-    whole : GridScene
-        The whole scene.
-    settings : mapping
-        Of the file.
-    storage : Storage
-        Holds the grid.
+    `planes`: stored planes ([width, n] f32 by field). `whole`: the whole scene. `settings`: of the file. `storage`:
+    holds the grid.
     """
 
     def __init__(self, planes: Planes, whole: GridScene, settings: Mapping[str, Any], storage: Storage) -> None:

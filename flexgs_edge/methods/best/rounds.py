@@ -58,41 +58,20 @@ class PruneRounds:
 
     Where arrays lie in files, snapshots that a search hardly needs again let their planes go.
 
-    Parameters
-    ----------
-    original : Original
-        Scored poses and those between them. If colours are refitted, the original's renders are put into its references,
-        which are empty at first.
-    source : SceneSource
-        The whole scene. Neighbours in space become neighbours in memory, so that views are drawn faster.
-    refit : bool
-        Refit colours in each round (default).
-    unseen_share : float
-        Share of the Gaussians that no pose sees to keep, 0 to 1 (default: all). Those that are largest and most opaque
-        stay first.
-    checkpoint : Checkpoint, optional
-        Keeps every round. Rounds that it holds already are read instead of computed.
-
-    Attributes
-    ----------
-    rows : np.ndarray
-        [n] i64, rows of the scene that the rounds begin with, without dead splats, in the order of the planes.
-    snapshots : list of Snapshot
-        The results.
-    unseen : int
-        How many rows no scored pose sees.
-
-    Raises
-    ------
-    InputError
-        If nothing is left of the scene.
+    `original`: scored poses and those between them. If colours are refitted, the original's renders are put into its
+    references, which are empty at first. `source`: the whole scene. Neighbours in space become neighbours in memory, so
+    that views are drawn faster. `unseen_share`: share of the Gaussians that no pose sees to keep, 0 to 1 (default:
+    all). Those that are largest and most opaque stay first. `checkpoint`: keeps every round. Rounds that it holds
+    already are read instead of computed. `rows`: [n] i64, rows of the scene that the rounds begin with, without dead
+    splats, in the order of the planes. `snapshots`: the results. `unseen`: how many rows no scored pose sees. Raises
+    `InputError` if nothing is left of the scene.
     """
 
     def __init__(
         self,
         original: Original,
         source: SceneSource,
-        refit: bool = True,
+        refit: bool = True,  # refit colours in each round (default)
         unseen_share: float = 1.0,
         checkpoint: Checkpoint | None = None,
     ) -> None:
@@ -195,10 +174,8 @@ class PruneRounds:
     def renew(self, change: Callable[[], tuple[np.ndarray, dict[str, np.ndarray]]]) -> Snapshot:
         """Append rows and planes that a descent has moved, with costs measured anew over all poses.
 
-        Parameters
-        ----------
-        change : callable
-            Makes the rows ([n] i64, places in `rows`, ascending) and their planes. It is not called if a checkpoint has them.
+        `change`: makes the rows ([n] i64, places in `rows`, ascending) and their planes. It is not called if a
+        checkpoint has them.
         """
         self._renewed.add(len(self.snapshots))
         if self._resumed():
@@ -213,14 +190,8 @@ class PruneRounds:
     def see(self, cameras: Sequence[Camera], number: int, known: KnownErrors | None) -> bool:
         """Score further poses, too, from snapshot `number` on; later ones are dropped. False if there are sets enough.
 
-        Parameters
-        ----------
-        cameras : sequence of Camera
-            The poses. They become a set of their own.
-        number : int
-            A snapshot that descents have made, or the first one. Its costs are measured anew.
-        known : KnownErrors or None
-            Descents look at poses by it.
+        `cameras`: the poses. They become a set of their own. `number`: a snapshot that descents have made, or the first
+        one. Its costs are measured anew. `known`: descents look at poses by it.
         """
         if len(self._views) >= MOST_PARTS:
             return False

@@ -47,31 +47,17 @@ LEAST_CHANGE = 1e-3
 class Candidate:
     """A finished result: coded and measured.
 
-    Parameters
-    ----------
-    multiplier : float
-        Squared error that a bit is worth.
-    count, sh_count : int
-        Gaussians kept, and those with SH.
-    size : int
-        Bytes of the file.
-    measurement : Measurement
-        Quality of the result.
-    excess : float
-        Log of the largest share: the target holds at zero or less.
-    seconds : float
-        Time that making and measuring took.
-    left_out : int
-        Gaussians that no scored pose sees and that were left out because the grid would be coarser with them.
+    `count`, `sh_count`: Gaussians kept, and those with SH.
     """
 
-    multiplier: float
+    multiplier: float  # squared error that a bit is worth
     count: int
     sh_count: int
-    size: int
-    measurement: Measurement
-    excess: float
-    seconds: float
+    size: int  # bytes of the file
+    measurement: Measurement  # quality of the result
+    excess: float  # log of the largest share: the target holds at zero or less
+    seconds: float  # time that making and measuring took
+    # Gaussians that no scored pose sees and that were left out because the grid would be coarser with them.
     left_out: int = 0
 
     @property
@@ -109,52 +95,24 @@ class Maker(Protocol[Product]):
 
 @dataclass(frozen=True)
 class RateResult(Generic[Product]):
-    """The answer of a search.
+    """The answer of a search."""
 
-    Parameters
-    ----------
-    product : Product
-        A grid, or a finished file.
-    chosen : Candidate
-        The best candidate, which `product` belongs to.
-    reached : bool
-        Whether it meets the target.
-    steps : tuple of Candidate
-        All candidates in the order of the search.
-    """
-
-    product: Product
-    chosen: Candidate
-    reached: bool
-    steps: tuple[Candidate, ...]
+    product: Product  # a grid, or a finished file
+    chosen: Candidate  # the best candidate, which `product` belongs to
+    reached: bool  # whether it meets the target
+    steps: tuple[Candidate, ...]  # all candidates in the order of the search
 
 
 def search(
-    maker: Maker[Product],
-    target: Target,
-    most: int = MOST,
-    best_effort: bool = False,
-    on_step: Callable[[Candidate], None] | None = None,
+    maker: Maker[Product],  # makes the candidates
+    target: Target,  # what must hold
+    most: int = MOST,  # most candidates, if one of them holds
+    best_effort: bool = False,  # answer with the closest candidate if none holds
+    on_step: Callable[[Candidate], None] | None = None,  # called with each candidate
 ) -> RateResult[Product]:
     """Search for the best candidate. An interrupted search answers with the best one so far.
 
-    Parameters
-    ----------
-    maker : Maker
-        Makes the candidates.
-    target : Target
-        What must hold.
-    most : int
-        Most candidates, if one of them holds.
-    best_effort : bool
-        Answer with the closest candidate if none holds.
-    on_step : callable, optional
-        Called with each candidate.
-
-    Raises
-    ------
-    TargetError
-        When no candidate holds and `best_effort` is not set; it names the closest one.
+    Raises `TargetError` when no candidate holds and `best_effort` is not set; it names the closest one.
     """
     steps: tuple[Candidate, ...] = ()
     best: tuple[Candidate, Product] | None = None
@@ -217,12 +175,7 @@ def _aimed(maker: Maker[Product], place: float, target: Target) -> float:
 def next_place(steps: Sequence[Candidate], target: Target) -> float | None:
     """Log of the multiplier of the next candidate; `None` if another one would not be better.
 
-    Parameters
-    ----------
-    steps : sequence of Candidate
-        All so far, at least one.
-    target : Target
-        What must hold.
+    `steps`: all so far, at least one. `target`: what must hold.
     """
     by_size = target.limit_bytes is not None
     slope = SIZE_SLOPE if by_size else SLOPE

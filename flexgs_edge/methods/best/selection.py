@@ -24,30 +24,14 @@ ALL_LEFT = 0.97
 
 @dataclass
 class Kept:
-    """The Gaussians that a multiplier keeps.
+    """The Gaussians that a multiplier keeps."""
 
-    Attributes
-    ----------
-    snapshot : int
-        Number of the snapshot that they were chosen from.
-    rows : np.ndarray
-        [n] i64, places in the rows of `PruneRounds`, ascending.
-    planes : dict
-        Stored planes of these rows ([width, n] f32 by field), with SH dropped.
-    degrees : np.ndarray
-        [n] u8, SH degrees.
-    weight2 : np.ndarray
-        [n] f64, sums of squared weights.
-    left_out : int
-        How many rows were left out because the grid would be coarser with them (`reachable`).
-    """
-
-    snapshot: int
-    rows: np.ndarray
-    planes: dict[str, np.ndarray]
-    degrees: np.ndarray
-    weight2: np.ndarray
-    left_out: int = 0
+    snapshot: int  # number of the snapshot that they were chosen from
+    rows: np.ndarray  # [n] i64, places in the rows of `PruneRounds`, ascending
+    planes: dict[str, np.ndarray]  # stored planes of these rows ([width, n] f32 by field), with SH dropped
+    degrees: np.ndarray  # [n] u8, SH degrees
+    weight2: np.ndarray  # [n] f64, sums of squared weights
+    left_out: int = 0  # how many rows were left out because the grid would be coarser with them (`reachable`)
 
     def take(self, keep: np.ndarray, storage: Storage = IN_MEMORY) -> Kept:
         """The rows for which `keep` ([n] bool) is True."""
@@ -61,30 +45,15 @@ class Kept:
 
 @dataclass
 class Selection:
-    """Chooses from rounds of pruning.
+    """Chooses from rounds of pruning."""
 
-    Parameters
-    ----------
-    rounds : PruneRounds
-        More rounds are done when they are needed.
-    keep : float
-        Share that stays in a round.
-    choose : callable
-        Rows to keep ([n] bool) and their SH degrees ([n] u8), from costs, bits and a multiplier.
-    bits : BitModel
-        Bits of a Gaussian by SH degree.
-    most : int, optional
-        Most Gaussians (`--max-gaussians`).
-    begin : int
-        Snapshots before this one do not count: a descent has changed all costs since.
-    """
-
-    rounds: PruneRounds
-    keep: float
+    rounds: PruneRounds  # more rounds are done when they are needed
+    keep: float  # share that stays in a round
+    # Rows to keep ([n] bool) and their SH degrees ([n] u8), from costs, bits and a multiplier.
     choose: Callable[[RemovalCosts, BitModel, float], tuple[np.ndarray, np.ndarray]]
-    bits: BitModel
-    most: int | None = None
-    begin: int = 0
+    bits: BitModel  # bits of a Gaussian by SH degree
+    most: int | None = None  # most Gaussians (`--max-gaussians`)
+    begin: int = 0  # snapshots before this one do not count: a descent has changed all costs since
 
     @property
     def last(self) -> Snapshot:

@@ -13,14 +13,8 @@ from flexgs_edge.scene.source import Planes
 class Snapshot:
     """The Gaussians that are kept after a round, with refitted colours and measured costs.
 
-    Parameters
-    ----------
-    rows : np.ndarray
-        [n] i64, places in the rows that the rounds began with (`PruneRounds.rows`), ascending.
-    planes : dict
-        Stored planes of these rows ([width, n] f32 by field).
-    costs : RemovalCosts
-        Costs of these rows.
+    `rows`: [n] i64, places in the rows that the rounds began with (`PruneRounds.rows`), ascending. `planes`: stored
+    planes of these rows ([width, n] f32 by field). `costs`: costs of these rows.
     """
 
     def __init__(self, rows: np.ndarray, planes: Planes, costs: RemovalCosts) -> None:

@@ -93,21 +93,8 @@ def expected_bytes(run: Run[CompressOptions]) -> int:
 def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera], folder: Path) -> Storage:
     """Memory if the scene and its search fit, else scratch files; logs where these go and how large they may get.
 
-    Parameters
-    ----------
-    run : Run
-        Planned, with a scene.
-    renderer : Renderer
-        With nothing loaded.
-    scored : sequence of Camera
-        The scored poses.
-    folder : path
-        For scratch files.
-
-    Raises
-    ------
-    BudgetError
-        When not even the views fit, or the disk is too small.
+    `run`: planned, with a scene. `renderer`: with nothing loaded. `scored`: the scored poses. `folder`: for scratch
+    files. Raises `BudgetError` when not even the views fit, or the disk is too small.
     """
     source, options, budget = run.source, run.options, run.budget
     largest = largest_of(scored)

@@ -36,29 +36,16 @@ the worst view, as a soft maximum does: docs/results/tuning.md#view_weights"""
 
 @dataclass(frozen=True)
 class KnownErrors:
-    """How near the original is to the photos of the views that decide.
+    """How near the original is to the photos of the views that decide."""
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The m views.
-    errors : np.ndarray
-        [m] f64, from `base_errors`.
-    drop : float
-        Allowed drop, dB.
-    """
-
-    cameras: Sequence[Camera]
-    errors: np.ndarray
-    drop: float
+    cameras: Sequence[Camera]  # the m views
+    errors: np.ndarray  # [m] f64, from `base_errors`
+    drop: float  # allowed drop, dB
 
     def slopes(self, cameras: Sequence[Camera]) -> np.ndarray:
         """[n] f64, above 0 to 1: the slope of the drop by the error, of the view that is nearest to each camera.
 
-        Parameters
-        ----------
-        cameras : sequence of Camera
-            The n poses.
+        `cameras`: the n poses.
         """
         allowed = float(np.median(self.errors)) * (10 ** (self.drop / 10) - 1)
         slopes = 1.0 / (self.errors + max(allowed, 1e-12))
@@ -68,26 +55,15 @@ class KnownErrors:
 
 
 def base_errors(
-    renderer: Renderer,
-    source: SceneSource,
-    cameras: Sequence[Camera],
+    renderer: Renderer,  # with nothing loaded
+    source: SceneSource,  # the original
+    cameras: Sequence[Camera],  # the views that decide
     photo: Callable[[int, np.ndarray], np.ndarray],
-    base_psnr: float = DEFAULT_BASE_PSNR,
+    base_psnr: float = DEFAULT_BASE_PSNR,  # as for `far_bases`
 ) -> np.ndarray:
     """[n] f64, mean squared error of the original against the photo of each view, or that of `far_bases`.
 
-    Parameters
-    ----------
-    renderer : Renderer
-        With nothing loaded.
-    source : SceneSource
-        The original.
-    cameras : sequence of Camera
-        The views that decide.
-    photo : callable
-        The photo of a view, [H, W, 3] f32 in [0, 1], by its place in `cameras` and a render of this size.
-    base_psnr : float
-        As for `far_bases`.
+    `photo`: the photo of a view, [H, W, 3] f32 in [0, 1], by its place in `cameras` and a render of this size.
     """
     errors, contrasts = [], []
     with renderer.load(source) as scene:
@@ -105,17 +81,7 @@ def base_errors(
 def view_weights(slopes: np.ndarray, rare: np.ndarray) -> np.ndarray:
     """How much an error counts in each scored pose, relative to the largest weight.
 
-    Parameters
-    ----------
-    slopes : np.ndarray
-        [n] f64, from `KnownErrors.slopes`.
-    rare : np.ndarray
-        [n] f64, from `rareness`.
-
-    Returns
-    -------
-    np.ndarray
-        [n] f64, above 0 to 1.
+    `slopes`: [n] f64, from `KnownErrors.slopes`. `rare`: [n] f64, from `rareness`. Returns [n] f64, above 0 to 1.
     """
     weights: np.ndarray = slopes**POWER * rare**RARE_POWER
     relative: np.ndarray = np.maximum(weights / weights.max(), LEAST)
@@ -125,14 +91,8 @@ def view_weights(slopes: np.ndarray, rare: np.ndarray) -> np.ndarray:
 def rareness(cameras: Sequence[Camera], points: np.ndarray, near: float) -> np.ndarray:
     """[n] f64, above 0 to 1: mean over the points in each picture of 1 / number of poses that have them in theirs.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The scored poses.
-    points : np.ndarray
-        [3, k] f64, a sample of the scene's positions, world coordinates.
-    near : float
-        Near plane, scene units.
+    `cameras`: the scored poses. `points`: [3, k] f64, a sample of the scene's positions, world coordinates. `near`:
+    near plane, scene units.
     """
     seen = np.array([in_picture(camera, points, near) for camera in cameras])
     share = seen / np.maximum(seen.sum(axis=0), 1)

@@ -33,31 +33,18 @@ from flexgs_edge.scene.source import MemorySource
 class CostMaker:
     """Makes files of a format by measured costs; a `Maker`.
 
-    Parameters
-    ----------
-    rounds : PruneRounds
-        Rounds of pruning; more are done when they are needed.
-    files : FileMaker
-        Writes, reads back and measures.
-    measure : callable
-        Quality of planes without quantization.
-    effort : Effort
-        How much work to spend.
-    refit : bool
-        Refit colours to the decoded geometry, and their constant to the decoded SH (default). This writes two more files
-        for each candidate.
-    see : callable, optional
-        As for `GridMaker`.
+    `refit`: refit colours to the decoded geometry, and their constant to the decoded SH (default). This writes two more
+    files for each candidate.
     """
 
     def __init__(
         self,
-        rounds: PruneRounds,
-        files: FileMaker,
-        measure: Measure,
-        effort: Effort,
+        rounds: PruneRounds,  # rounds of pruning; more are done when they are needed
+        files: FileMaker,  # writes, reads back and measures
+        measure: Measure,  # quality of planes without quantization
+        effort: Effort,  # how much work to spend
         refit: bool = True,
-        see: See | None = None,
+        see: See | None = None,  # as for `GridMaker`
     ) -> None:
         self.rounds, self.files, self.measure = rounds, files, measure
         self.effort, self.refit, self.close = effort, refit, effort.close

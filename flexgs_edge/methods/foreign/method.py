@@ -21,12 +21,7 @@ LOG = logging.getLogger("flexgs_edge")
 def compress(run: Run[CompressOptions], bench: Bench) -> Made:
     """Compress a scene into a file of another program's format, by measured costs.
 
-    Parameters
-    ----------
-    run : Run
-        Planned.
-    bench : Bench
-        Draws the views.
+    `run`: planned. `bench`: draws the views.
     """
     options, plan, output, format = run.options, run.plan, run.output.path, run.output.format
     assert plan is not None and plan.target is not None and format is not None

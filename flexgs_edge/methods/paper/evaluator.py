@@ -24,38 +24,18 @@ QUANTIZE_COPIES = 4
 
 @dataclass(frozen=True)
 class Ranked:
-    """A scene and the order in which its rows are pruned.
+    """A scene and the order in which its rows are pruned."""
 
-    Parameters
-    ----------
-    source : SceneSource
-        The original.
-    order : np.ndarray
-        [N] i64, least important row first.
-    has_sh : np.ndarray
-        [N] bool, rows with SH that are not zero.
-    """
-
-    source: SceneSource
-    order: np.ndarray
-    has_sh: np.ndarray
+    source: SceneSource  # the original
+    order: np.ndarray  # [N] i64, least important row first
+    has_sh: np.ndarray  # [N] bool, rows with SH that are not zero
 
 
 class SceneEvaluator:
     """Prunes by rank, quantizes, and asks the judge; see `flexgs_edge.goals.Evaluator`.
 
-    Parameters
-    ----------
-    ranked : Ranked
-        The scene.
-    bits : BitSpec
-        Bits per code.
-    groups : int or None
-        As for `quantize_scene`.
-    judge : Judge or None
-        Draws and compares. Without one, `measure` and `estimate` fail.
-    budget : MemoryBudget
-        The quantized scene is taken from it.
+    `ranked`: the scene. `bits`: bits per code. `groups`: as for `quantize_scene`. `judge`: draws and compares. Without
+    one, `measure` and `estimate` fail. `budget`: the quantized scene is taken from it.
     """
 
     def __init__(

@@ -43,29 +43,16 @@ RANK_ROW_BYTES = 36
 
 @dataclass(frozen=True)
 class Ranking:
-    """The order in which rows are pruned.
+    """The order in which rows are pruned."""
 
-    Parameters
-    ----------
-    order : np.ndarray
-        [N] i64, rows of the scene, least important first.
-    reused : bool
-        Whether their scores came from the cache.
-    """
-
-    order: np.ndarray
-    reused: bool = False
+    order: np.ndarray  # [N] i64, rows of the scene, least important first
+    reused: bool = False  # whether their scores came from the cache
 
 
 def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
     """Compress a scene into a `.fgs` of version 1.
 
-    Parameters
-    ----------
-    run : Run
-        Planned.
-    bench : Bench or None
-        Draws the views; `None` for runs without views, whose rates are fixed.
+    `run`: planned. `bench`: draws the views; `None` for runs without views, whose rates are fixed.
     """
     run.budget.take("the order of the Gaussians", RANK_ROW_BYTES * run.source.count)
     with nullcontext() if bench is None else Judges(run, bench) as judges:

@@ -55,34 +55,16 @@ class Evaluator(Protocol):
 
 
 def adapt(
-    evaluator: Evaluator,
-    target: Target,
-    effort: str = "balanced",
-    best_effort: bool = False,
-    on_step: Callable[[Step], None] | None = None,
-    rows: int | None = None,
+    evaluator: Evaluator,  # Answers for sizes, estimates and measurements. No question is asked twice.
+    target: Target,  # what must hold
+    effort: str = "balanced",  # Number of refinement steps (`REFINE_STEPS`). Default: `balanced`.
+    best_effort: bool = False,  # return the closest point with `reached` False when nothing holds
+    on_step: Callable[[Step], None] | None = None,  # called after each new step
+    rows: int | None = None,  # rows of the scene; an error then says if one Gaussian is left
 ) -> SearchResult:
     """Find the choice that meets `target` with the fewest bytes (for a size target: with the best quality).
 
-    Parameters
-    ----------
-    evaluator : Evaluator
-        Answers for sizes, estimates and measurements. No question is asked twice.
-    target : Target
-        What must hold.
-    effort : {"fast", "balanced", "max"}
-        Number of refinement steps (`REFINE_STEPS`). Default: `balanced`.
-    best_effort : bool
-        Return the closest point with `reached` False when nothing holds.
-    on_step : callable, optional
-        Called after each new step.
-    rows : int, optional
-        Rows of the scene; an error then says if one Gaussian is left.
-
-    Raises
-    ------
-    TargetError
-        When no point holds and `best_effort` is not set; the message names the closest point.
+    Raises `TargetError` when no point holds and `best_effort` is not set; the message names the closest point.
     """
     search = _Search(evaluator, target, on_step)
     refine_steps = REFINE_STEPS[effort]

@@ -71,10 +71,8 @@ def study_paper(
 ) -> PaperStudy:
     """Make the paper's experiments on every scene and write them to a folder.
 
-    Raises
-    ------
-    FlexGSError
-        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
+    Raises `FlexGSError`: `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is
+    written then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "paper"})
     experiments = EXPERIMENTS if experiments is None else experiments

@@ -24,10 +24,7 @@ class RankedPath(PruneRounds):
     Measured costs are handed out again by rank: the row with the lowest score gets the lowest cost. So a multiplier
     removes about as many rows as it would by measured costs.
 
-    Parameters
-    ----------
-    order : np.ndarray
-        [N] i64, rows of the scene, least important first.
+    `order`: [N] i64, rows of the scene, least important first.
     """
 
     def __init__(self, *words: Any, order: np.ndarray, **more: Any) -> None:
@@ -107,30 +104,14 @@ def choose_among(
 
 @dataclass(frozen=True)
 class Variant:
-    """The method `best`, or the same without one part.
+    """The method `best`, or the same without one part."""
 
-    Parameters
-    ----------
-    name : str
-        Name in tables.
-    words : str
-        What replaces the part, for tables.
-    search : type
-        The search, a `GridMaker`.
-    path : callable
-        Makes the rounds from the arguments of `PruneRounds`.
-    refit : bool
-        As for `compress`.
-    distil : int, optional
-        As for `compress`. Default: as the study has it.
-    """
-
-    name: str
-    words: str
-    search: type[GridMaker] = GridMaker
-    path: Callable[..., PruneRounds] = PruneRounds
-    refit: bool = True
-    distil: int | None = None
+    name: str  # name in tables
+    words: str  # what replaces the part, for tables
+    search: type[GridMaker] = GridMaker  # the search, a `GridMaker`
+    path: Callable[..., PruneRounds] = PruneRounds  # makes the rounds from the arguments of `PruneRounds`
+    refit: bool = True  # as for `compress`
+    distil: int | None = None  # As for `compress`. Default: as the study has it.
 
 
 WHOLE = Variant("whole", "nothing is taken away")
@@ -139,14 +120,8 @@ WHOLE = Variant("whole", "nothing is taken away")
 def parts_of(order: np.ndarray, sh_degree: int, descends: bool) -> tuple[Variant, ...]:
     """Variants that each lack one part. Those about SH are left out if the scene has none.
 
-    Parameters
-    ----------
-    order : np.ndarray
-        [N] i64, rows by the paper's score, least important first.
-    sh_degree : int
-        SH degree of the scene.
-    descends : bool
-        Whether the searches descend: then variants lack parts of the descents, too.
+    `order`: [N] i64, rows by the paper's score, least important first. `sh_degree`: SH degree of the scene. `descends`:
+    whether the searches descend: then variants lack parts of the descents, too.
     """
     parts = [
         Variant(

@@ -16,10 +16,7 @@ SLACK = 1e-9
 class Curve:
     """Bytes and loss of one method at several sizes.
 
-    Parameters
-    ----------
-    points : iterable of (size, loss)
-        Bytes and dB.
+    `points`: bytes and dB.
     """
 
     def __init__(self, points: Iterable[tuple[int, float]]) -> None:

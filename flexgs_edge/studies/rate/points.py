@@ -40,36 +40,16 @@ MAX = "max"
 
 @dataclass(frozen=True)
 class RatePoint:
-    """A file and its quality.
+    """A file and its quality."""
 
-    Parameters
-    ----------
-    method : str
-        `best`, `paper`, or the format of another program.
-    variant : str
-        The part that was taken away, or `whole`.
-    effort : str or None
-        Effort of the search, if there was one.
-    wanted : float or None
-        The ratio that was asked for.
-    size : int
-        Bytes of the file.
-    kept : int
-        Gaussians in the file.
-    quality : Quality
-        Over the views that decide, with SSIM and FLIP.
-    seconds : float or None
-        Time of the search or conversion, without measuring the final quality.
-    """
-
-    method: str
-    variant: str
-    effort: str | None
-    wanted: float | None
-    size: int
-    kept: int
-    quality: Quality
-    seconds: float | None
+    method: str  # `best`, `paper`, or the format of another program
+    variant: str  # the part that was taken away, or `whole`
+    effort: str | None  # effort of the search, if there was one
+    wanted: float | None  # the ratio that was asked for
+    size: int  # bytes of the file
+    kept: int  # Gaussians in the file
+    quality: Quality  # over the views that decide, with SSIM and FLIP
+    seconds: float | None  # time of the search or conversion, without measuring the final quality
 
     @property
     def ssim(self) -> float | None:
@@ -171,16 +151,8 @@ def _paper_point(studied: StudyScene, ratio: float | None, choice: Choice, secon
 def best_points(studied: StudyScene, variant: Variant, effort: str, ratios: Sequence[float]) -> Found:
     """Points of `--method best`, whole or without a part. All ratios share their rounds, the weakest compression first.
 
-    Parameters
-    ----------
-    studied : StudyScene
-        The scene.
-    variant : Variant
-        The method, or the method without a part.
-    effort : str
-        Effort of the searches.
-    ratios : sequence of float
-        PLY bytes over file bytes, one search for each.
+    `studied`: the scene. `variant`: the method, or the method without a part. `effort`: effort of the searches.
+    `ratios`: PLY bytes over file bytes, one search for each.
     """
     run, source = studied.run, studied.run.source
     options = replace(studied.run.options, effort=effort, refit=variant.refit, best_effort=True)

@@ -56,10 +56,8 @@ def study_rate(
     `ratios`: PLY bytes over file bytes, for the curves; `ablations`: PLY bytes over file bytes, for the points without a
     part; `distilled`: PLY bytes over file bytes, for the points at the effort `max`.
 
-    Raises
-    ------
-    FlexGSError
-        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
+    Raises `FlexGSError`: `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is
+    written then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "best"})
     _check(ratios, ablations, ablation_effort, distilled)

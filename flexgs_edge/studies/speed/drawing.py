@@ -71,23 +71,14 @@ class HalfPrecision(SceneSource):
 class Way:
     """A way to draw the scene.
 
-    Parameters
-    ----------
-    kind, name : str
-        What is reduced, and to what.
-    source : SceneSource
-        The scene to draw.
-    extent : str
-        Extent of splats, as for the renderer.
-    shrink : int
-        Divisor of both sides of the picture.
+    `kind`, `name`: what is reduced, and to what.
     """
 
     kind: str
     name: str
-    source: SceneSource
-    extent: str
-    shrink: int = 1
+    source: SceneSource  # the scene to draw
+    extent: str  # extent of splats, as for the renderer
+    shrink: int = 1  # divisor of both sides of the picture
 
     def cameras(self, views: Sequence[Camera]) -> list[Camera]:
         """The views at the size at which they are drawn."""

@@ -79,14 +79,8 @@ def scoring(studied: StudyScene) -> list[Experiment]:
 def score_rows(studied: StudyScene, fewest: int = FEWEST, orders: Sequence[str] = COMPARED) -> list[dict[str, Cell]]:
     """Rows for each score from more and more views: seconds, ranks, and quality of the search's choice.
 
-    Parameters
-    ----------
-    studied : StudyScene
-        The scene.
-    fewest : int
-        Views in the smallest set.
-    orders : sequence of str
-        Names in `ORDERS`, which decide the views of a set.
+    `studied`: the scene. `fewest`: views in the smallest set. `orders`: names in `ORDERS`, which decide the views of a
+    set.
     """
     cameras = studied.views.of(studied.views.train)
     counts = view_counts(len(cameras), fewest)

@@ -45,10 +45,8 @@ def study_speed(
 ) -> SpeedStudy:
     """Measure speed against accuracy on a scene and write it to a folder.
 
-    Raises
-    ------
-    FlexGSError
-        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
+    Raises `FlexGSError`: `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is
+    written then.
     """
     options = replace(options or CompressOptions(), **words)
     _check(parts, repeats)

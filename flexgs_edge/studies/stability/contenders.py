@@ -25,14 +25,8 @@ WORDS = (
 class Contenders:
     """The compressed scenes, by name.
 
-    Parameters
-    ----------
-    studied : StudyScene
-        The scene.
-    ours : Whole
-        The result of best.
-    guarded : Whole
-        The result of best with generated poses (`--views-margin`).
+    `studied`: the scene. `ours`: the result of best. `guarded`: the result of best with generated poses
+    (`--views-margin`).
     """
 
     def __init__(self, studied: StudyScene, ours: Whole, guarded: Whole) -> None:

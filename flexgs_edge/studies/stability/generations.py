@@ -42,10 +42,7 @@ MOST_LOSS = 0.1
 class Copies:
     """Makes decompressed copies of a scene, as files in a folder.
 
-    Parameters
-    ----------
-    folder : Path
-        For the files. There is one of each kind at a time.
+    `folder`: for the files. There is one of each kind at a time.
     """
 
     def __init__(self, folder: Path) -> None:

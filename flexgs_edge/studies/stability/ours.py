@@ -28,27 +28,13 @@ from flexgs_edge.views.bench import Bench
 
 @dataclass(frozen=True, eq=False)
 class Whole:
-    """A candidate of the method best.
+    """A candidate of the method best."""
 
-    Parameters
-    ----------
-    grid : GridScene
-        The integers of its file.
-    size : int
-        Bytes of its file, without settings in the header.
-    multiplier : float
-        Squared error that a bit is worth.
-    rows : np.ndarray
-        [n] i64, rows of the scene that were kept, ascending.
-    reached : bool
-        Whether the target holds.
-    """
-
-    grid: GridScene
-    size: int
-    multiplier: float
-    rows: np.ndarray
-    reached: bool
+    grid: GridScene  # the integers of its file
+    size: int  # bytes of its file, without settings in the header
+    multiplier: float  # squared error that a bit is worth
+    rows: np.ndarray  # [n] i64, rows of the scene that were kept, ascending
+    reached: bool  # whether the target holds
 
     @property
     def source(self) -> MemorySource:

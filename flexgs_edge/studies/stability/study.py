@@ -63,10 +63,8 @@ def study_stability(
 ) -> StabilityStudy:
     """Find the conditions under which methods break on a scene, and write them to a folder.
 
-    Raises
-    ------
-    FlexGSError
-        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
+    Raises `FlexGSError`: `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is
+    written then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "best", "effort": EFFORT})
     amounts = amounts or (QUICK if quick else FULL)

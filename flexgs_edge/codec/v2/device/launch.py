@@ -56,21 +56,14 @@ class Device(Protocol):
 def launch_coding(
     device: Device,
     chunks: int,
-    shape: tuple[int, int, int],
-    shared: Sequence[Any],
+    shape: tuple[int, int, int],  # elements of a plane, number of code planes, SH degree
+    shared: Sequence[Any],  # arguments for both directions, in the kernel's order
     decoding: tuple[Sequence[int], Sequence[Any]] | None = None,
     counting: tuple[Sequence[int], Sequence[Any]] | None = None,
 ) -> None:
     """Run `code_chunks`, either to decode or to count.
 
-    Parameters
-    ----------
-    shape : tuple of int
-        Elements of a plane, number of code planes, SH degree.
-    shared : sequence of arrays
-        Arguments for both directions, in the kernel's order.
-    decoding, counting : tuple, optional
-        Numbers and arrays for the one direction to run.
+    `decoding`, `counting`: numbers and arrays for the one direction to run.
     """
     # The kernel does not touch the arrays of the other direction, so any array may stand there.
     numbers, arrays = decoding or ([0] * 3, [shared[0]] * 4)

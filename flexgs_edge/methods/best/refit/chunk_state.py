@@ -31,13 +31,7 @@ def widths(sh_degree: int) -> dict[str, int]:
 class ChunkState:
     """Values of a chunk's rows, their mean, the last gradient, and Adam's running means of gradients.
 
-    Parameters
-    ----------
-    backend : Backend
-    chunk : Chunk
-        Gets the values that views are drawn from.
-    antialiased : bool
-        As in `DeviceScene`.
+    `chunk`: gets the values that views are drawn from. `antialiased`: as in `DeviceScene`.
     """
 
     def __init__(self, backend: Backend, chunk: Chunk, antialiased: bool) -> None:

@@ -37,35 +37,18 @@ class Descent:
     After `put_on`, views are drawn from values rounded to their grids, but gradients move the values themselves (the
     straight-through rule). Neighbours then compensate for errors of rounding, too.
 
-    Parameters
-    ----------
-    renderer : Renderer
-        With nothing loaded.
-    planes : dict
-        Stored planes ([width, n] f32 by field); not changed.
-    degrees : np.ndarray
-        [n] u8, SH degree of each row. Coefficients above it stay as they are.
-    origin : np.ndarray
-        [3] f64, as in `SceneSource`.
-    camera : Camera
-        The largest view, from which memory is planned.
-    structure : float
-        Weight of the structural term of the loss (`Renderer.gradient_sums`).
-
-    Raises
-    ------
-    BudgetError
-        When the scene, its gradients and their running means do not fit at once. `StreamedDescent` goes on there.
+    Raises `BudgetError` when the scene, its gradients and their running means do not fit at once. `StreamedDescent`
+    goes on there.
     """
 
     def __init__(
         self,
-        renderer: Renderer,
-        planes: dict[str, np.ndarray],
-        degrees: np.ndarray,
-        origin: np.ndarray,
-        camera: Camera,
-        structure: float = 0.0,
+        renderer: Renderer,  # with nothing loaded
+        planes: dict[str, np.ndarray],  # stored planes ([width, n] f32 by field); not changed
+        degrees: np.ndarray,  # [n] u8, SH degree of each row. Coefficients above it stay as they are.
+        origin: np.ndarray,  # [3] f64, as in `SceneSource`
+        camera: Camera,  # the largest view, from which memory is planned
+        structure: float = 0.0,  # weight of the structural term of the loss (`Renderer.gradient_sums`)
     ) -> None:
         self.renderer, self.backend, self.structure = renderer, renderer.backend, structure
         source = MemorySource(planes, origin=origin, sh_count=int(np.flatnonzero(degrees).max(initial=-1)) + 1)

@@ -21,16 +21,7 @@ from flexgs_edge.scene.source import SceneSource
 class Part:
     """Where a chunk's state lies in the files, and what is still to be done to it.
 
-    Attributes
-    ----------
-    at, powers_at : int
-        First element in the files of planes, and in that of powers.
-    stepped : bool
-        Whether a step has moved the chunk. Before, its running means of gradients are zero and not in the files.
-    mean : {"none", "values", "own"}
-        Whether there is a mean of the values, and whether it is in its file or equal to the values.
-    pending : list of float
-        Shares by which the mean is still to follow the values as they are.
+    `at`, `powers_at`: first element in the files of planes, and in that of powers.
     """
 
     base: int
@@ -38,8 +29,10 @@ class Part:
     degree: int
     at: int
     powers_at: int
+    # Whether a step has moved the chunk. Before, its running means of gradients are zero and not in the files.
     stepped: bool = False
-    mean: str = "none"
+    mean: str = "none"  # whether there is a mean of the values, and whether it is in its file or equal to the values
+    # Shares by which the mean is still to follow the values as they are.
     pending: list[float] = field(default_factory=list)
 
     @property

@@ -23,22 +23,10 @@ WIDTH = 0.5
 def bit_prices(planes: Planes, degrees: np.ndarray, steps: StepSizes, worth: float) -> np.ndarray:
     """The record of the kernel `descend`.
 
-    Parameters
-    ----------
-    planes : mapping
-        {field: [width, n] f32}, with n above 0, before the descent. Quaternions have their canonical form.
-    degrees : np.ndarray
-        [n] u8, SH degree kept for each row.
-    steps : StepSizes
-        Of the grid that the values will be put on.
-    worth : float
-        Squared error in one pose that a bit costs.
-
-    Returns
-    -------
-    np.ndarray
-        [33] f32: price and width of scale, rotation and opacity, and of luma and chroma of the constant and each SH degree;
-        then centres of the three scales, opacity, Y, Co and Cg.
+    `planes`: {field: [width, n] f32}, with n above 0, before the descent. Quaternions have their canonical form.
+    `degrees`: [n] u8, SH degree kept for each row. `steps`: of the grid that the values will be put on. `worth`:
+    squared error in one pose that a bit costs. Returns [33] f32: price and width of scale, rotation and opacity, and of
+    luma and chroma of the constant and each SH degree; then centres of the three scales, opacity, Y, Co and Cg.
     """
     centres = _centres(planes)
     grid = [steps.scale, steps.rotation, steps.opacity]

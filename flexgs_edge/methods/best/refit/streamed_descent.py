@@ -72,17 +72,12 @@ class StreamedDescent:
     A step draws its view chunk by chunk, and then moves the chunks of which it shows something. A mean follows the values of the
     other chunks later, when a view shows them: they do not change until then.
 
-    Parameters
-    ----------
-    renderer : Renderer
-        With nothing loaded. Its storage holds the state.
-    planes, degrees, origin, structure
-        As for `Descent`.
+    `planes`, `degrees`, `origin`, `structure`: as for `Descent`.
     """
 
     def __init__(
         self,
-        renderer: Renderer,
+        renderer: Renderer,  # With nothing loaded. Its storage holds the state.
         planes: dict[str, np.ndarray],
         degrees: np.ndarray,
         origin: np.ndarray,
