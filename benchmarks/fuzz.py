@@ -377,11 +377,7 @@ def main() -> int:
             continue
         tally = fuzz(kind, options.first, options.tries or round(options.part * kind.tries), keep=options.keep)
         tallies.append(tally)
-        print(
-            f"{kind.name}: {tally.tries} tries, {dict(tally.outcomes)}",
-            file=sys.stderr,
-            flush=True,
-        )
+        print(f"{kind.name}: {tally.tries} tries, {dict(tally.outcomes)}", file=sys.stderr, flush=True)
         print("\n".join(tally.failures), end="\n" if tally.failures else "", file=sys.stderr, flush=True)
     page = table(tallies, (time.process_time() - started) / 60)
     if options.tries is None and not options.only and not options.first:

@@ -75,13 +75,7 @@ CULLED: Final = 0xFFFFFFFF
 # --- spherical harmonics (real basis, the field's usual signs) --------------------------------
 SH_C0: Final = 0.28209479177387814
 SH_C1: Final = 0.4886025119029199
-SH_C2: Final = (
-    1.0925484305920792,
-    -1.0925484305920792,
-    0.31539156525252005,
-    -1.0925484305920792,
-    0.5462742152960396,
-)
+SH_C2: Final = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
 SH_C3: Final = (
     -0.5900435899266435,
     2.890611442640554,
@@ -110,14 +104,7 @@ EXP2_MAGIC: Final = 12582912.0
 EXP2_LOW: Final = -126.0
 EXP2_HIGH: Final = 127.0
 """Arguments of exp2 are clamped to this range, so that there are no denormals and no infinity."""
-EXP2_POLY: Final = (
-    1.000000072,
-    6.931469671e-1,
-    2.402211972e-1,
-    5.550713274e-2,
-    9.675541333e-3,
-    1.327647178e-3,
-)
+EXP2_POLY: Final = (1.000000072, 6.931469671e-1, 2.402211972e-1, 5.550713274e-2, 9.675541333e-3, 1.327647178e-3)
 """Polynomial of degree 5 on [-0.5, 0.5]: relative error 7.5e-8 in reals, 2.15e-7 in float32."""
 
 LOG2_PIVOT: Final = 0x3F2AAAAB

@@ -173,18 +173,9 @@ memory_option = option(
     help="Most memory for the run, such as 600MiB or 2GB. Less is slower. Default: 3/4 of the free memory.",
 )
 force_option = option(OUTPUT, "-f", "--force", is_flag=True, help="Overwrite files that exist.")
-report_option = option(
-    OUTPUT,
-    "--report",
-    metavar="DIR",
-    help="Write a page about the result: DIR/index.html.",
-)
+report_option = option(OUTPUT, "--report", metavar="DIR", help="Write a page about the result: DIR/index.html.")
 json_option = option(
-    OUTPUT,
-    "--json",
-    "json_path",
-    metavar="FILE",
-    help="Write the result as JSON to FILE; - is stdout.",
+    OUTPUT, "--json", "json_path", metavar="FILE", help="Write the result as JSON to FILE; - is stdout."
 )
 quiet_option = option(OUTPUT, "-q", "--quiet", is_flag=True, help="Show no log and no progress bars.")
 debug_option = option(

@@ -218,10 +218,7 @@ def reference_bytes(size: ViewSize) -> int:
 def structure_shapes(size: ViewSize) -> Shapes:
     """Buffers for the gradient of a view's SSIM. They end in rows that the sums of the last pixels read."""
     stride = size.tiles_x * TILE
-    return {
-        "taps": ((SSIM_WINDOW,), np.float32),
-        "slopes": ((3, 3, (size.height + SSIM_WINDOW) * stride), np.float32),
-    }
+    return {"taps": ((SSIM_WINDOW,), np.float32), "slopes": ((3, 3, (size.height + SSIM_WINDOW) * stride), np.float32)}
 
 
 def target_bytes(scene: SceneSize, size: ViewSize) -> int:

@@ -23,16 +23,7 @@ from flexgs_edge.render.ahead import ViewsAhead
 from flexgs_edge.render.camera_record import camera_record
 from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.render.fit import (
-    GRADIENT_SUMS,
-    GROWTH,
-    GUESS,
-    MOST_SUMS,
-    SUM_BYTES,
-    Fit,
-    fits_whole,
-    saves_bytes,
-)
+from flexgs_edge.render.fit import GRADIENT_SUMS, GROWTH, GUESS, MOST_SUMS, SUM_BYTES, Fit, fits_whole, saves_bytes
 from flexgs_edge.render.residual import add_structure, target_residual
 from flexgs_edge.render.statistics import Statistics, SumReader
 from flexgs_edge.render.tile_lists import list_tiles, sort_splats, split_batches

@@ -294,13 +294,7 @@ def _bars(axes: Axes, chart: BarChart) -> None:
         left = [group - 0.4 + (number + 0.5) * width for group in range(len(chart.groups))]
         shown = [value or 0.0 for value in values]
         bars = axes.bar(left, shown, width * 0.94, color=COLOURS[number], label=label)
-        axes.bar_label(
-            bars,
-            [_bar_words(value, chart) for value in values],
-            padding=2,
-            fontsize=7.5,
-            color=INK,
-        )
+        axes.bar_label(bars, [_bar_words(value, chart) for value in values], padding=2, fontsize=7.5, color=INK)
     axes.axhline(0.0, color=INK, linewidth=0.8)
     if chart.limit is not None:
         axes.axhline(chart.limit, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))

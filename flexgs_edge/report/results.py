@@ -229,11 +229,7 @@ class EvaluateResult:
 
     def summary(self) -> str:
         """Return the text that the command prints."""
-        lines = [
-            *scene_lines("scene", self.scene),
-            *scene_lines("against", self.reference),
-            *view_lines(self.views),
-        ]
+        lines = [*scene_lines("scene", self.scene), *scene_lines("against", self.reference), *view_lines(self.views)]
         lines += quality_lines(self.quality, f"{len(self.quality.views)} {self.quality_views} views")
         lines += [line("warning", words) for words in self.warnings]
         lines += ["", *_view_table(self.quality.views)]

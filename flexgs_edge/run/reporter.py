@@ -117,10 +117,7 @@ class Reporter:
             except OSError as error:
                 raise InputError(f"--report {self.folder}: cannot make the folder ({error.strerror})") from error
             place = self.folder / PAGE
-            with (
-                atomic_write(self.folder / RECORD, self.force) as record,
-                atomic_write(place, self.force) as page,
-            ):
+            with atomic_write(self.folder / RECORD, self.force) as record, atomic_write(place, self.force) as page:
                 record.write(json_text(result.to_json()).encode())
                 # Flush the record before the page gets its name: on a full disk no page may stand without its record.
                 record.flush()

@@ -18,11 +18,7 @@ EXP2_ERROR = 2.15e-7
 
 
 def run_probe(
-    form: str,
-    body: str,
-    inputs: list[np.ndarray],
-    outputs: int = 1,
-    dtype: type = np.float32,
+    form: str, body: str, inputs: list[np.ndarray], outputs: int = 1, dtype: type = np.float32
 ) -> list[np.ndarray]:
     """Run a throw-away kernel after constants and common.clh; `body` reads x0, x1, ... and writes y0, y1, ... at i."""
     backend = open_form(form)

@@ -113,10 +113,7 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
         yield drawer.read_sums(sums, 6, source.count)
     planes = source.read(slice(0, source.count), list(FIELD))
     planes = refit_colours(
-        planes,
-        np.full(source.count, 4),
-        Original(Bench(drawer), source.origin, [camera], references),
-        rounds=1,
+        planes, np.full(source.count, 4), Original(Bench(drawer), source.origin, [camera], references), rounds=1
     )
     yield planes["sh_dc"]
     yield planes["sh_rest"]

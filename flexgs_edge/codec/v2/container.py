@@ -324,12 +324,4 @@ def channel_bytes(
     return table
 
 
-__all__ = [
-    "GridContainer",
-    "Preview",
-    "channel_bytes",
-    "coded_size",
-    "trim_container",
-    "verify_grid",
-    "write_grid",
-]
+__all__ = ["GridContainer", "Preview", "channel_bytes", "coded_size", "trim_container", "verify_grid", "write_grid"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,11 +19,12 @@ from flexgs_edge.codec.v2.threads import in_order, thread_count
 from flexgs_edge.codec.v2.walk import ChunkCodes, base_kinds
 from flexgs_edge.constants import CODE_LIMIT
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.on_grid import grid_comment
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.scene.check import SH_LARGEST
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 
+GRID_COMMENT = "flexgs-edge grid "
+"""Begins the comment in a PLY that names the step sizes of its values."""
 DECODE_BYTES = 800
 """Bound on the bytes per row while NumPy decodes a chunk: codes, features, neighbours' weights, sums."""
 _ROTATION_STEP_MOST = 2.0**38
@@ -50,7 +52,7 @@ class GridSource(SceneSource):
         colour = CODE_LIMIT * max(steps.dc, *steps.sh, 0.0) * (1 + steps.chroma)
         self.valid = steps.rotation <= _ROTATION_STEP_MOST and colour <= SH_LARGEST
         self.settings: dict[str, Any] = header.settings
-        self.comments = (grid_comment(header.grid_steps),)
+        self.comments = (GRID_COMMENT + json.dumps(header.grid_steps.to_json()),)
         self._model = self.container.read_model()
         self._entries = self.container.read_table()
         self._chunks = header.chunks()

@@ -153,13 +153,7 @@ def walk_chunk(
 
 
 def _walk_channel(
-    group: int,
-    known: Any,
-    port: Port,
-    plan: Plan,
-    rows: int,
-    source: np.ndarray | None,
-    mean: np.ndarray | None = None,
+    group: int, known: Any, port: Port, plan: Plan, rows: int, source: np.ndarray | None, mean: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Code one channel: codes [rows] i32 and values [rows] f32. The neighbours' means are written into `mean`."""
     if source is None:

@@ -16,12 +16,7 @@ def _pull(away: np.ndarray, price: np.float32, width: np.float32) -> np.ndarray:
 
 
 def price_bits(
-    degree: int,
-    prices: np.ndarray,
-    degrees: np.ndarray,
-    pace: np.ndarray,
-    values: np.ndarray,
-    gradient: np.ndarray,
+    degree: int, prices: np.ndarray, degrees: np.ndarray, pace: np.ndarray, values: np.ndarray, gradient: np.ndarray
 ) -> None:
     """Add what the bits of values cost to their gradients ([14 + 3 K, stride]), in rows that have gradients.
 

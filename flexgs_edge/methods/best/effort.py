@@ -127,15 +127,7 @@ def pixels_of(cameras: Sequence[Camera], steps: Sequence[float]) -> int:
 
 EFFORTS = {
     "fast": Effort(
-        keep=0.77,
-        refit_rounds=0,
-        subsets=7,
-        close=0.3,
-        few=32,
-        views=96,
-        pixels=12,
-        refitted=0.93,
-        probed=4,
+        keep=0.77, refit_rounds=0, subsets=7, close=0.3, few=32, views=96, pixels=12, refitted=0.93, probed=4
     ),
     "balanced": Effort(
         keep=0.8,

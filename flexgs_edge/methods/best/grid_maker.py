@@ -13,9 +13,8 @@ from flexgs_edge.goals.promise import excesses
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.on_grid import lowered
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.grid.to_grid import recolour, to_grid
+from flexgs_edge.grid.to_grid import lowered, recolour, to_grid
 from flexgs_edge.grid.values import values_of
 from flexgs_edge.methods.best import descents
 from flexgs_edge.methods.best.allocation import BitModel, choose

@@ -28,10 +28,9 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import values_of
 from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
 from flexgs_edge.methods.best.effort import distil_steps, effort_of
-from flexgs_edge.methods.best.grid_coder import GridCoder
+from flexgs_edge.methods.best.grid_coder import GridCoder, projected_size, with_preview
 from flexgs_edge.methods.best.grid_maker import GridMaker
 from flexgs_edge.methods.best.guess import Measure
-from flexgs_edge.methods.best.keep import kept_as_it_is, reckoned, with_preview
 from flexgs_edge.methods.best.layers import HALF, assign_layers, can_sort
 from flexgs_edge.methods.best.poses import ScoredPoses, is_fine, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
@@ -80,11 +79,8 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
                 kept = open_checkpoint(run, bench.renderer, poses.cameras, folder)
         LOG.info("searching for %s", run.target.describe())
         coder = GridCoder(bench.renderer, settings_room(run))
-        with run.clock.stage("search"):
-            found = kept_as_it_is(run, bench, coder, judges.decide)
-        grid, search = found or search_best(
-            grid_maker(run.options, coder), run, bench, poses, judges.decide, checkpoint=kept
-        )
+        maker = grid_maker(run.options, coder)
+        grid, search = search_best(maker, run, bench, poses, judges.decide, checkpoint=kept)
         judges.decided()
         if run.options.layers is not None and run.options.layers > 1:
             with run.clock.stage("layers"):
@@ -164,16 +160,16 @@ def _tried(
     return size, judges.measure(MemorySource(values_of(grid, judges.storage), origin=grid.origin))
 
 
-def grid_maker(options: CompressOptions, coder: GridCoder, kind: type[GridMaker] = GridMaker) -> MakerOf[GridScene]:
+def grid_maker(options: CompressOptions, coder: GridCoder) -> MakerOf[GridScene]:
     """Make makers of the grid of a `.fgs`."""
 
     def size_of(grid: GridScene) -> int:
-        return reckoned(options, coder.size(grid))
+        return projected_size(options, coder.size(grid))
 
     plan = effort_of(options)
 
     def make(rounds: PruneRounds, measure: Measure, see: See | None = None) -> GridMaker:
-        maker = kind(rounds, size_of, measure, plan, options.refit, rounds.original.steps, see)
+        maker = GridMaker(rounds, size_of, measure, plan, options.refit, rounds.original.steps, see)
         maker.selection.most = options.max_gaussians
         return maker
 
@@ -241,7 +237,6 @@ def open_rounds(
     run: Run[CompressOptions],  # planned
     bench: Bench,  # draws the views
     scored: Sequence[Camera],  # from `scored_poses`
-    make: Callable[..., PruneRounds] = PruneRounds,  # builds the rounds from the arguments of `PruneRounds`
     checkpoint: Checkpoint | None = None,  # keeps the rounds for a later run
     known: KnownErrors | None = None,  # from `scored_poses`; descents look at poses by it
 ) -> Iterator[PruneRounds]:
@@ -262,12 +257,12 @@ def open_rounds(
                 between = poses_between(scored) if steps else ()
                 poses = [*scored, *between]
                 turns = known.slopes(poses) if known and steps else None
-                rounds = make(
+                rounds = PruneRounds(
                     Original(bench, source.origin, scored, references, between, run.progress, steps, turns),
                     source,
                     refit=options.refit,
                     unseen_share=options.unseen_share,
-                    **({} if checkpoint is None else {"checkpoint": checkpoint}),
+                    checkpoint=checkpoint,
                 )
             yield rounds
     finally:

@@ -50,10 +50,7 @@ class WrittenFile:
 
 @contextmanager
 def open_files(
-    run: Run[CompressOptions],
-    format: Format,
-    bench: Bench | None = None,
-    judges: Judges | None = None,
+    run: Run[CompressOptions], format: Format, bench: Bench | None = None, judges: Judges | None = None
 ) -> Iterator[FileMaker]:
     """A `FileMaker` with a folder beside `output` (in a dry run: in TMPDIR), which is removed when the block ends."""
     output = run.output.path

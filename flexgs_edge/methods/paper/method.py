@@ -146,10 +146,7 @@ def _search(run: Run[CompressOptions], evaluator: SceneEvaluator) -> SearchResul
 
 
 def _write(
-    run: Run[CompressOptions],
-    quantized: QuantizedScene,
-    search: SearchResult | None,
-    judges: Judges | None,
+    run: Run[CompressOptions], quantized: QuantizedScene, search: SearchResult | None, judges: Judges | None
 ) -> Quality | None:
     """Write the file under a temporary name, measure the decoded scene, and only then give the file its name."""
     settings, output = make_settings(run, search, quantized.bits), run.output.path

@@ -133,12 +133,7 @@ def plane(studied: StudyScene) -> Experiment:
         # Steps of the list and of the refinement are estimates, because the search saw only these.
         kind = "answer" if step is search.chosen else step.phase
         rows.append(
-            {
-                "kind": kind,
-                "step": number,
-                **_rates(step.choice),
-                **studied.figures(step.size, step.measurement),
-            }
+            {"kind": kind, "step": number, **_rates(step.choice), **studied.figures(step.size, step.measurement)}
         )
     figure = studied.figure
     limit = getattr(studied.target, "limit", None)

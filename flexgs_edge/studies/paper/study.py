@@ -17,10 +17,9 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.plots import require_matplotlib
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.page import study_page
 from flexgs_edge.studies.paper import pruning, quantization, whole
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
-from flexgs_edge.studies.written import SceneStudy, write_scene
+from flexgs_edge.studies.written import SceneStudy, write_page, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -117,5 +116,4 @@ def _write(folder: Path, scenes: Sequence[SceneStudy]) -> None:
         "containers and quality figures. Sizes are bytes of the finished file. Ratios are to the PLY as INRIA writes it. The "
         "paper's figures are means over its own scenes, so beside one scene they only give the order of magnitude."
     )
-    page = study_page("The paper's evaluation", intro, sections)
-    (folder / "index.html").write_text(page, encoding="utf-8")
+    write_page(folder, "The paper's evaluation", intro, sections)

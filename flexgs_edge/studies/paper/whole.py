@@ -228,11 +228,7 @@ def _step_parts(studied: StudyScene, choice: Choice) -> dict[str, float]:
     """Median seconds of a step's parts, as `SceneEvaluator.measure` does them."""
     ranks = ranks_from_order(studied.orders["gs"])
     found: list[list[float]] = []
-    evaluator, renderer, first = (
-        studied.evaluator(Setting(choice)),
-        studied.bench.renderer,
-        studied.judge.cameras[0],
-    )
+    evaluator, renderer, first = (studied.evaluator(Setting(choice)), studied.bench.renderer, studied.judge.cameras[0])
     for _ in range(REPEATS):
         marks = [time.perf_counter()]
         select_rows(ranks, choice, studied.has_sh)

@@ -19,13 +19,7 @@ from flexgs_edge.methods.best.refit.streamed_descent import open_descent
 from flexgs_edge.scene.rotations import canonical_axes
 from flexgs_edge.views.original import Original
 
-FIELD_RATES = {
-    "log_scales": 4e-2,
-    "quats": 4.8e-3,
-    "opacity_logits": 8e-2,
-    "sh_dc": 8e-3,
-    "sh_rest": 1e-3,
-}
+FIELD_RATES = {"log_scales": 4e-2, "quats": 4.8e-3, "opacity_logits": 8e-2, "sh_dc": 8e-3, "sh_rest": 1e-3}
 """Largest changes of the other values in a step: 1.6 (opacities) to 8 times (scales, SH) the reference program's. That program
 takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
 STRUCTURE, LED_STRUCTURE, FULL_LEAD = 0.02, 0.04, 0.3
