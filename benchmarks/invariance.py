@@ -21,8 +21,7 @@ import numpy as np
 from benchmarks.harness import SCENES, Timer, check
 from benchmarks.moved_scene import Similarity
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.inria import inria_json
-from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.cameras.read import inria_json, read_cameras
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.io.ply import PlySource, write_ply

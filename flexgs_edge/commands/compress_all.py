@@ -14,7 +14,7 @@ from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_folder, check_writable
 from flexgs_edge.io.formats import format_of
-from flexgs_edge.memory.heap import trim_heap
+from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.batch_result import BatchItem, BatchResult
 from flexgs_edge.report.results import CompressResult

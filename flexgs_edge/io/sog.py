@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from flexgs_edge.errors import FormatError
+from flexgs_edge.io.codes import unpack_small
 from flexgs_edge.io.decoded import DecodedSource
 from flexgs_edge.io.exact_pictures import is_lossy, picture_size, read_pixels
 from flexgs_edge.io.pieces import Pieces, folder_pieces, open_zip, zip_pieces
-from flexgs_edge.io.quat_codes import unpack_small
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.io.sog_meta import BANDS, SogMeta, parse_meta
 from flexgs_edge.scene.source import Rows

@@ -13,11 +13,10 @@ import numpy as np
 
 from flexgs_edge._version import __version__
 from flexgs_edge.errors import InputError
-from flexgs_edge.io.codebook import best_codebook, nearest_codes
+from flexgs_edge.io.codes import rounded_quats
 from flexgs_edge.io.exact_pictures import write_pixels
-from flexgs_edge.io.quat_codes import rounded_quats
 from flexgs_edge.io.reading import Writing
-from flexgs_edge.io.sh_palette import sh_palette
+from flexgs_edge.io.sh_palette import best_codebook, nearest_codes, sh_palette
 from flexgs_edge.io.sog import META, PALETTE_COLUMNS, QUAT_MODE
 from flexgs_edge.scene.source import SceneSource
 

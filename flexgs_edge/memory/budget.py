@@ -12,8 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from flexgs_edge.errors import BudgetError
-from flexgs_edge.memory.heap import HeapWatch
-from flexgs_edge.memory.process import available_memory, current_rss
+from flexgs_edge.memory.process import HeapWatch, available_memory, current_rss
 from flexgs_edge.units import format_mib
 
 LARGE = 2**20

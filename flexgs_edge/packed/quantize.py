@@ -23,7 +23,7 @@ from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.scene.contraction import LARGEST, Contraction, densest
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.rotations import normalize_quats
-from flexgs_edge.scene.sample import SAMPLE_ROWS, some_positions
+from flexgs_edge.scene.source import SAMPLE_ROWS, some_positions
 
 if TYPE_CHECKING:
     from flexgs_edge.scene.source import SceneSource

@@ -14,7 +14,7 @@ from typing import Any
 from flexgs_edge._version import __version__
 from flexgs_edge.goals.promise import KeptPromise
 from flexgs_edge.goals.steps import Scored, SearchResult
-from flexgs_edge.packed.sensitivity import Sensitivity
+from flexgs_edge.packed.bitspec import Sensitivity
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.as_json import promise_json, quality_json, rounded, step_json
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo

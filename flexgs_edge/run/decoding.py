@@ -14,7 +14,7 @@ from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.tested import processors_with_verdicts
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.memory.heap import trim_heap
+from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.clock import Stopwatch

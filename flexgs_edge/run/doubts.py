@@ -9,7 +9,7 @@ from flexgs_edge.io.frames import RDF
 from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.scene.sample import some_positions
+from flexgs_edge.scene.source import some_positions
 from flexgs_edge.small_matrices import product
 
 FIT_GAP = 2.0

@@ -11,7 +11,7 @@ from flexgs_edge.render.fit import DEFAULT, GUESS, ViewSize, compact_bytes, padd
 from flexgs_edge.run.counted_backend import BUILD_BYTES, RUNTIME_BYTES
 from flexgs_edge.run.judge import work_bytes
 from flexgs_edge.run.run import Run
-from flexgs_edge.scene.sample import some_positions
+from flexgs_edge.scene.source import some_positions
 
 BLOCKS = 64
 """Blocks of a view's passes on the device: as many as a processor of 16 cores has."""

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import SearchResult
+from flexgs_edge.goals.steps import Choice, SearchResult
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.packed.bitspec import BitSpec
-from flexgs_edge.packed.sensitivity import Sensitivity
+from flexgs_edge.packed.bitspec import BitSpec, Sensitivity
 from flexgs_edge.quality.view_quality import Quality
 
 

@@ -11,7 +11,6 @@ from flexgs_edge.cameras.camera import split_views
 from flexgs_edge.codec.v2.header import PREVIEW_MOST
 from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, MAX_VIEW_WIDTH
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.promise import (
     LEAST_SSIM,
     SSIM_PER_DB,
@@ -22,7 +21,7 @@ from flexgs_edge.goals.promise import (
     promised,
     worst_allowed,
 )
-from flexgs_edge.goals.steps import REFINE_STEPS
+from flexgs_edge.goals.steps import REFINE_STEPS, Choice
 from flexgs_edge.goals.target import Figure, MaxDrop, MaxSize, MinFidelity, Target, min_ratio
 from flexgs_edge.io.reading import Reading, Writing
 from flexgs_edge.packed.bitspec import PAPER, BitSpec

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.promise import MadePoses, Promised
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.goals.target import Figure, Target
 from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.options import CompressOptions

@@ -6,8 +6,7 @@ from typing import Any
 
 from flexgs_edge._version import __version__
 from flexgs_edge.codec.header import canonical_json
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import SearchResult, Step
+from flexgs_edge.goals.steps import Choice, SearchResult, Step
 from flexgs_edge.goals.target import Covered, Measurement
 from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.run.options import CompressOptions

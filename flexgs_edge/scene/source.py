@@ -287,3 +287,14 @@ def by_chunk(rows: Rows, starts: np.ndarray) -> Iterator[tuple[int, Rows, slice]
     cuts = np.flatnonzero(np.diff(chunks, prepend=-1))
     for start, stop in zip(cuts.tolist(), [*cuts[1:].tolist(), len(rows)], strict=True):
         yield int(chunks[start]), rows[start:stop], slice(start, stop)
+
+
+SAMPLE_ROWS = 4096
+"""Most Gaussians whose positions tell which poses see which part of a scene, and how much of it."""
+
+
+def some_positions(source: SceneSource, most: int = SAMPLE_ROWS) -> np.ndarray:
+    """[3, n] f64, world coordinates of at most `most` rows, evenly spread over the scene's rows."""
+    rows = np.arange(0, source.count, max(-(-source.count // most), 1))
+    positions: np.ndarray = source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
+    return positions

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import SearchResult, Step
+from flexgs_edge.goals.steps import Choice, SearchResult, Step
 from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores

@@ -11,8 +11,7 @@ from typing import Any
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.viewer.assets import PAGE, PLAIN, STYLE, entries_of
-from flexgs_edge.viewer.join import join_modules
-from flexgs_edge.viewer.shorten import shorten_style
+from flexgs_edge.viewer.join import join_modules, shorten_style
 
 _CONFIG = '<script type="application/json" id="scene">{}</script>'
 _STYLE_LINK = '<link rel="stylesheet" href="style.css">'

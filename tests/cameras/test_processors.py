@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from flexgs_edge.cameras.generated import at_distance, poses_between
-from flexgs_edge.cameras.inria import read_inria
 from flexgs_edge.cameras.order import covering_order
+from flexgs_edge.cameras.read import read_inria
 from flexgs_edge.render.camera_record import camera_record
 
 PROCESSORS = {

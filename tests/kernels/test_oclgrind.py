@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.codec.v2.container import write_grid
-from flexgs_edge.codec.v2.decode import decode_chunk
+from flexgs_edge.codec.v2.container import decode_chunk, write_grid
 from flexgs_edge.codec.v2.device.decode_kernel import ChunkKernel
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.grid.step_sizes import StepSizes
@@ -28,9 +27,8 @@ from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.descent import Descent
+from flexgs_edge.methods.best.refit.descent import Descent, bit_prices
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
-from flexgs_edge.methods.best.refit.prices import bit_prices
 from flexgs_edge.quality.flip import flips
 from flexgs_edge.quality.ssim import ssims
 from flexgs_edge.render.fit import Fit

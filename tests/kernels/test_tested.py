@@ -16,7 +16,7 @@ import pytest
 
 from flexgs_edge.cli import app
 from flexgs_edge.errors import BudgetError, DeviceError
-from flexgs_edge.kernels import programs
+from flexgs_edge.kernels import session as programs
 from flexgs_edge.kernels import tested as module
 from flexgs_edge.kernels import verdict as verdicts
 from flexgs_edge.kernels.choose_device import DeviceInfo, choose_device, list_devices

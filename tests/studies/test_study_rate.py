@@ -23,9 +23,9 @@ from flexgs_edge.progress import SILENT
 from flexgs_edge.report.plots import LineChart, Series, draw, picture
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.studies.rate import study as rate
-from flexgs_edge.studies.rate.curves import Curve
 from flexgs_edge.studies.rate.points import best_points, paper_points
 from flexgs_edge.studies.rate.study import RateStudy, study_rate
+from flexgs_edge.studies.rate.trade import Curve
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene
 from tiny_project import COUNT, make_project
 

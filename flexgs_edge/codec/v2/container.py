@@ -14,20 +14,35 @@ import numpy as np
 from flexgs_edge.codec.header import PREAMBLE_BYTES, Section, format_error
 from flexgs_edge.codec.sections import ChunkEntry, SectionFile, Verification, checked, preamble
 from flexgs_edge.codec.v2.boxes import with_boxes
-from flexgs_edge.codec.v2.channels import Channels
-from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes
-from flexgs_edge.codec.v2.decode import decode_chunk
+from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, check_end, least_bytes
 from flexgs_edge.codec.v2.device.launch import Device
 from flexgs_edge.codec.v2.encode import Encoded, encode_grid
-from flexgs_edge.codec.v2.header import HEADER_MOST, GridHeader, decode_header, encode_header
+from flexgs_edge.codec.v2.header import HEADER_MOST, Channels, GridHeader, decode_header, encode_header
 from flexgs_edge.codec.v2.model import Model
 from flexgs_edge.codec.v2.octree import TooManyNodes
-from flexgs_edge.codec.v2.rans import StreamError
-from flexgs_edge.codec.v2.walk import ChunkCodes
+from flexgs_edge.codec.v2.ports import DecodePort
+from flexgs_edge.codec.v2.rans import Decoder, StreamError, lane_count
+from flexgs_edge.codec.v2.walk import ChunkCodes, walk_chunk
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.files import atomic_write
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
+
+
+def decode_chunk(
+    model: Model, rows: int, data: bytes, base_only: bool = False, cost: np.ndarray | None = None
+) -> ChunkCodes:
+    """Decode the codes of a chunk; raises `StreamError` for bytes that no encoder writes.
+
+    `model`: the model of the file. `rows`: rows of the chunk. `data`: the whole chunk. `base_only`: stop before the SH;
+    False by default. `cost`: [alphabets] f64, to which the bits of each alphabet are added.
+    """
+    stream = Decoder(data, lane_count(rows))
+    codes = walk_chunk(rows, model.depth, model.sh_degree, DecodePort(model, stream, cost), None, base_only)
+    if not base_only:
+        check_end(data, rows, stream.finish())
+    return codes
+
 
 VERSION = 2
 

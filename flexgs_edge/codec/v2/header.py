@@ -19,12 +19,37 @@ from flexgs_edge.codec.header import (
     parse_json,
     shown,
 )
-from flexgs_edge.codec.v2.channels import COUNT_MOST, Channels, channel_parts
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes, plan_chunks
 from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
+
+COUNT_MOST = 2**53 - 1
+"""Largest number of bytes or rows: every JSON reader keeps integers up to here exactly."""
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Bytes of each kind in `channel_parts`, rounded, and the number of rows with SH of at least degree 1, 2 and so on."""
+
+    bytes: tuple[int, ...]
+    rows: tuple[int, ...]
+
+    @classmethod
+    def of(cls, taken: Mapping[str, float], rows: Sequence[int]) -> Channels:
+        """Make the record from the bytes of each alphabet (as in `channel_bytes`) and the rows of each degree from 1 on."""
+        parts = channel_parts(len(rows)).values()
+        return cls(tuple(round(sum(taken[part] for part in some)) for some in parts), tuple(map(int, rows)))
+
+
+def channel_parts(sh_degree: int) -> dict[str, tuple[str, ...]]:
+    """The kinds of value in version 2, and the alphabets of each."""
+    parts: dict[str, tuple[str, ...]] = {"position": ("position", "repeats")}
+    parts |= {name: tuple(f"{name} {axis}" for axis in "xyz") for name in ("scale", "rotation")}
+    parts |= {"opacity": ("opacity",), "dc": ("dc Y", "dc Co", "dc Cg"), "sh degree": ("sh degree",)}
+    return parts | {f"sh {d}": tuple(f"sh {d} {c}" for c in ("Y", "Co", "Cg")) for d in range(1, sh_degree + 1)}
+
 
 HEADER_MOST = 1 << 20
 MODEL_MOST = 1 << 20

@@ -20,7 +20,7 @@ def price_bits(
 ) -> None:
     """Add what the bits of values cost to their gradients ([14 + 3 K, stride]), in rows that have gradients.
 
-    `prices` is the record of `flexgs_edge.methods.best.refit.prices.bit_prices`.
+    `prices` is the record of `flexgs_edge.methods.best.refit.descent.bit_prices`.
     """
     rows = np.flatnonzero(pace > 0)
     own = values[:, rows]

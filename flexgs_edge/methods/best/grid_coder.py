@@ -12,7 +12,7 @@ from flexgs_edge.codec.v2.container import coded_size, write_grid
 from flexgs_edge.codec.v2.encode import Encoded, encode_grid
 from flexgs_edge.codec.v2.header import PREVIEW_KEY
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.memory.heap import trim_heap
+from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import coding_device

@@ -21,8 +21,7 @@ from flexgs_edge.cameras.generated import poses_between
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.errors import TargetError
 from flexgs_edge.files import temporary_name
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import Scored, SearchResult, Step, step_words
+from flexgs_edge.goals.steps import Choice, Scored, SearchResult, Step, step_words
 from flexgs_edge.goals.target import Measurement
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import values_of
@@ -30,14 +29,13 @@ from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
 from flexgs_edge.methods.best.effort import distil_steps, effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder, projected_size, with_preview
 from flexgs_edge.methods.best.grid_maker import GridMaker
-from flexgs_edge.methods.best.guess import Measure
 from flexgs_edge.methods.best.layers import HALF, assign_layers, can_sort
-from flexgs_edge.methods.best.poses import ScoredPoses, is_fine, scored_poses
+from flexgs_edge.methods.best.poses import KnownErrors, ScoredPoses, is_fine, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate, Maker, Product, RateResult, search
+from flexgs_edge.methods.best.selection import Measure
 from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, choose_storage, least_spilled, needed_bytes
-from flexgs_edge.methods.best.view_weights import KnownErrors
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.view_buffers import view_size
 from flexgs_edge.run.decoding import decoded

@@ -20,15 +20,15 @@ from flexgs_edge.methods.best.costs import (
     PART_NAMES,
     CostParts,
     RemovalCosts,
+    Snapshot,
     cost_bytes,
     cost_parts,
     cost_sums,
     put_costs,
 )
 from flexgs_edge.methods.best.effort import LEAST_VIEWS
+from flexgs_edge.methods.best.poses import KnownErrors
 from flexgs_edge.methods.best.refit.colour import normal_bytes, normal_sums, step_colours
-from flexgs_edge.methods.best.snapshot import Snapshot
-from flexgs_edge.methods.best.view_weights import KnownErrors
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.check import alive, invisible

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flexgs_edge.cameras.camera import Camera, largest_of
-from flexgs_edge.memory.heap import return_freed_memory
+from flexgs_edge.memory.process import return_freed_memory
 from flexgs_edge.memory.rows import READING_BYTES
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps

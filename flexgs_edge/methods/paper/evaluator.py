@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.codec.v1.header import container_size
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.goals.target import Measurement
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows

@@ -15,25 +15,52 @@ from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v1.packed_source import FgsSource
 from flexgs_edge.files import temporary_name
 from flexgs_edge.goals.steps import SearchResult, Step, step_words
-from flexgs_edge.methods.paper.auto_bits import bits_by_sensitivity
 from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.methods.paper.score_cache import score_cache
 from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.methods.paper.search import adapt, measure_fixed
-from flexgs_edge.packed.bitspec import PAPER
+from flexgs_edge.packed.bitspec import ALLOWED_DROP, PAPER, BitSpec, Sensitivity, search_bits
 from flexgs_edge.packed.quantize import QuantizedScene, quantized_bytes
-from flexgs_edge.packed.sensitivity import Sensitivity
+from flexgs_edge.quality.psnr import error_for_drop
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decode_bytes
 from flexgs_edge.run.foresight import drawing_bytes
+from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.judges import Judges
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings
 from flexgs_edge.units import format_size
 from flexgs_edge.views.bench import Bench
+
+SENSITIVITY_VIEWS = 8
+"""Most training poses that sensitivity is measured on, evenly spread."""
+
+
+def bits_by_sensitivity(
+    evaluator: SceneEvaluator, run: Run[CompressOptions], bench: Bench
+) -> tuple[BitSpec, list[Sensitivity]]:
+    """Search for the bits with nothing pruned; returns them and the measured sensitivities."""
+    renderer, source, views, base_psnr = bench.renderer, evaluator.source, run.seen, run.options.base_psnr
+    count = min(SENSITIVITY_VIEWS, len(views.train))
+    indices = [views.train[i * len(views.train) // count] for i in range(count)]
+    judge = Judge(bench, source, views, indices, with_photos=False, base_psnr=base_psnr)
+    with renderer.load(source) as original:
+        judge.prepare(original, run.progress)
+
+    def error(bits: BitSpec) -> float:
+        with evaluator.quantized(EVERYTHING, bits) as quantized, renderer.load_quantized(quantized) as scene:
+            return judge.compare(scene).deciding_error
+
+    kept, with_sh = evaluator.counts(EVERYTHING)
+    bits, found = search_bits(error, source.sh_degree, with_sh / kept, error_for_drop(ALLOWED_DROP, base_psnr))
+    judge.close()
+    LOG.info("bits found by sensitivity: %s", bits)
+    return bits, found
+
 
 LOG = logging.getLogger("flexgs_edge")
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 
 if TYPE_CHECKING:
     from flexgs_edge.scene.source import SceneSource

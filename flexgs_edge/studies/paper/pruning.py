@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.methods.paper.search import CANDIDATES
 from flexgs_edge.report.plots import LineChart, PlaneChart, Series
 from flexgs_edge.studies.experiment import Beside, Experiment

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import MAX_PRUNE
+from flexgs_edge.goals.steps import MAX_PRUNE, Choice
 from flexgs_edge.goals.target import Measurement, min_ratio
 from flexgs_edge.memory.process import peak_rss
 from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows

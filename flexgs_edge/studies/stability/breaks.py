@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.methods.paper.evaluator import SceneEvaluator
 from flexgs_edge.quality.psnr import modelled_drop
 from flexgs_edge.quality.view_quality import Quality, ViewQuality

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.codec.v2.container import coded_size
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import from_grid
@@ -19,10 +20,14 @@ from flexgs_edge.methods.best.method import grid_maker, open_rounds
 from flexgs_edge.methods.best.poses import scored_poses
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import search as search_by
+from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import MemorySource, SceneSource
-from flexgs_edge.studies.study_scene import StudyScene
+from flexgs_edge.studies.paper.pruning import nearest
+from flexgs_edge.studies.stability.breaks import drawn
+from flexgs_edge.studies.study_scene import Setting, StudyScene
 from flexgs_edge.views.bench import Bench
 
 
@@ -82,3 +87,55 @@ def _search(studied: StudyScene, rounds: PruneRounds, judge: Judge, renderer: Re
 def _whole(made: GridMaker, grid: GridScene, multiplier: float, reached: bool) -> Whole:
     rows = made.rounds.scene_rows(made.selection.kept(multiplier).rows)
     return Whole(grid, coded_size(grid, {}), multiplier, rows, reached)
+
+
+BEST, PAPER, RTN, ROWS, SH = "best", "paper", "RTN, 8 bits", "rows only", "SH only"
+MARGIN = "best, --views-margin"
+WORDS = (
+    f"best and paper: the results at the study's target. {MARGIN}: generated poses are scored too. {RTN}: one "
+    f"range a channel, nothing removed. {ROWS}, {SH}: the paper's bits, with only Gaussians or only SH removed by gs, to "
+    "paper's bytes or as near as possible."
+)
+
+
+class Contenders:
+    """The compressed scenes, by name.
+
+    `studied`: the scene. `ours`: the result of best. `guarded`: the result of best with generated poses
+    (`--views-margin`).
+    """
+
+    def __init__(self, studied: StudyScene, ours: Whole, guarded: Whole) -> None:
+        self.studied, self.wholes = studied, {BEST: ours, MARGIN: guarded}
+        paper = Setting(studied.search.chosen.choice)
+        size = studied.size(paper)
+        self.settings = {
+            PAPER: paper,
+            RTN: Setting(bits=BitSpec.rtn(8), groups=1),
+            ROWS: Setting(_of_size(studied, size, lambda rate: Choice(min(rate, 980), 0))),
+            SH: Setting(_of_size(studied, size, lambda rate: Choice(0, rate))),
+        }
+        self.names = (*self.wholes, *self.settings)
+
+    def size(self, name: str) -> int:
+        """Bytes of the file."""
+        return self.wholes[name].size if name in self.wholes else self.studied.size(self.settings[name])
+
+    @contextmanager
+    def loaded(self, name: str) -> Iterator[DeviceScene]:
+        """The decoded scene of its file, loaded to draw."""
+        if name in self.wholes:
+            with self.studied.bench.renderer.load(self.wholes[name].source) as scene:
+                yield scene
+        else:
+            setting = self.settings[name]
+            with drawn(self.studied, self.studied.evaluator(setting), setting.choice) as scene:
+                yield scene
+
+
+def _of_size(studied: StudyScene, size: int, choice: Callable[[int], Choice]) -> Choice:
+    ladder = [choice(rate) for rate in range(1001)]
+    sizes = [studied.size(Setting(one)) for one in ladder]
+    place = nearest(sizes, size)
+    # If a size is out of reach, the nearer end counts.
+    return ladder[place] if place is not None else ladder[-1 if size < sizes[-1] else 0]

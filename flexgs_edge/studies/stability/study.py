@@ -11,9 +11,8 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.stability.contenders import Contenders
 from flexgs_edge.studies.stability.heldout import held_out
-from flexgs_edge.studies.stability.ours import search, walked
+from flexgs_edge.studies.stability.ours import Contenders, search, walked
 from flexgs_edge.studies.stability.unseen_poses import FULL, QUICK, Amounts, poses
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
 from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_study

@@ -14,7 +14,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.memory.storage import Storage
-from flexgs_edge.methods.best.refit.prices import bit_prices
+from flexgs_edge.methods.best.refit.descent import bit_prices
 from flexgs_edge.methods.best.refit.streamed_descent import open_descent
 from flexgs_edge.scene.rotations import canonical_axes
 from flexgs_edge.views.original import Original
