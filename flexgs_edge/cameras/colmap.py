@@ -45,8 +45,7 @@ MODELS: dict[int, Model] = dict(
             Model("RAD_TAN_THIN_PRISM_FISHEYE", 2, 16, True),
         )
     )
-)
-"""Camera models by COLMAP's model id."""
+)  # Camera models by COLMAP's model id
 
 LENSES: dict[str, Callable[[tuple[float, ...]], Lens]] = {
     **dict.fromkeys(("SIMPLE_RADIAL", "RADIAL"), Lens),

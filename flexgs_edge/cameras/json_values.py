@@ -13,10 +13,8 @@ from flexgs_edge.errors import FormatError, InputError, brief
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of |R R^T - 1|. Files keep 6 digits or more; a scaled or sheared matrix is off by far more."""
-MAX_SIDE = 65535
-"""Most pixels of a side; a larger number means a damaged file (JPEG has this limit too)."""
-_SHOWN = 20
-"""Most keys in a message."""
+MAX_SIDE = 65535  # Most pixels of a side; a larger number means a damaged file (JPEG has this limit too)
+_SHOWN = 20  # Most keys in a message
 
 
 def load_json(path: Path) -> Any:

@@ -7,10 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-_BLOCK = 64
-"""Rows that are resampled at a time."""
-_EDGE = 65
-"""Places along each edge, and along each ray, where `fitted` looks."""
+_BLOCK = 64  # Rows that are resampled at a time
+_EDGE = 65  # Places along each edge, and along each ray, where `fitted` looks
 _ZOOMS = np.arange(1.0, 2.0, 0.002)
 
 

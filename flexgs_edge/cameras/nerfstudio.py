@@ -18,15 +18,11 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.small_matrices import product
 
 DATAPARSER = "dataparser_transforms.json"
-LEVELS = 4
-"""Folders above the data, or above a PLY, that are searched."""
-FLIP = np.diag([1.0, -1.0, -1.0])
-"""Turns OpenGL's camera (y up, looking along -z) into COLMAP's."""
+LEVELS = 4  # Folders above the data, or above a PLY, that are searched
+FLIP = np.diag([1.0, -1.0, -1.0])  # Turns OpenGL's camera (y up, looking along -z) into COLMAP's
 ASSUMED_SIZE = (640, 480)
-ASSUMED_VIEW = 65.0
-"""Degrees across the image, where a list of poses has no focal length."""
-_CONFIG_LIMIT = 1 << 20
-"""Most bytes of config.yml that are searched for the name of the data."""
+ASSUMED_VIEW = 65.0  # Degrees across the image, where a list of poses has no focal length
+_CONFIG_LIMIT = 1 << 20  # Most bytes of config.yml that are searched for the name of the data
 
 
 def find_dataparser(path: Path) -> Path | None:

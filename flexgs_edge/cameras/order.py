@@ -9,8 +9,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.small_matrices import product
 
-GAIN_DIGITS = 4
-"""Decimals in comparisons of what a camera adds, as a share of all points."""
+GAIN_DIGITS = 4  # Decimals in comparisons of what a camera adds, as a share of all points
 SAME_VIEW = 0.2
 """Two views of a point overlap if the cosine between their directions differs from 1 by less than this: up to 37
 degrees. A wider reach would leave out views that are needed: docs/results/tuning.md#same_view"""

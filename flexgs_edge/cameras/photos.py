@@ -26,8 +26,7 @@ _SHOWN = 5
 # Errors of Pillow for damaged files, besides OSError (the base of its errors for truncated and unknown files).
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, OverflowError)
 
-Size = tuple[int, int]
-"""Width and height in pixels."""
+Size = tuple[int, int]  # Width and height in pixels
 
 
 class Photos:

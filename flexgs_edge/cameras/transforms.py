@@ -27,8 +27,7 @@ from flexgs_edge.small_matrices import product
 
 LOG = logging.getLogger("flexgs_edge")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
-"""Values of `camera_model` without a lens."""
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")  # Values of `camera_model` without a lens
 BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Values of `camera_model` that are pinholes if their parameters are zero."""
 

@@ -37,8 +37,7 @@ USUAL = (
     "dry_run",
     "force",
     "quiet",
-)
-"""Options that `--help` shows, in order. `--expert` shows the others too."""
+)  # Options that `--help` shows, in order. `--expert` shows the others too.
 MORE = """\b
 More examples:
   flexgs-edge compress point_cloud.ply -o a.fgs --method paper --score-cache s.npz

@@ -32,8 +32,7 @@ reading_options = stack(
         type=int,
         help="Leave out view-dependent colour (SH) above degree N. Default: keep all.",
     ),
-)
-"""Options of every command that reads a scene with its values."""
+)  # Options of every command that reads a scene with its values
 spz_version_option = option(
     OUTPUT,
     "--spz-version",
@@ -187,12 +186,10 @@ debug_option = option(
     callback=set_debug,
     help="Show tracebacks of errors.",
 )
-write_options = stack(json_option, force_option, quiet_option, debug_option)
-"""Options of every command."""
+write_options = stack(json_option, force_option, quiet_option, debug_option)  # Options of every command
 run_options = stack(memory_option, device_option, write_options)
 """Options of every command that uses a device and writes a file."""
-photos_options = stack(cameras_option, images_option, holdout_option)
-"""Options for cameras, photos and held-out views."""
+photos_options = stack(cameras_option, images_option, holdout_option)  # Options for cameras, photos and held-out views
 study_options = stack(
     reading_options,
     photos_options,
@@ -202,9 +199,7 @@ study_options = stack(
     base_psnr_option,
     drop_invalid_option,
     run_options,
-)
-"""Options of every study."""
+)  # Options of every study
 results_option = option(
     OUTPUT, "-o", "--output", metavar="DIR", required=True, help="Folder for the results; made if missing."
-)
-"""Options for the output of a study."""
+)  # Options for the output of a study

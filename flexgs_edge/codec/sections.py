@@ -24,8 +24,7 @@ MAGIC = b"\x93FGS\r\n\x1a\n"
 them."""
 _PREAMBLE = struct.Struct("<8sHHIQII")
 _U32 = struct.Struct("<I")
-_PIECE = 1 << 20
-"""Bytes read at a time to compute a checksum."""
+_PIECE = 1 << 20  # Bytes read at a time to compute a checksum
 
 _Header = TypeVar("_Header")
 

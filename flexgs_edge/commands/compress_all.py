@@ -32,8 +32,7 @@ OF_ONE_SCENE: dict[str, tuple[object, ...]] = {
     "score_cache": (None,),
     "report": (None,),
     "resume": (False,),
-}
-"""Options that belong to one scene, and their values that suit any scene."""
+}  # Options that belong to one scene, and their values that suit any scene
 
 
 def compress_all(

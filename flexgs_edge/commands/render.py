@@ -30,8 +30,7 @@ LOG = logging.getLogger("flexgs_edge")
 
 PNG_LEVEL = 2
 """Effort of the PNG's compression: a fourth of the default's time, 8 to 21 % more bytes. docs/results/tuning.md#png_level"""
-PICTURE_BYTES = 48
-"""Bound on the bytes a pixel of a view that is read, rounded and written as PNG."""
+PICTURE_BYTES = 48  # Bound on the bytes a pixel of a view that is read, rounded and written as PNG
 
 
 def render_views(

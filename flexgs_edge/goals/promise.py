@@ -20,10 +20,8 @@ WORST_TIMES, WORST_MORE = 1.5, 0.2
 SSIM_PER_DB = 0.015
 """SSIM that may be lost for each dB of the target. The paper's method loses 0.010 to 0.019 at 1 dB:
 docs/results/tuning.md#ssim_per_db"""
-LEAST_SSIM = 1e-4
-"""Least SSIM that a target allows to lose; rounding alone loses a part of it."""
-LOST_ALONE = 1.5
-"""A view that loses so many times the share of all other bounds needs more than finer steps."""
+LEAST_SSIM = 1e-4  # Least SSIM that a target allows to lose; rounding alone loses a part of it
+LOST_ALONE = 1.5  # A view that loses so many times the share of all other bounds needs more than finer steps
 MADE_GAP = 3.0
 """Generated poses may have this much less fidelity than the views that decide, dB: twice their squared error."""
 

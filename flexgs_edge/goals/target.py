@@ -16,8 +16,7 @@ from flexgs_edge.units import format_size
 Figure = Literal["drop", "modelled drop", "fidelity"]
 """The figure that decides: drop against photos, modelled drop, or fidelity (PSNR against the original's renders)."""
 
-IDENTICAL_DB = 200.0
-"""Fidelity of identical renders in comparisons; it is never reported."""
+IDENTICAL_DB = 200.0  # Fidelity of identical renders in comparisons; it is never reported
 
 
 @dataclass(frozen=True)

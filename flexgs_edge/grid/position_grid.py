@@ -9,8 +9,7 @@ from flexgs_edge.grid.step_sizes import POSITION_BITS
 from flexgs_edge.memory.rows import COPY_ROWS, blocks, read_rows
 from flexgs_edge.scene.contraction import OCTAVES, Contraction, densest
 
-_HALF = 2 ** (POSITION_BITS - 1) - 2
-"""Steps from the centre of a grid to its ends."""
+_HALF = 2 ** (POSITION_BITS - 1) - 2  # Steps from the centre of a grid to its ends
 _LEAST_RADIUS = _HALF.bit_length() - OCTAVES.bit_length()
 """Binary logarithm of the smallest radius, in steps: all octaves then fit."""
 

@@ -12,8 +12,7 @@ from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.scene.contraction import Contraction
 
-POSITION_BITS = 21
-"""A scene is at most 2^21 cells wide on each axis; three coordinates fill a Morton index of 63 bits."""
+POSITION_BITS = 21  # A scene is at most 2^21 cells wide on each axis; three coordinates fill a Morton index of 63 bits
 
 Planes = Mapping[str, np.ndarray]
 

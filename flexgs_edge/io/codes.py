@@ -69,8 +69,7 @@ _FORMS: tuple[tuple[tuple[float, float, float, float], tuple[int, int, int]], ..
     ((0.5, -0.5, -0.5, -0.5), (2, 0, 1)),
 )
 """Turns of the axes, w x y z, and the old axis behind each new one. The other 18 forms swap and negate components only."""
-_ROUND = 1e-4
-"""What turns of round Gaussians count, so that these round to the nearest."""
+_ROUND = 1e-4  # What turns of round Gaussians count, so that these round to the nearest
 
 
 def unpack_small(codes: np.ndarray, mode: np.ndarray) -> np.ndarray:

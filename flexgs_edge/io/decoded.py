@@ -11,8 +11,7 @@ from flexgs_edge.io.frames import Frame
 from flexgs_edge.scene.fields import FIELD, OPACITY_LIMIT
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
-_BLOCK_ROWS = 16384
-"""Rows decoded at a time, so that intermediate arrays stay small."""
+_BLOCK_ROWS = 16384  # Rows decoded at a time, so that intermediate arrays stay small
 
 
 class DecodedSource(SceneSource):

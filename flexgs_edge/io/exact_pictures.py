@@ -9,10 +9,8 @@ import numpy as np
 
 from flexgs_edge.errors import FormatError
 
-_WEBP_PLACE = 20
-"""First byte of the first chunk of a WebP."""
-_LARGEST_CHUNKS = 64
-"""Chunks of a WebP that are looked through."""
+_WEBP_PLACE = 20  # First byte of the first chunk of a WebP
+_LARGEST_CHUNKS = 64  # Chunks of a WebP that are looked through
 _DAMAGED = (OSError, SyntaxError, struct.error, ValueError, EOFError, RuntimeError, IndexError, KeyError)
 """What Pillow raises for pictures that it cannot decode."""
 

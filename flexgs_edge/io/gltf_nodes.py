@@ -19,16 +19,12 @@ from flexgs_edge.scene.rotations import matrices, quats_of, times
 from flexgs_edge.scene.turn_sh import band_matrices, turn_sh
 from flexgs_edge.small_matrices import product
 
-_SAME = 1e-6
-"""Largest difference between the scales of axes that count as one: the rounding of float32."""
-_STILL = 1e-12
-"""Largest difference from the identity that is rounding alone."""
+_SAME = 1e-6  # Largest difference between the scales of axes that count as one: the rounding of float32
+_STILL = 1e-12  # Largest difference from the identity that is rounding alone
 
-_MOVES = {"matrix", "rotation", "scale", "translation"}
-"""Keys of a node that move it."""
+_MOVES = {"matrix", "rotation", "scale", "translation"}  # Keys of a node that move it
 
-Reader = Callable[[str], np.ndarray]
-"""Gives the values of a field before they are moved, [width, n] f64."""
+Reader = Callable[[str], np.ndarray]  # Gives the values of a field before they are moved, [width, n] f64
 
 
 @dataclass(frozen=True)

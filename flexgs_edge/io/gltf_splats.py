@@ -40,10 +40,8 @@ class AttributeSplats:
     opacities: Packed
     dc: Packed
     rest: list[Packed]
-    has_colours: bool
-    """`dc` holds colours, not SH."""
-    as_logs: bool = False
-    """`scales` holds logarithms."""
+    has_colours: bool  # `dc` holds colours, not SH
+    as_logs: bool = False  # `scales` holds logarithms
 
     def decode(self, rows: Rows, field: str) -> np.ndarray:
         """See `Splats`."""

@@ -17,12 +17,9 @@ from flexgs_edge.scene.source import SceneSource
 
 GZ = ".gz"
 _BLOCK = 1 << 20
-LEAST_FREE = 1 << 28
-"""Bytes of the temporary disk that stay free."""
-MOST_TIMES = 200
-"""Scenes unpack to 1.1 to 10 times their size, and any gzip file to at most 1032 times."""
-SMALL = 1 << 26
-"""Unpacked bytes that need no such bound."""
+LEAST_FREE = 1 << 28  # Bytes of the temporary disk that stay free
+MOST_TIMES = 200  # Scenes unpack to 1.1 to 10 times their size, and any gzip file to at most 1032 times
+SMALL = 1 << 26  # Unpacked bytes that need no such bound
 
 
 def unpacked(

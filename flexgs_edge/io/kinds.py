@@ -15,10 +15,8 @@ from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.io.ply_layout import PlyHeader, read_header
 
 GZIP_MAGIC = b"\x1f\x8b"
-_HEAD = 1 << 16
-"""Bytes that are looked at."""
-_PEEK = 64
-"""Bytes that are unpacked of a gzip file, to see what it holds."""
+_HEAD = 1 << 16  # Bytes that are looked at
+_PEEK = 64  # Bytes that are unpacked of a gzip file, to see what it holds
 _LFS = b"version https://git-lfs.github.com/spec/"
 _FGS = b"\x93FGS\r\n\x1a\n"
 _IMAGES = {

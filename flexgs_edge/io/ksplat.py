@@ -23,10 +23,8 @@ from flexgs_edge.scene.source import Rows, by_chunk
 
 _HEADER_BYTES, _SECTION_BYTES, _CENTRE_BYTES = 4096, 1024, 12
 _MAX_DEGREE = 3
-_SH_RANGE = 1.5
-"""SH of level 2 reach so far on both sides, unless the header says otherwise."""
-_POSITION_RANGE = 32767
-"""Code of a bucket's centre, unless the section says otherwise."""
+_SH_RANGE = 1.5  # SH of level 2 reach so far on both sides, unless the header says otherwise
+_POSITION_RANGE = 32767  # Code of a bucket's centre, unless the section says otherwise
 
 
 @dataclass(frozen=True)

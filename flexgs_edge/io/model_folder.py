@@ -12,12 +12,10 @@ from typing import Any
 from flexgs_edge.errors import FormatError, InputError
 
 _ITERATION = re.compile(r"iteration_([0-9]{1,18})")
-_CFG_LIMIT = 1 << 16
-"""Most bytes of cfg_args, which normally has a few hundred."""
+_CFG_LIMIT = 1 << 16  # Most bytes of cfg_args, which normally has a few hundred
 
 
-POINT_CLOUD = "point_cloud.ply"
-"""What INRIA's program calls the scene of an iteration."""
+POINT_CLOUD = "point_cloud.ply"  # What INRIA's program calls the scene of an iteration
 
 
 def latest_iteration(folder: Path) -> Path:

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from flexgs_edge.errors import FormatError, brief
 
-Pieces = Callable[[str], bytes]
-"""Gives the bytes of a piece by its name; raises `FormatError` if it is not there."""
+Pieces = Callable[[str], bytes]  # Gives the bytes of a piece by its name; raises `FormatError` if it is not there
 
 _MOST_UNPACKED = 1 << 22
 _MOST_GAIN = 8
@@ -21,8 +20,7 @@ a second compression."""
 _DAMAGED = (
     *(zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, struct.error, ValueError),
     *(OSError, OverflowError, IndexError, KeyError),
-)
-"""What zipfile raises for files that it cannot read."""
+)  # What zipfile raises for files that it cannot read
 
 
 def piece_place(folder: Path, piece: str, name: str) -> Path:

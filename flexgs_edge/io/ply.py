@@ -29,12 +29,9 @@ from flexgs_edge.io.ply_layout import (
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
-BLOCK_ROWS = 4096
-"""Rows read at a time: 1 MB at SH degree 3, so that gathering stays in the processor's cache."""
-_BLOCK_BYTES = 1 << 22
-"""Most bytes of these rows: a file may have any number of properties."""
-_SPAN = 4
-"""A list of rows is read as one span of the file if the span has at most this many rows for each wanted one."""
+BLOCK_ROWS = 4096  # Rows read at a time: 1 MB at SH degree 3, so that gathering stays in the processor's cache
+_BLOCK_BYTES = 1 << 22  # Most bytes of these rows: a file may have any number of properties
+_SPAN = 4  # A list of rows is read as one span of the file if the span has at most this many rows for each wanted one
 _GAP = 64
 """Rows between two wanted ones are read too, up to this many: a read of its own for the second would take as long."""
 _ORIGIN_ROWS = 65536

@@ -35,14 +35,11 @@ _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 1 << 20
 _MOST_LINES = 1 << 13
 """Most bytes and lines of a header; those of scenes have 2 kB in a hundred lines. What comes later is not looked at."""
-_SILENT = ("nx", "ny", "nz")
-"""Properties of INRIA's layout without content (normals)."""
+_SILENT = ("nx", "ny", "nz")  # Properties of INRIA's layout without content (normals)
 RGB = ("red", "green", "blue")
 """8-bit colours, which nerfstudio's export has in place of `f_dc` with `--ply-color-mode rgb`."""
-_SHOWN = 8
-"""Most names in a message."""
-PROGRAM = "flexgs-edge"
-"""First word of our comments."""
+_SHOWN = 8  # Most names in a message
+PROGRAM = "flexgs-edge"  # First word of our comments
 SMOOTHING = "filter_3D"
 """Property of Mip-Splatting: standard deviation (scene units) of a filter that stored scales and opacities do not
 include."""

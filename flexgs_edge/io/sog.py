@@ -19,10 +19,8 @@ from flexgs_edge.io.sog_meta import BANDS, SogMeta, parse_meta
 from flexgs_edge.scene.source import Rows
 
 META = "meta.json"
-PALETTE_COLUMNS = 64
-"""Entries of the SH palette in a row of its picture."""
-QUAT_MODE = 252
-"""Alpha of a quaternion whose largest component is w; the next ones are x, y and z."""
+PALETTE_COLUMNS = 64  # Entries of the SH palette in a row of its picture
+QUAT_MODE = 252  # Alpha of a quaternion whose largest component is w; the next ones are x, y and z
 _SPARE_ROWS = 1 << 20
 _ROWS_A_BYTE = 16
 """A file may hold the first number of rows, and the second for each of its bytes. Real ones need 10 to 20 bytes a row."""

@@ -12,10 +12,8 @@ import numpy as np
 from flexgs_edge.errors import FormatError, brief
 from flexgs_edge.io.decoded import opacity_logits
 
-LEVELS = 256
-"""Values of a byte."""
-BANDS: dict[int, int] = {1: 3, 2: 8, 3: 15}
-"""SH coefficients above degree 0 of one colour channel, by SH degree."""
+LEVELS = 256  # Values of a byte
+BANDS: dict[int, int] = {1: 3, 2: 8, 3: 15}  # SH coefficients above degree 0 of one colour channel, by SH degree
 _MOST_COUNT = 2**31 - 1
 
 

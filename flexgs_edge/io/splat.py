@@ -25,8 +25,7 @@ _PARTS = {
     "sh_dc": slice(24, 27),
     "opacity_logits": slice(27, 28),
     "quats": slice(28, 32),
-}
-"""Bytes of each field in a row."""
+}  # Bytes of each field in a row
 _CHUNK_ROWS = 1 << 16
 
 

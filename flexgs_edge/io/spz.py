@@ -36,12 +36,9 @@ from flexgs_edge.io.spz_layout import (
 )
 from flexgs_edge.scene.source import Rows
 
-_BLOCK = 1 << 18
-"""Packed bytes read at a time."""
-_PIECE = 1 << 20
-"""Unpacked bytes asked for at a time."""
-_TAIL = 1 << 20
-"""Most bytes behind the arrays; extensions have a few."""
+_BLOCK = 1 << 18  # Packed bytes read at a time
+_PIECE = 1 << 20  # Unpacked bytes asked for at a time
+_TAIL = 1 << 20  # Most bytes behind the arrays; extensions have a few
 _MOST_PACKED = 1032
 """Bytes that one byte can unpack to: what deflate reaches. Version 4 has the same limit, as in the reference program."""
 

@@ -17,27 +17,18 @@ from flexgs_edge.scene.fields import sh_rest_count
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, bits behind the point, flags; then a zero, or in version 4 the number of arrays."""
-PLAIN_HEADER = struct.Struct("<4sIIBBBBI12x")
-"""Header of version 4: also the place of the table of sizes."""
-SIZES = struct.Struct("<QQ")
-"""Entry of the table: packed and unpacked bytes of an array."""
-ANTIALIASED, EXTENDED = 1, 2
-"""Flags."""
+PLAIN_HEADER = struct.Struct("<4sIIBBBBI12x")  # Header of version 4: also the place of the table of sizes
+SIZES = struct.Struct("<QQ")  # Entry of the table: packed and unpacked bytes of an array
+ANTIALIASED, EXTENDED = 1, 2  # Flags
 VERSIONS = range(1, 5)
-FIRST_PLAIN = 4
-"""First version with a plain header."""
-POSITION_LIMIT = (1 << 23) - 1
-"""Largest code of a coordinate: 24 bits with a sign."""
-MAX_FRACTION_BITS = 30
-"""Readers compute 1 << bits in 32 bits with a sign."""
-COLOUR_SCALE = 0.15
-"""Colour codes are 0.5 + 0.15 times the coefficient, so that they reach beyond black and white."""
-SCALE_OFFSET, SCALE_STEPS = 10.0, 16.0
-"""Codes of log-scales: 16 a unit, from -10 on."""
+FIRST_PLAIN = 4  # First version with a plain header
+POSITION_LIMIT = (1 << 23) - 1  # Largest code of a coordinate: 24 bits with a sign
+MAX_FRACTION_BITS = 30  # Readers compute 1 << bits in 32 bits with a sign
+COLOUR_SCALE = 0.15  # Colour codes are 0.5 + 0.15 times the coefficient, so that they reach beyond black and white
+SCALE_OFFSET, SCALE_STEPS = 10.0, 16.0  # Codes of log-scales: 16 a unit, from -10 on
 ROTATION_MASK = (1 << 9) - 1
 """Magnitude of a quaternion's component from version 3 on: 9 bits for up to the root of 1/2."""
-_COORDINATES = 0xADBE0003
-"""Type of the extension that states the frame."""
+_COORDINATES = 0xADBE0003  # Type of the extension that states the frame
 _FRAMES = tuple(a + b + c for b, c in ("DB", "UB", "DF", "UF", "FD", "FU", "BD", "BU") for a in "LR")
 """Frames by their number in that extension, from 1 on; 0 says nothing. From 9 on, y and z are exchanged."""
 _SHOWN = 4

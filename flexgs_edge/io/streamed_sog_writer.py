@@ -26,10 +26,8 @@ from flexgs_edge.scene.rotations import matrices
 from flexgs_edge.scene.source import SceneSource
 
 STREAMED = "lod-meta.json"
-LEAF_ROWS = 1 << 19
-"""Most Gaussians of a part at the finest level. Smaller parts pay for more palettes."""
-_REACH = 3.0
-"""Standard deviations within which a Gaussian counts for the box of its part."""
+LEAF_ROWS = 1 << 19  # Most Gaussians of a part at the finest level. Smaller parts pay for more palettes.
+_REACH = 3.0  # Standard deviations within which a Gaussian counts for the box of its part
 _CHUNK_ROWS = 65536
 
 

@@ -66,15 +66,13 @@ KERNELS: dict[str, KernelSpec] = {
     "follow": KernelSpec("descend.cl", "uufbb", "rows"),
     "snap": KernelSpec("descend.cl", "uubbbbbbbb", "rows"),
     "dequantize": KernelSpec("dequantize.cl", "uuuuuuubbbb"),
-}
-"""Every kernel, by the name that `Backend.launch` and the twins use."""
+}  # Every kernel, by the name that `Backend.launch` and the twins use
 
 CODEC_KERNELS: dict[str, KernelSpec] = {
     "code_chunks": KernelSpec("code_chunks.cl", 11 * "u" + 17 * "b"),
     "encode_chunks": KernelSpec("encode_chunks.cl", "uubbbbbb"),
     "grid_rows": KernelSpec("grid_rows.cl", "uuuuuiiibbbb"),
-}
-"""Kernels of the codec. They have no twins: the codec's own NumPy code is their specification."""
+}  # Kernels of the codec. They have no twins: the codec's own NumPy code is their specification.
 
 
 class Array(Protocol):

@@ -70,8 +70,7 @@ class DeviceInfo:
     self_test: str
     loop_steps: int = 0
     """Steps after which the runtime leaves loops, counted over all loops of a work-item; 0 if it does not."""
-    form: str = ""
-    """Name of the form of the kernels that was measured to be fastest; empty if none was."""
+    form: str = ""  # Name of the form of the kernels that was measured to be fastest; empty if none was
     handle: cl.Device | None = field(default=None, repr=False, compare=False)
     context: cl.Context | None = field(default=None, repr=False, compare=False)
     """The context of the self-test, kept alive: after the last context is gone, PoCL starts its compiler anew for the

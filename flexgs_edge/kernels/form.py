@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 from flexgs_edge.kernels.choose_device import DeviceInfo
 
-WIDTHS = (16, 8, 4, 1)
-"""Lanes that a vector may have."""
+WIDTHS = (16, 8, 4, 1)  # Lanes that a vector may have
 GPU_WIDTHS = (1, 4)
 """Pixels of a work-item of the GPU form. With 8, llvmpipe was no faster, and took four times as long to build."""
 

@@ -54,10 +54,8 @@ def check_steps(info: DeviceInfo, name: str, size: tuple[int, ...], args: tuple[
         )
 
 
-SCAN_GROUPS = (1024, 256, 64)
-"""Sizes of the work-group that scans on GPUs: the largest that the device allows."""
-LIST_GROUP = 64
-"""Size of the work-groups that list pairs on GPUs."""
+SCAN_GROUPS = (1024, 256, 64)  # Sizes of the work-group that scans on GPUs: the largest that the device allows
+LIST_GROUP = 64  # Size of the work-groups that list pairs on GPUs
 GPU_BLOCKS = (64, 256)
 """Least and most work-items of the serial passes on GPUs; between them, two for each compute unit."""
 

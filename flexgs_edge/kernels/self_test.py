@@ -13,8 +13,7 @@ from flexgs_edge.kernels.backend import CODEC_KERNELS, Backend, TwinBackend
 from flexgs_edge.kernels.launch_record import Record, canonical, checksum
 from flexgs_edge.memory.budget import MemoryBudget
 
-PATTERN = 0xAB
-"""Every byte of a new array, so that elements that are not written are known."""
+PATTERN = 0xAB  # Every byte of a new array, so that elements that are not written are known
 
 
 class WrongResult(Exception):

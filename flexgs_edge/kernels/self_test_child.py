@@ -28,10 +28,8 @@ from flexgs_edge.memory.budget import MemoryBudget
 KERNEL = "blend_stats"
 """The kernel that is timed. Blends take most of the time of a run, and this one makes a program of its own, which builds fast."""
 TILES_ACROSS = 6
-SPLATS = 64
-"""Splats of a tile: two batches, few enough for devices that end loops."""
-LAPS = 3
-"""Timed launches of each form, after one that may still compile."""
+SPLATS = 64  # Splats of a tile: two batches, few enough for devices that end loops
+LAPS = 3  # Timed launches of each form, after one that may still compile
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from flexgs_edge.errors import BudgetError, DeviceError
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.memory.budget import MemoryBudget
 
-_CONTEXTS: dict[int, cl.Context] = {}
-"""By device."""
+_CONTEXTS: dict[int, cl.Context] = {}  # By device
 _PROGRAMS: dict[tuple[int, str, tuple[str, ...]], tuple[cl.Context, cl.Program]] = {}
 """By context, source and options. Each keeps its context, so that no other one takes its number."""
 
@@ -49,8 +48,7 @@ SCALARS = {"u": np.uint32, "i": np.int32, "f": np.float32, "b": None}
 
 FILLED_TOGETHER = (16, 8, 4, 2)
 """Elements of a pattern that fills an array, where its size allows. Patterns have at most 128 bytes."""
-SMALL_WRITE = 1 << 16
-"""Most bytes of a write that does not wait for the queue: docs/results/tuning.md#small_write"""
+SMALL_WRITE = 1 << 16  # Most bytes of a write that does not wait for the queue: docs/results/tuning.md#small_write
 HELD_WRITE = 1 << 22
 """Most bytes of values that stay, which a write holds on to without waiting. The budget does not count them:
 docs/results/tuning.md#one_pass"""

@@ -17,12 +17,9 @@ LOG = logging.getLogger("flexgs_edge")
 
 CHILD = [sys.executable, "-m", "flexgs_edge.kernels.self_test_child"]
 """The command that tests one device. A compiler that crashes ends that process, not ours."""
-MOST_SECONDS = 1800
-"""Time for the test of one device, with all kernels to build. The slowest that we met took 40 s."""
-MARK = "self-test: "
-"""Begins the lines of `CHILD` that are for us; runtimes print other ones."""
-FORM = "form "
-"""Begins what such a line says when another form of the kernels begins; other lines name kernels."""
+MOST_SECONDS = 1800  # Time for the test of one device, with all kernels to build. The slowest that we met took 40 s.
+MARK = "self-test: "  # Begins the lines of `CHILD` that are for us; runtimes print other ones
+FORM = "form "  # Begins what such a line says when another form of the kernels begins; other lines name kernels
 
 _known: dict[str, Verdict] = {}
 _warned: set[str] = set()

@@ -15,8 +15,7 @@ from flexgs_edge.errors import BudgetError
 from flexgs_edge.memory.process import HeapWatch, available_memory, current_rss
 from flexgs_edge.units import format_mib
 
-LARGE = 2**20
-"""A stage that takes so many bytes or more has the heaps of this process checked."""
+LARGE = 2**20  # A stage that takes so many bytes or more has the heaps of this process checked
 ROOM = 8 << 20
 """Spare bytes of a limit that an error names. Pages of libraries, heaps of threads and the compiler take some MiB more in one run
 than in the next, mostly on a busy machine: docs/results/tuning.md#foresight"""

@@ -10,8 +10,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-SAMPLE_SECONDS = 0.05
-"""Seconds between two samples of the memory; shorter peaks may be missed."""
+SAMPLE_SECONDS = 0.05  # Seconds between two samples of the memory; shorter peaks may be missed
 
 
 def peak_rss() -> int:
@@ -109,10 +108,8 @@ MAP_THRESHOLD, TRIM_THRESHOLD, ARENA_MAX = -3, -1, -8
 """Parameters of glibc's `mallopt`: bytes from which arrays are mapped, free bytes that a heap keeps, heaps for threads."""
 USUAL = {MAP_THRESHOLD: 8 << 20, TRIM_THRESHOLD: 32 << 20, ARENA_MAX: 2}
 STRICT = {MAP_THRESHOLD: 1 << 20, TRIM_THRESHOLD: 2 << 20, ARENA_MAX: 2}
-NEAR = 0.9
-"""Share of the limit from which freed memory goes back at once: docs/results/tuning.md#heap"""
-GROWTH = 8 << 20
-"""Bytes by which the process must have grown since the last trim of its heaps to be worth another one."""
+NEAR = 0.9  # Share of the limit from which freed memory goes back at once: docs/results/tuning.md#heap
+GROWTH = 8 << 20  # Bytes by which the process must have grown since the last trim of its heaps to be worth another one
 
 
 def return_freed_memory(settings: dict[int, int] = USUAL) -> None:

@@ -91,16 +91,11 @@ def _library() -> ctypes.CDLL | None:
     return None
 
 
-BLOCK_ROWS = 1 << 14
-"""Rows of a part in loops over rows: 24 MB of all fields in f64, with the copies that NumPy makes."""
-AHEAD_ROWS = 1 << 15
-"""Rows that are read ahead at a time."""
-COPY_ROWS = 1 << 18
-"""Rows of one plane that are copied at a time: a megabyte of f32."""
-DENSE = 4
-"""Listed rows are read as one span if it holds at most so many rows for each listed one, else page by page."""
-READERS = 4
-"""Threads that read past the cache. One thread does not keep a disk busy: docs/results/tuning.md#disks"""
+BLOCK_ROWS = 1 << 14  # Rows of a part in loops over rows: 24 MB of all fields in f64, with the copies that NumPy makes
+AHEAD_ROWS = 1 << 15  # Rows that are read ahead at a time
+COPY_ROWS = 1 << 18  # Rows of one plane that are copied at a time: a megabyte of f32
+DENSE = 4  # Listed rows are read as one span if it holds at most so many rows for each listed one, else page by page
+READERS = 4  # Threads that read past the cache. One thread does not keep a disk busy: docs/results/tuning.md#disks
 _READING = ThreadPoolExecutor(READERS, "read")
 _TAKING = ThreadPoolExecutor(2, "take")
 """Threads that take listed rows: while one plane is read or written, another is indexed."""
@@ -113,8 +108,7 @@ _Piece = tuple[DirectFile, int, memoryview]
 class _Owner(Protocol):
     """The storage that a mapped file belongs to."""
 
-    used: int
-    """Bytes of all its mapped files."""
+    used: int  # Bytes of all its mapped files
 
     def full(self, size: int, error: OSError) -> Exception:
         """The error to raise if the disk has no room for `size` bytes."""

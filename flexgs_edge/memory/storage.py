@@ -23,8 +23,7 @@ LEAST_BYTES = 1 << 16
 WHOLE_BYTES = 1 << 26
 """Least size of a plane, in bytes, that may be read as a whole to take rows in any order. Otherwise each row would be a
 read of its own: docs/results/tuning.md#disks"""
-WHOLE_SHARE = 16
-"""Such a plane may be as large as this part of the limit (one in 16), if that is more."""
+WHOLE_SHARE = 16  # Such a plane may be as large as this part of the limit (one in 16), if that is more
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _IN_MEMORY = {"tmpfs", "ramfs", "devtmpfs"}
 
@@ -36,10 +35,8 @@ class Storage:
     """Whether arrays lie in files. Then memory need hold only a few bytes for each row; the page cache takes what is
     free."""
     folder: Path | None = None
-    whole_bytes = WHOLE_BYTES
-    """Bytes of the largest plane to hold as a whole; see `take_rows`."""
-    peak = 0
-    """Most bytes that lay in files at one time."""
+    whole_bytes = WHOLE_BYTES  # Bytes of the largest plane to hold as a whole; see `take_rows`
+    peak = 0  # Most bytes that lay in files at one time
 
     @property
     def peak_anonymous(self) -> int | None:

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-MAX_BITS = 16
-"""Most bits of a code: two bytes."""
+MAX_BITS = 16  # Most bits of a code: two bytes
 
 
 def plane_bytes(rows: int, bits: int) -> int:

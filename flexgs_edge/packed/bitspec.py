@@ -58,13 +58,11 @@ class BitSpec:
         return ",".join(f"{name}={bits}" for name, bits in asdict(self).items())
 
 
-PAPER = BitSpec()
-"""16 bits for positions, 8 for DC, scale and rotation, 4 for opacity and SH."""
+PAPER = BitSpec()  # 16 bits for positions, 8 for DC, scale and rotation, 4 for opacity and SH
 
 
 HIGH, LOW, POSITION = 8, 4, 16
-ALLOWED_DROP = 0.3
-"""Modelled drop in dB that all attributes at 4 bits may cost together."""
+ALLOWED_DROP = 0.3  # Modelled drop in dB that all attributes at 4 bits may cost together
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from flexgs_edge.scene.source import SceneSource
 
 
-FINER = 128
-"""Within the radius of a contraction, steps of 16 bits are this many times shorter than Gaussians are wide."""
+FINER = 128  # Within the radius of a contraction, steps of 16 bits are this many times shorter than Gaussians are wide
 SMALLEST_STEP = 2.0**-126
 """Smallest normal float32. A range with a finer step counts as constant, since devices may flush the step to zero."""
 

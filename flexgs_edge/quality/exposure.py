@@ -12,8 +12,7 @@ import numpy as np
 
 from flexgs_edge.quality.psnr import drop, mse
 
-DARK, BRIGHT = 2 / 255, 253 / 255
-"""Values outside these may be clipped, and tell no gain."""
+DARK, BRIGHT = 2 / 255, 253 / 255  # Values outside these may be clipped, and tell no gain
 FIT_PIXELS = 1 << 16
 """Every n-th pixel in both directions is fitted, so that at least this many are, or all of a smaller picture."""
 LEAST_GAIN = 0.5

@@ -14,8 +14,7 @@ from flexgs_edge.kernels.backend import Backend
 
 FILTERS = 7
 """Filters of a direction: light, red against green, yellow against blue (two parts), and light for features (three)."""
-SEEN = 5
-"""Values of a pixel that are compared: colour (three), edges and points."""
+SEEN = 5  # Values of a pixel that are compared: colour (three), edges and points
 BAND = 1 << 16
 """Most elements of a band of rows, so that all planes together take 8 MB, and one fits a core's cache. Values do not
 depend on bands. docs/results/tuning.md#flip"""

@@ -22,8 +22,7 @@ for pictures of any height."""
 _BANDS = ThreadPoolExecutor(BANDS, "bands")
 MSE_FLOOR = 1e-12
 """Smallest MSE in a difference of two PSNRs; smaller ones (120 dB) are beyond the precision of float32 renders."""
-BLIND_DROP = 1.0
-"""A photo that would not show a larger drop than this does not judge its view, dB: see `far_bases`."""
+BLIND_DROP = 1.0  # A photo that would not show a larger drop than this does not judge its view, dB: see `far_bases`
 
 
 def mse(image: np.ndarray, reference: np.ndarray) -> float:

@@ -10,8 +10,7 @@ from flexgs_edge.constants import LANES, SSIM_WINDOW
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.window import window
 
-LOST_SHARE = 0.7
-"""SSIM lost against photos, as a share of what is lost against the original's renders."""
+LOST_SHARE = 0.7  # SSIM lost against photos, as a share of what is lost against the original's renders
 
 
 def modelled_ssim_drop(unlike: float) -> float:

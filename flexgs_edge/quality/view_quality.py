@@ -22,8 +22,7 @@ Distance = Callable[[np.ndarray, np.ndarray], float | None]
 LEAST_COVERAGE = 0.1
 """The worst view by covered figures has at least this share of the mean coverage. Views that see a few faint pixels have
 large errors relative to them, and nobody would see these."""
-ALIKE = 48.0
-"""Fidelity in dB from which on more of it shows nothing: an error of one level of 255."""
+ALIKE = 48.0  # Fidelity in dB from which on more of it shows nothing: an error of one level of 255
 Figures = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | None]]
 """Figures of pairs of [H, W, 3] images, all of one size."""
 

@@ -34,12 +34,9 @@ Splats = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 class CompactView(Protocol):
     """A view that collects its splats, chunk by chunk, in row order."""
 
-    record: np.ndarray
-    """[32] f32, from `camera_record`."""
-    camera: Any
-    """The same record on the backend."""
-    count: int
-    """Splats that the view shows so far."""
+    record: np.ndarray  # [32] f32, from `camera_record`
+    camera: Any  # The same record on the backend
+    count: int  # Splats that the view shows so far
 
     def put(self, splats: Splats) -> bool:
         """Append the splats of a chunk that the view shows; False if there is no room for them."""

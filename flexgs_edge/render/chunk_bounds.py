@@ -21,8 +21,7 @@ INRIA_SPREAD = math.sqrt(math.sqrt(0.1))
 ROUNDING = 1e-5
 """Bound of the float32 error in `project`, as a share of the largest term: generous, so that no block vanishes by
 rounding."""
-LARGER = 1.001
-"""Factor that widens the extent of a block against rounding."""
+LARGER = 1.001  # Factor that widens the extent of a block against rounding
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,10 @@ from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.render.chunks import ChunkArrays, ChunkPlanes
 from flexgs_edge.render.fit import padded
 
-SLOTS = 2
-"""Chunks that memory always has room for: one is drawn while the next one loads."""
+SLOTS = 2  # Chunks that memory always has room for: one is drawn while the next one loads
 MOST_SLOTS = 3
 """Chunks if memory has room for one more: the disk then rests less between two. docs/results/tuning.md#most_slots"""
-Span = tuple[int, int, int]
-"""First row, row after the last, and SH degree of a chunk."""
+Span = tuple[int, int, int]  # First row, row after the last, and SH degree of a chunk
 
 
 @dataclass

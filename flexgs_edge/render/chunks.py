@@ -143,8 +143,7 @@ class SourcePlanes:
         self.source = source
         self.count, self.sh_count, self.sh_degree = source.count, source.sh_count, source.sh_degree
         self.origin = source.origin
-        self.bounds: dict[int, ChunkBounds] = {}
-        """Bounds of the chunks loaded so far, by their first rows."""
+        self.bounds: dict[int, ChunkBounds] = {}  # Bounds of the chunks loaded so far, by their first rows
 
     def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
         """Read rows [start, stop) into arrays of the backend, [width, padded(stop - start)] by field name."""

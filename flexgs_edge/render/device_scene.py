@@ -63,17 +63,13 @@ class DeviceScene:
         self.sum_bytes = sum_bytes
         self.view_sums = view_sums
         self.fit = fit or fit_module.DEFAULT
-        self.changes = 0
-        """How many times the values have changed."""
-        self.shown: int | None = None
-        """Rows that a compact view has room for; None while views have room for all rows."""
+        self.changes = 0  # How many times the values have changed
+        self.shown: int | None = None  # Rows that a compact view has room for; None while views have room for all rows
         self._planes = planes
         self._budget = budget
         self._resident: list[Chunk] = []
-        self._pinned: dict[int, Chunk] = {}
-        """Chunks of a compact scene that stay on the backend, by their first rows."""
-        self._drawn = -1
-        """First row of the chunk in use, -1 if none is; `give_way` must not free it."""
+        self._pinned: dict[int, Chunk] = {}  # Chunks of a compact scene that stay on the backend, by their first rows
+        self._drawn = -1  # First row of the chunk in use, -1 if none is; `give_way` must not free it
         self._stays = self._keeps_chunks = False
         self._rows = 0
         self._chunk_row_bytes = streamed_bytes(planes.sh_degree)

@@ -14,25 +14,18 @@ import numpy as np
 from flexgs_edge.constants import LANES, ROW_BLOCK, SSIM_WINDOW, TILE
 from flexgs_edge.scene.fields import FIELD
 
-Shapes = dict[str, tuple[tuple[int, ...], Any]]
-"""Shape and type of each array, by name."""
+Shapes = dict[str, tuple[tuple[int, ...], Any]]  # Shape and type of each array, by name
 
 RAW_BYTES = 4 * (3 + 4 + 1)
 """Extra bytes a row while a chunk is loaded: stored scale, rotation and opacity, freed after `activate`."""
-GROWTH = 1.1
-"""Room beyond the estimate that the part of a view projected so far gives."""
-GUESS = 1.02
-"""Room beyond the largest share of rows that a view has shown so far."""
-MOST_SUMS = 6
-"""Largest number of sum planes of a view (`Renderer.residual_and_removal_sums`)."""
-GRADIENT_SUMS = 9
-"""Number of planes of `Renderer.gradient_sums`."""
+GROWTH = 1.1  # Room beyond the estimate that the part of a view projected so far gives
+GUESS = 1.02  # Room beyond the largest share of rows that a view has shown so far
+MOST_SUMS = 6  # Largest number of sum planes of a view (`Renderer.residual_and_removal_sums`)
+GRADIENT_SUMS = 9  # Number of planes of `Renderer.gradient_sums`
 SORT_DIGIT_BITS = 11
 SORT_DIGITS = 1 << SORT_DIGIT_BITS
-REFERENCE_BYTES = 6
-"""Bytes a pixel and channel of a target (f16) and of the residual against it (f32)."""
-PAIR_BYTES = 20
-"""Bytes of a pair in a tile list (8) and of its draft (12)."""
+REFERENCE_BYTES = 6  # Bytes a pixel and channel of a target (f16) and of the residual against it (f32)
+PAIR_BYTES = 20  # Bytes of a pair in a tile list (8) and of its draft (12)
 PAIR_SHARE = 8
 """The tile lists take at most this part (one in eight) of the free memory, so that the scene gets the rest."""
 COMPACT_PAIR_SHARE = 2
@@ -65,8 +58,7 @@ class Fit:
         return min((int(share * count) // self.capacity_step + 1) * self.capacity_step, count)
 
 
-DEFAULT = Fit()
-"""The fit of a `Renderer` that is given none."""
+DEFAULT = Fit()  # The fit of a `Renderer` that is given none
 
 
 @dataclass(frozen=True)

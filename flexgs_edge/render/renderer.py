@@ -40,10 +40,8 @@ class _View:
     buffers: ViewBuffers
     camera: Camera
     batches: list[tuple[int, int]]
-    count: int
-    """Rows of the view's sums."""
-    parts: dict[int, ViewPart] | None
-    """The rows of each chunk, by the chunk's first row; None in a compact view."""
+    count: int  # Rows of the view's sums
+    parts: dict[int, ViewPart] | None  # The rows of each chunk, by the chunk's first row; None in a compact view
 
 
 class Renderer:
@@ -80,8 +78,7 @@ class Renderer:
         self.splats_shown = 0
         self._shown_rows: np.ndarray | None = None
         """[m] u32, the rows of the scene that the last view shows, if it was compact."""
-        self._share = 0.0
-        """Largest share of its rows that a scene has shown in a compact view so far."""
+        self._share = 0.0  # Largest share of its rows that a scene has shown in a compact view so far
         self._ahead = ViewsAhead(backend, self.fit.ahead)
         self._buffers: ViewBuffers | None = None
         self._drawn: _View | None = None

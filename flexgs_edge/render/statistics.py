@@ -11,8 +11,7 @@ import numpy as np
 from flexgs_edge.constants import FIXED_WEIGHT, SUM_LANES
 from flexgs_edge.kernels.backend import Backend
 
-SUM_ROWS = 1 << 18
-"""Rows of sums that are copied to the host at a time."""
+SUM_ROWS = 1 << 18  # Rows of sums that are copied to the host at a time
 GROUP_ROWS = 1 << 12
 """Rows of sums over views that are copied at a time, a multiple of `SUM_LANES`: few enough for a core's cache."""
 

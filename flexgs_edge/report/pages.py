@@ -21,12 +21,9 @@ from flexgs_edge.report.summary import device_words, memory_words
 from flexgs_edge.report.tones import ERROR_SCALE, FLIP_SCALE, css_ramp
 from flexgs_edge.units import format_size, times_words
 
-SIDE = 360
-"""Width of a plan in its own units: as wide as a phone, like the charts."""
-WEDGE = 0.055
-"""Length of a camera's viewing wedge, as a share of the plan's width."""
-ROOM = 0.06
-"""Empty margin, as a share of the plan's width."""
+SIDE = 360  # Width of a plan in its own units: as wide as a phone, like the charts
+WEDGE = 0.055  # Length of a camera's viewing wedge, as a share of the plan's width
+ROOM = 0.06  # Empty margin, as a share of the plan's width
 FAR = 0.35
 """The scene's points widen the plan by at most this share of the cameras' extent. Some scenes reach to the horizon."""
 MOST_NAMES = 400
@@ -216,8 +213,7 @@ def nice_range(values: Sequence[float], most: int = 5) -> tuple[float, float, li
     return low, high, [round(index * step, 12) for index in range(first, last + 1)]
 
 
-FEW_ROWS = 16
-"""With more steps than this, their table is folded up. With more views, their table scrolls."""
+FEW_ROWS = 16  # With more steps than this, their table is folded up. With more views, their table scrolls.
 
 
 def compress_page(result: CompressResult, material: Material) -> str:

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 INCHES, TALL, DPI = (7.2, 4.4), (7.2, 6.2), 144
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#A0A000")
 GREY, INK = "#7a7a7a", "#222222"
-SHORT = 8
-"""Notes shorter than this many letters are centred over their point."""
+SHORT = 8  # Notes shorter than this many letters are centred over their point
 MARKS, OPEN_MARKS = ("o", "s", "^", "D", "v", "P", "<", ">"), ("*", "d")
 LINEAR_BELOW = 0.1
 LEVELS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)

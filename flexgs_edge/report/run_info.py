@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-PLY_HEADER_MOST = 4096
-"""Most bytes of the header of a PLY in INRIA's layout; most have 1.5 kB."""
+PLY_HEADER_MOST = 4096  # Most bytes of the header of a PLY in INRIA's layout; most have 1.5 kB
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ if TYPE_CHECKING:  # so that `trim` and `verify` start without kernels
     from flexgs_edge.quality.view_quality import Quality
 
 
-FAR_SHOWN = 4
-"""Names of views that one line shows."""
+FAR_SHOWN = 4  # Names of views that one line shows
 
 
 def scene_lines(label: str, scene: SceneInfo) -> list[str]:

@@ -27,8 +27,7 @@ COMPANIONS = (
 """Names beside scenes that are no scenes and need no words."""
 _SUFFIXES = tuple(each for each in SUFFIXES if each.startswith("."))
 _ENDINGS = sorted((each + packed for each in _SUFFIXES for packed in ("", GZ)), key=len, reverse=True)
-_NAMED = 5
-"""Most skipped names in one line of the log."""
+_NAMED = 5  # Most skipped names in one line of the log
 
 
 def is_batch(inputs: Sequence[StrPath], output: StrPath | None) -> bool:

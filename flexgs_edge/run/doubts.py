@@ -12,16 +12,12 @@ from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.source import some_positions
 from flexgs_edge.small_matrices import product
 
-FIT_GAP = 2.0
-"""We warn of overfitting when training views show this much more fidelity than held-out views, dB."""
-NEEDED_VIEWS = 16
-"""We warn below this many scored views; more change little: docs/results/speed.md#scoring-fewer-views"""
-UNSEEN_SHARE = 0.01
-"""We warn when automatic views miss more than this share of the Gaussians."""
+FIT_GAP = 2.0  # We warn of overfitting when training views show this much more fidelity than held-out views, dB
+NEEDED_VIEWS = 16  # We warn below this many scored views; more change little: docs/results/speed.md#scoring-fewer-views
+UNSEEN_SHARE = 0.01  # We warn when automatic views miss more than this share of the Gaussians
 
 
-BEHIND_SHARE = 0.5
-"""We warn when more than this share of the Gaussians lies behind all cameras."""
+BEHIND_SHARE = 0.5  # We warn when more than this share of the Gaussians lies behind all cameras
 _SAMPLE_ROWS = 2048
 _SAMPLE_VIEWS = 64
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from flexgs_edge.errors import BudgetError, FlexGSError, InputError
 from flexgs_edge.files import DISK_FULL
 
-INTERNAL = 1
-"""Exit code of a fault of ours."""
+INTERNAL = 1  # Exit code of a fault of ours
 TRACEBACKS = logging.getLogger("flexgs_edge.tracebacks")
 """Where `--debug` shows the tracebacks of errors that end one scene of several."""
 

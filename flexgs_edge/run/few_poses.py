@@ -15,12 +15,9 @@ from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.depths import visible_depths
 from flexgs_edge.views.references import References
 
-STEP = 2
-"""Every second pixel in both directions is read."""
-MOST = 8
-"""At most so many training poses, evenly spread, tell whether a result fits the scored poses too closely."""
-MADE_FROM = 6
-"""At most so many of the views that decide, evenly spread, get a nearer and a farther pose each."""
+STEP = 2  # Every second pixel in both directions is read
+MOST = 8  # At most so many training poses, evenly spread, tell whether a result fits the scored poses too closely
+MADE_FROM = 6  # At most so many of the views that decide, evenly spread, get a nearer and a farther pose each
 
 
 class FewPoses:

@@ -11,8 +11,7 @@ from flexgs_edge._version import __version__
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.scene.source import SceneSource
 
-ROWS = 1 << 16
-"""We hash this many rows at a time."""
+ROWS = 1 << 16  # We hash this many rows at a time
 FIELDS = ("means", "log_scales", "quats", "opacity_logits")
 """Fields that change hits, weights or volumes. Colours change none of them."""
 

@@ -13,8 +13,7 @@ from flexgs_edge.run.judge import work_bytes
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.source import some_positions
 
-BLOCKS = 64
-"""Blocks of a view's passes on the device: as many as a processor of 16 cores has."""
+BLOCKS = 64  # Blocks of a view's passes on the device: as many as a processor of 16 cores has
 
 
 def foresee(

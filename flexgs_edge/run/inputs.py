@@ -62,8 +62,7 @@ class CheckedScene:
         return self.ply_bytes - 12 * self.input_count
 
 
-ScenePlace = str | os.PathLike[str] | CheckedScene
-"""A scene file, a model folder, or a scene that is already open."""
+ScenePlace = str | os.PathLike[str] | CheckedScene  # A scene file, a model folder, or a scene that is already open
 
 
 def read_scene(path: str | os.PathLike[str], drop_invalid: bool = False) -> SceneSource:

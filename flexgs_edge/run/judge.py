@@ -33,10 +33,8 @@ LIBRARY_BYTES = 12 * 2**20
 """Bound on the bytes that loading Pillow and decoding with it take: docs/results/tuning.md#memory"""
 WORK_BYTES = 100
 """Bound on the bytes per pixel while a photo is decoded, or SSIM or FLIP is computed, with the backend's buffers."""
-CHECK_ROWS = 1 << 18
-"""Rows whose opacity is read at a time, where no view sees any Gaussian."""
-ESTIMATE_STEP = 2
-"""An estimate reads every second pixel in both directions."""
+CHECK_ROWS = 1 << 18  # Rows whose opacity is read at a time, where no view sees any Gaussian
+ESTIMATE_STEP = 2  # An estimate reads every second pixel in both directions
 
 
 def work_bytes(cameras: Sequence[Camera]) -> int:
@@ -86,8 +84,7 @@ class Judge:
         self._coverage: list[float] = []
         self._coarse_error: dict[int, float] = {}
         self._known: dict[bytes, Quality] = {}
-        self.made: FewPoses | None = None
-        """Made poses that whole comparisons look at too."""
+        self.made: FewPoses | None = None  # Made poses that whole comparisons look at too
         # Reserve the memory now: scenes that are loaded later must not count on it.
         images = 1 if self.photos is None else 2
         wanted = sum(camera.width * camera.height + _coarse_pixels(camera) for camera in self.cameras) * 12 * images

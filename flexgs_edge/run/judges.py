@@ -33,8 +33,7 @@ class Judges:
         self.decide = self._judge(run.plan.decide, reports=False) if on_train else self.report
         self.training: FewPoses | None = None
         self._made: FewPoses | None = None
-        self.trained: float | None = None
-        """Fidelity of what was measured last on training poses, dB."""
+        self.trained: float | None = None  # Fidelity of what was measured last on training poses, dB
 
     def _judge(self, indices: list[int], reports: bool) -> Judge:
         run = self._run

@@ -17,8 +17,7 @@ from flexgs_edge.io.ply import PlySource
 from flexgs_edge.io.reading import AS_WRITTEN, Reading
 from flexgs_edge.scene.source import SceneSource
 
-FOLDERS = ("lod-meta.json", "meta.json")
-"""Files that make a folder a scene, the first that is there."""
+FOLDERS = ("lod-meta.json", "meta.json")  # Files that make a folder a scene, the first that is there
 SUFFIXES = (".fgs", ".ply", *FORMATS)
 _PLY = (".ply", ".compressed.ply")
 """Formats that a file has if its first bytes say so, whatever its suffix: both are called .ply in the wild."""

@@ -29,20 +29,16 @@ from flexgs_edge.quality.psnr import modelled_drop, mse_of_psnr
 
 LOG = logging.getLogger("flexgs_edge")
 
-NO_PHOTOS = "none"
-"""`--images none`: do not use the photos beside the scene."""
-AUTO_CAMERAS = "auto"
-"""`--cameras auto`: generate camera views from the scene itself."""
-NO_CAMERAS = "none"
-"""`--cameras none`: no views at all. Only fixed rates work then."""
+NO_PHOTOS = "none"  # `--images none`: do not use the photos beside the scene
+AUTO_CAMERAS = "auto"  # `--cameras auto`: generate camera views from the scene itself
+NO_CAMERAS = "none"  # `--cameras none`: no views at all. Only fixed rates work then.
 METHODS = ("best", "paper")
 EFFORT_WORDS = tuple(REFINE_STEPS)
 SCORES = ("gs", "meson")
 SELECTS = ("test", "train")
 EXPOSURES = ("fit", "none")
 PROMISES = ("whole", "mean")
-NONE = "none"
-"""Lifts a bound of the promise."""
+NONE = "none"  # Lifts a bound of the promise
 LAYERS_MOST = 4
 DISTIL_MOST = 100_000
 """Most iterations of distillation. This many take hours on any machine; beyond a few thousand nothing is gained."""
@@ -63,8 +59,7 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "scratch": ("best", None),
     "resume": ("best", False),
     "cluster": ("best", None),
-}
-"""Options that only one `--method` knows: the method and the default of each."""
+}  # Options that only one `--method` knows: the method and the default of each
 
 
 def check_method(method: str, given: Iterable[str]) -> None:

@@ -20,8 +20,7 @@ class Output:
     format: Format | None = None  # another program's format; `None` for a `.fgs`
 
 
-NO_OUTPUT = Output()
-"""Of commands that write no scene."""
+NO_OUTPUT = Output()  # Of commands that write no scene
 
 
 def check_output(output: str | os.PathLike[str] | None, options: CompressOptions) -> Output:

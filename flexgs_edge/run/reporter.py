@@ -36,17 +36,14 @@ from flexgs_edge.scene.source import SceneSource
 
 MOST_SHOTS = 5
 """A report shows pictures of at most this many views: the worst, the median, the best, and one between each two."""
-MOST_WIDTH = 800
-"""Wider pictures are scaled down to this many pixels: sharp on a phone, and a page of a few MB at most."""
-LAYERS = 5
-"""Pictures per view: original, compressed, error map, map of FLIP, photo."""
+MOST_WIDTH = 800  # Wider pictures are scaled down to this many pixels: sharp on a phone, and a page of a few MB at most
+LAYERS = 5  # Pictures per view: original, compressed, error map, map of FLIP, photo
 PIXEL_BYTES = 1
 """Bytes per pixel that we reserve for an encoded picture. Only noise takes more: docs/results/tuning.md#memory"""
 JPEG_QUALITY = 95
 """High enough that pictures differ by our compression and not by JPEG: docs/results/tuning.md#jpeg_quality"""
 ERROR_QUALITY = 85
-MOST_POINTS = 1500
-"""The camera plans show the scene as at most this many of its Gaussians."""
+MOST_POINTS = 1500  # The camera plans show the scene as at most this many of its Gaussians
 
 
 def shown_size(camera: Camera) -> tuple[int, int]:

@@ -12,8 +12,7 @@ from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 
-MARGIN = 16
-"""Room for numbers of the header that grow by a digit with the settings, such as its own length."""
+MARGIN = 16  # Room for numbers of the header that grow by a digit with the settings, such as its own length
 
 
 def make_settings(

@@ -20,8 +20,7 @@ from flexgs_edge.run.inputs import LOG, Options
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOptions
 from flexgs_edge.scene.source import SceneSource
 
-MEMORY = "memory"
-"""Takes the place of a path in records when cameras or photos came from memory."""
+MEMORY = "memory"  # Takes the place of a path in records when cameras or photos came from memory
 WITHOUT_VIEWS = f"--cameras {NO_CAMERAS} leaves no views: leave it out for automatic ones, or give --cameras PATH"
 
 

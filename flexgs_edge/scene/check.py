@@ -13,8 +13,7 @@ from flexgs_edge.scene.fields import FIELDS, OPACITY_LIMIT
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
 
 LOG = logging.getLogger("flexgs_edge")
-TELLING_ROWS = 32
-"""In scenes of fewer Gaussians, all opacities and scales may look activated by chance."""
+TELLING_ROWS = 32  # In scenes of fewer Gaussians, all opacities and scales may look activated by chance
 _TINY = np.finfo(np.float32).tiny
 SH_LARGEST = 1e15
 """Larger SH coefficients are invalid: squares of their colours leave float32, and infinity times a weight of zero is

@@ -14,12 +14,10 @@ from typing import Any
 
 import numpy as np
 
-OCTAVES = 64
-"""Most doublings; what lies beyond is not contracted further."""
+OCTAVES = 64  # Most doublings; what lies beyond is not contracted further
 LARGEST = 2.0**126
 """Largest magnitude of coordinates that can be coded, and of radii and their reciprocals: nothing leaves float32 or float64."""
-_SAMPLE, _FEWEST = 4096, 32
-"""Rows that tell the centre, and rows of its densest part."""
+_SAMPLE, _FEWEST = 4096, 32  # Rows that tell the centre, and rows of its densest part
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,6 @@ FIELDS: tuple[Field, ...] = (
         "log_scales", "natural log of the standard deviations, scene units", ("scale_0", "scale_1", "scale_2"), "scale"
     ),
     Field("quats", "rotation quaternion w x y z, any norm", ("rot_0", "rot_1", "rot_2", "rot_3"), "rot"),
-)
-"""All fields, in the order of INRIA's PLY."""
+)  # All fields, in the order of INRIA's PLY
 
 FIELD: dict[str, Field] = {field.name: field for field in FIELDS}

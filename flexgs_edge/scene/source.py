@@ -15,11 +15,9 @@ from flexgs_edge.memory.rows import BLOCK_ROWS, copy_all_rows, put_rows
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
 
-Planes = dict[str, np.ndarray]
-"""Arrays by field name, each [width, n] f32."""
+Planes = dict[str, np.ndarray]  # Arrays by field name, each [width, n] f32
 
-Rows = slice | np.ndarray
-"""`slice(start, stop)`, or a sorted int64 array."""
+Rows = slice | np.ndarray  # `slice(start, stop)`, or a sorted int64 array
 
 _TURN_ROWS = 1024
 """Rows transposed at a time: 250 kB at SH degree 3. The columns of a whole chunk would not stay in the processor's
@@ -289,8 +287,7 @@ def by_chunk(rows: Rows, starts: np.ndarray) -> Iterator[tuple[int, Rows, slice]
         yield int(chunks[start]), rows[start:stop], slice(start, stop)
 
 
-SAMPLE_ROWS = 4096
-"""Most Gaussians whose positions tell which poses see which part of a scene, and how much of it."""
+SAMPLE_ROWS = 4096  # Most Gaussians whose positions tell which poses see which part of a scene, and how much of it
 
 
 def some_positions(source: SceneSource, most: int = SAMPLE_ROWS) -> np.ndarray:

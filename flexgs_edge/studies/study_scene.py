@@ -33,8 +33,7 @@ from flexgs_edge.views.bench import Bench
 
 LOG = logging.getLogger("flexgs_edge")
 
-RANK_BYTES = 24
-"""Bytes for each row and score: order, rank, and the number of rows with SH above each rank."""
+RANK_BYTES = 24  # Bytes for each row and score: order, rank, and the number of rows with SH above each rank
 
 
 @dataclass(frozen=True)
@@ -170,8 +169,7 @@ FIGURES = {
     "drop": "drop (dB)",
     "fidelity": "fidelity (dB)",
     "modelled_drop": "modelled drop (dB)",
-}
-"""Columns at the end of every measured row, and their heads."""
+}  # Columns at the end of every measured row, and their heads
 
 
 class _Remembering:

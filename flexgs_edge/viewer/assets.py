@@ -10,8 +10,7 @@ PAGE = "viewer/index.html"
 STYLE = "viewer/style.css"
 ENTRIES = {"page": "viewer/src/page.js", "load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
 """The modules that are run: the page's, and those of the workers by the name that `startWorker` knows."""
-LIVE = {**ENTRIES, "page": "viewer/src/live.js"}
-"""The same for the live scenes of a report."""
+LIVE = {**ENTRIES, "page": "viewer/src/live.js"}  # The same for the live scenes of a report
 PLAIN, SPATIAL, PREVIEWED = "plain", "spatial", "previewed"
 """Kinds of scenes: all others, those whose file tells where its chunks lie, and those with a preview. Of a spatial one, the
 viewer asks for the chunks in sight first."""
@@ -19,8 +18,7 @@ _KINDS = {
     PLAIN: ("viewer/src/load-worker.js", "viewer/src/scene-viewer.js"),
     SPATIAL: ("viewer/src/spatial-worker.js", "viewer/src/scene-viewer-spatial.js"),
     PREVIEWED: ("viewer/src/preview-worker.js", "viewer/src/scene-viewer-preview.js"),
-}
-"""Of each kind, the worker that loads, and the module with the viewer."""
+}  # Of each kind, the worker that loads, and the module with the viewer
 _FORMATS = "decoder/src/formats.js"
 _FORMATS_2 = "decoder/src/formats2.js"
 _PATTERNS = ("viewer/*.html", "viewer/*.css", "viewer/src/*.js", "decoder/src/*.js")

@@ -23,12 +23,9 @@ from typing import Any
 
 from flexgs_edge.errors import InputError
 
-HEAD_MOST = 16384
-"""Most bytes of a request; browsers send less than one kilobyte."""
-HEAD_SECONDS = 10.0
-"""Time for a request to come."""
-SEND_SECONDS = 30.0
-"""Time for a piece of an answer to go."""
+HEAD_MOST = 16384  # Most bytes of a request; browsers send less than one kilobyte
+HEAD_SECONDS = 10.0  # Time for a request to come
+SEND_SECONDS = 30.0  # Time for a piece of an answer to go
 CONNECTIONS_MOST = 64
 _PIECE = 1 << 16
 _REQUEST = re.compile(r"([A-Z]{1,16}) (\S{1,2048}) HTTP/1\.[01]")

@@ -30,10 +30,8 @@ from flexgs_edge.views.worker import Drawing, draw_planes, draw_sums, warm_up, w
 
 LOG = logging.getLogger("flexgs_edge")
 
-AHEAD = 2
-"""Views asked for ahead, for each worker; their sums wait in the memory of the workers."""
-SENDINGS = 3
-"""How many times a scene is sent before we give up, if all workers that held it were lost."""
+AHEAD = 2  # Views asked for ahead, for each worker; their sums wait in the memory of the workers
+SENDINGS = 3  # How many times a scene is sent before we give up, if all workers that held it were lost
 CONNECT_SECONDS = 30
 NICE = 10
 """Niceness of the worker processes that we start on this machine, so that the main process keeps a core:

@@ -14,8 +14,7 @@ from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.small_matrices import product
 
-MIDDLE = 3
-"""A camera looks at the middle one of so many parts of its frame, across and down."""
+MIDDLE = 3  # A camera looks at the middle one of so many parts of its frame, across and down
 
 
 def middle_of(camera: Camera) -> Camera:

@@ -11,8 +11,7 @@ COMMANDS = {
     "rate": "Chart bytes against quality for a scene.",
     "speed": "Chart the time of a run against the ratio that it finds.",
     "stability": "Find where methods break on a scene.",
-}
-"""Subcommands and the first sentence of their help."""
+}  # Subcommands and the first sentence of their help
 
 
 @click.group(cls=LazyGroup, commands_from=("flexgs_edge.cli.study", COMMANDS))

@@ -29,8 +29,7 @@ __all__ = ["Container", "Section", "container_size", "read_header", "verify", "w
 
 VERSION = 1
 
-Ranges = dict[str, tuple[np.ndarray, np.ndarray]]
-"""(low, step) of each field, [channels, G] f32 both."""
+Ranges = dict[str, tuple[np.ndarray, np.ndarray]]  # (low, step) of each field, [channels, G] f32 both
 
 
 def write_container(

@@ -26,15 +26,12 @@ from flexgs_edge.packed.quantize import QuantizedScene, group_count
 from flexgs_edge.scene.contraction import Contraction
 from flexgs_edge.scene.fields import FIELD, FIELDS
 
-CHUNK_ROWS = 65536
-"""Rows of a chunk: a multiple of 8, so that each plane ends at a whole byte for any number of bits."""
-HEADER_STEP = 1024
-"""Headers are padded to a multiple of this many bytes."""
+CHUNK_ROWS = 65536  # Rows of a chunk: a multiple of 8, so that each plane ends at a whole byte for any number of bits
+HEADER_STEP = 1024  # Headers are padded to a multiple of this many bytes
 HEADER_MIN = 2048
 """Least bytes of a header; normal ones fit, so that the size of a file does not depend on the digits of its numbers."""
 HEADER_MAX = 1 << 20
-HEADER_OWN = 512
-"""Most bytes of the header without the settings (counts of 10 digits, numbers of 24)."""
+HEADER_OWN = 512  # Most bytes of the header without the settings (counts of 10 digits, numbers of 24)
 _KEYS = ("bits", "count", "groups", "origin", "settings", "sh_count", "sh_degree")
 
 

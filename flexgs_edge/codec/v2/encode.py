@@ -27,8 +27,7 @@ from flexgs_edge.memory.rows import blocks, put_rows, read_rows
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.curve import morton
 
-ROUNDS = 2
-"""How often levels are chosen, each time by what levels cost after the time before."""
+ROUNDS = 2  # How often levels are chosen, each time by what levels cost after the time before
 _UNSEEN = 0.25
 """A change of levels that no table has yet costs as much as one that comes this often. It would need an entry of its own."""
 _UNIT = 2.0**-20
@@ -173,12 +172,9 @@ class Encoded:
     chunks: list[Chunk]
     batches: list[list[Batch]]
     bits: np.ndarray
-    device: Device | None = None
-    """The device that codes the streams; None for NumPy."""
-    written: tuple[bytes, ...] | None = None
-    """The coded streams, if they are made already."""
-    threads: int | None = None
-    """Chunks that NumPy codes at once; None for as many as suit this machine."""
+    device: Device | None = None  # The device that codes the streams; None for NumPy
+    written: tuple[bytes, ...] | None = None  # The coded streams, if they are made already
+    threads: int | None = None  # Chunks that NumPy codes at once; None for as many as suit this machine
 
     @property
     def information(self) -> float:

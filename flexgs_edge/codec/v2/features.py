@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-EXACT = float(1 << 23)
-"""Sums below this bound are exact in float32, also with halves of 2^16 added."""
+EXACT = float(1 << 23)  # Sums below this bound are exact in float32, also with halves of 2^16 added
 _PRODUCT = 1 << 17
 """Products of one matrix product. From twice as many, OpenBLAS starts threads, which cost more than they save."""
 

@@ -23,10 +23,8 @@ from flexgs_edge.grid.values import from_grid
 from flexgs_edge.scene.check import SH_LARGEST
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 
-GRID_COMMENT = "flexgs-edge grid "
-"""Begins the comment in a PLY that names the step sizes of its values."""
-DECODE_BYTES = 800
-"""Bound on the bytes per row while NumPy decodes a chunk: codes, features, neighbours' weights, sums."""
+GRID_COMMENT = "flexgs-edge grid "  # Begins the comment in a PLY that names the step sizes of its values
+DECODE_BYTES = 800  # Bound on the bytes per row while NumPy decodes a chunk: codes, features, neighbours' weights, sums
 _ROTATION_STEP_MOST = 2.0**38
 """Bound up to which three squares of a rotation code (24 bits) times its step stay finite in float32."""
 

@@ -25,8 +25,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
 
-COUNT_MOST = 2**53 - 1
-"""Largest number of bytes or rows: every JSON reader keeps integers up to here exactly."""
+COUNT_MOST = 2**53 - 1  # Largest number of bytes or rows: every JSON reader keeps integers up to here exactly
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,7 @@ def channel_parts(sh_degree: int) -> dict[str, tuple[str, ...]]:
 
 
 HEADER_MOST = 1 << 20
-MODEL_MOST = 1 << 20
-"""Most bytes of the model; 59 alphabets of 256 symbols and 64 tables need less."""
+MODEL_MOST = 1 << 20  # Most bytes of the model; 59 alphabets of 256 symbols and 64 tables need less
 LAYERS_MOST = 256
 PREVIEW_MOST = 1 << 24
 PREVIEW_KEY = len(',"preview_bytes":16777216')

@@ -14,10 +14,8 @@ from flexgs_edge.codec.v2.tables import decode_tables, encode_tables, from_level
 from flexgs_edge.codec.v2.walk import base_kinds, sh_kinds
 from flexgs_edge.constants import RANS_PRECISION as PRECISION
 
-REPEATS_MOST = 16
-"""Symbols of the alphabet of repeats; the last one is the escape."""
-SHARED = 2
-"""Alphabets that come before those of the groups: the octree's and that of the repeats."""
+REPEATS_MOST = 16  # Symbols of the alphabet of repeats; the last one is the escape
+SHARED = 2  # Alphabets that come before those of the groups: the octree's and that of the repeats
 
 
 @dataclass(frozen=True, eq=False)

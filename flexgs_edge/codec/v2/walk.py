@@ -20,8 +20,7 @@ from flexgs_edge.constants import COARSE_ROWS, VALUE_LIMIT
 REACH = (4, 2)
 """Neighbours on each side: for base channels, then for SH. SH have many channels, so they take fewer neighbours, which
 saves time and costs few bits: docs/results/tuning.md#codec"""
-ONE = 256
-"""Features are integers in units of 1/256 of a code."""
+ONE = 256  # Features are integers in units of 1/256 of a code
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +116,8 @@ def limited(values: np.ndarray) -> np.ndarray:
 
 AXES = ("x", "y", "z")
 COLOURS = ("Y", "Co", "Cg")
-_OWN = 3
-"""Number of features from the channel's own neighbours: mean, spread and distance."""
-_NEAR = (2,)
-"""Place of the distance's weight."""
+_OWN = 3  # Number of features from the channel's own neighbours: mean, spread and distance
+_NEAR = (2,)  # Place of the distance's weight
 
 _SCALES = ("scale x", "scale y", "scale z")
 _EARLIER: dict[str, tuple[str, ...]] = {
@@ -135,8 +132,7 @@ _EARLIER: dict[str, tuple[str, ...]] = {
     "rotation x": _SCALES,
     "rotation y": _SCALES,
     "rotation z": _SCALES,
-}
-"""Base channels in order, and the earlier channels that predict each of them."""
+}  # Base channels in order, and the earlier channels that predict each of them
 _SOURCES = ("scale x", "scale y", "scale z", "opacity", "dc Y", "dc Co", "dc Cg")
 """Channels that predict others. Each gives three features in this order: value, neighbours' mean, distance."""
 _SH_SOURCES = ("opacity", *_SCALES)
@@ -174,8 +170,7 @@ class ChunkCodes:
     cells: np.ndarray  # [r] u64, Morton index of every row's cell
     base: dict[str, np.ndarray]  # each [r]
     sh: tuple[np.ndarray, ...]
-    coordinates: np.ndarray | None = None
-    """[3, r] i32, coordinates of the cells, if a decoder has made them."""
+    coordinates: np.ndarray | None = None  # [3, r] i32, coordinates of the cells, if a decoder has made them
 
     @property
     def position(self) -> np.ndarray:
@@ -189,8 +184,7 @@ class Port(Protocol):
     The port chooses the type `known` returns.
     """
 
-    stride: int
-    """One in so many rows of each pass is coded."""
+    stride: int  # One in so many rows of each pass is coded
 
     def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
         """Code the bytes of octree nodes."""

@@ -25,8 +25,7 @@ from flexgs_edge.scene.fields import FIELD
 
 LOG = logging.getLogger("flexgs_edge")
 
-DONE = "done"
-"""File that is written last. A round without it was cut short."""
+DONE = "done"  # File that is written last. A round without it was cut short.
 
 
 class Checkpoint:

@@ -91,8 +91,7 @@ def cost_bytes(sh_degree: int) -> int:
     return 32 * (1 + sh_degree)
 
 
-PART_NAMES = ("removal", "weight2", "moments")
-"""Arrays of `CostParts`."""
+PART_NAMES = ("removal", "weight2", "moments")  # Arrays of `CostParts`
 
 
 def cost_sums(renderer: Renderer, degree: int, first: int = 0) -> Maker:

@@ -16,8 +16,7 @@ from flexgs_edge.run.options import CompressOptions
 
 LEAST_STEPS = 240
 """Least steps of a descent. Four rounds of a few poses mend less than they break: docs/results/tuning.md#least_steps"""
-FINE_PASSES = 0.75
-"""Share of `Effort.passes` where poses have every pixel: docs/results/tuning.md#fine_passes"""
+FINE_PASSES = 0.75  # Share of `Effort.passes` where poses have every pixel: docs/results/tuning.md#fine_passes
 MANY_POSES = 125
 """Beyond so many poses, steps of a descent grow with the root of their number: docs/results/tuning.md#many_poses"""
 LEAST_VIEWS = 6
@@ -30,8 +29,7 @@ docs/results/tuning.md#refitted"""
 LARGEST_STEP = 4
 """Largest distance in pixels between the points that we look at. Splats of one or two pixels must not fall between them
 in every view: docs/results/tuning.md#distances"""
-STEP_UNIT = 1 / 32
-"""Distances are multiples of it, so that no last bit of a sum decides."""
+STEP_UNIT = 1 / 32  # Distances are multiples of it, so that no last bit of a sum decides
 SHIFTS = 0.7548776662466927, 0.5698402909980532
 """Shares of a distance by which the lattice moves right and down from view to view: powers of the root of x^3 = x + 1, whose
 multiples fill the unit square evenly."""

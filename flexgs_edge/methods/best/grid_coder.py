@@ -21,8 +21,7 @@ from flexgs_edge.run.options import CompressOptions
 LAYERS_COST = 1.06
 """Most bytes of a layered file over those of a file without layers: neighbours on the curve are farther apart in it.
 docs/results/tuning.md#layers_cost"""
-SETTINGS_MOST = 1536
-"""Most bytes of the settings of any file in its header."""
+SETTINGS_MOST = 1536  # Most bytes of the settings of any file in its header
 
 
 def projected_size(options: CompressOptions, size: int) -> int:

@@ -102,8 +102,7 @@ class Descents:
 
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
-FAR = 0.1
-"""Log of the share from which on we ask whether the descent mended anything."""
+FAR = 0.1  # Log of the share from which on we ask whether the descent mended anything
 PRICED, ABOVE = -0.035, 0.02
 """Expected log of the size after a descent over that before it, below 0 since bits cost; and how far above a size we aim, since
 results that are too large can be trimmed: docs/results/tuning.md#landing"""

@@ -11,17 +11,13 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.scene.curve import morton
 
-REACH = 0.04
-"""Largest log of size over limit that is landed. Beyond it, a new result at another multiplier is better."""
-NEAR = 0.002
-"""How far below the limit, as a share of it, we are content."""
-TRIES = 4
-"""Most times that the file is coded on the way."""
+REACH = 0.04  # Largest log of size over limit that is landed. Beyond it, a new result at another multiplier is better.
+NEAR = 0.002  # How far below the limit, as a share of it, we are content
+TRIES = 4  # Most times that the file is coded on the way
 SHARE, DESCENDED_SHARE = 0.5, 0.33
 """Share of the Gaussians to remove at first, for each unit of the log of what a quality allows; and behind a descent, where each
 matters more: docs/results/tuning.md#landing"""
-NEAR_QUALITY = 0.02
-"""How far below what it allows, as a share of it, we are content."""
+NEAR_QUALITY = 0.02  # How far below what it allows, as a share of it, we are content
 QUALITY_TRIES, DESCENDED_TRIES = 1, 6
 """Most results that are made and measured on the way to a quality, and behind a descent; one more if none of them holds:
 docs/results/tuning.md#landing"""

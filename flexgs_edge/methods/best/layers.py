@@ -27,8 +27,7 @@ from flexgs_edge.views.bench import Bench
 HALF = 0.485
 """Share of the bits that stays when the last layer is cut off. It is below .5, so that half of a file's bytes hold the other
 layers and the header."""
-MOST_SORTED = 1 << 18
-"""So many rows may always be sorted. Of more, see `can_sort`."""
+MOST_SORTED = 1 << 18  # So many rows may always be sorted. Of more, see `can_sort`.
 SORTED_ROW_BYTES = 41
 """Bytes of memory that sorting takes for each row, even if the scene lies in scratch files: see `worthiest`."""
 ROUND, LARGE_ROUND = 0.8, 0.5

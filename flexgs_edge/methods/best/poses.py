@@ -21,10 +21,8 @@ from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.source import SceneSource, some_positions
 from flexgs_edge.views.depths import visible_depths
 
-LEAST = 1e-6
-"""Least weight of a pose."""
-STEP = 4
-"""Every fourth pixel in both directions is compared."""
+LEAST = 1e-6  # Least weight of a pose
+STEP = 4  # Every fourth pixel in both directions is compared
 POWER, RARE_POWER = 4.8, 2.4
 """Powers of the slope, and of how rare a pose's picture is. The slope alone would minimise the mean drop; higher powers lift
 the worst view, as a soft maximum does: docs/results/tuning.md#view_weights"""
@@ -129,16 +127,11 @@ def margin_of(
 LEAST_GAIN = 0.2
 """A pose is needed if it adds at least this share of its own picture to what the scored ones see:
 docs/results/tuning.md#needed"""
-GAIN_DIGITS = 4
-"""Decimals in comparisons of what a pose adds."""
-NEIGHBOURS = 6
-"""A given pose and each of so many nearest ones make a pose half way between them, if that is needed."""
-BESIDE = 4
-"""So many given poses nearest to a view that lost too much make poses half way to it."""
-MOST_TIMES = 2
-"""Needed poses are at most so many times the given ones that are scored."""
-POINTS = 512
-"""Most points that tell what poses see."""
+GAIN_DIGITS = 4  # Decimals in comparisons of what a pose adds
+NEIGHBOURS = 6  # A given pose and each of so many nearest ones make a pose half way between them, if that is needed
+BESIDE = 4  # So many given poses nearest to a view that lost too much make poses half way to it
+MOST_TIMES = 2  # Needed poses are at most so many times the given ones that are scored
+POINTS = 512  # Most points that tell what poses see
 
 
 def needed_poses(

@@ -42,10 +42,8 @@ PARTS = 2
 """Each pruning round measures one of this many interleaved sets of cameras and reuses the sums of the others. One set
 is slower, four make files larger: docs/results/tuning.md#parts"""
 MOST_PARTS = 4
-PART_VIEWS = 48
-"""Many cameras make up to `MOST_PARTS` sets, if each has this many: docs/results/tuning.md#part_views"""
-SNAPSHOTS_HELD = 2
-"""So many of the last snapshots never let their planes go: docs/results/tuning.md#let_go"""
+PART_VIEWS = 48  # Many cameras make up to `MOST_PARTS` sets, if each has this many: docs/results/tuning.md#part_views
+SNAPSHOTS_HELD = 2  # So many of the last snapshots never let their planes go: docs/results/tuning.md#let_go
 
 
 def parts_of(views: int) -> int:
@@ -83,8 +81,7 @@ class PruneRounds:
         self._views = [range(first, len(cameras), count) for first in range(count)]
         self._parts: list[CostParts] = []
         self.snapshots: list[Snapshot] = []
-        self._renewed: set[int] = set()
-        """Snapshots that a descent has made."""
+        self._renewed: set[int] = set()  # Snapshots that a descent has made
         if not self._resumed():
             self._begin(start, unseen_share)
         first = self.snapshots[0]

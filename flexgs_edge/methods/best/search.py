@@ -71,25 +71,20 @@ def weighed(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 LOG = logging.getLogger("flexgs_edge")
 
-Product = TypeVar("Product")
-"""Type of the product of a candidate: a grid, or a finished file."""
+Product = TypeVar("Product")  # Type of the product of a candidate: a grid, or a finished file
 
 MOST, MOST_TRIED = 4, 6
 """Most candidates, and most of them with those that lost Gaussians; while none holds, and of a size, the second is the limit
 of both."""
-PROBES = 4
-"""Most probes before the first candidate."""
+PROBES = 4  # Most probes before the first candidate
 AIM, FARTHER = -0.01, 0.05
 """Log of the share that we aim at, and how much farther below 1 for each candidate in a row that missed."""
 SLOPE, SIZE_SLOPE = 0.7, -0.45
 """Slopes of the logs of the share and of the size over that of the multiplier, before two points are measured:
 docs/results/tuning.md#slope"""
-LARGEST_STRIDE = 1.2
-"""Largest change of the log of the multiplier beyond what is measured."""
-CLOSE_SIZE = 0.003
-"""A candidate that is smaller than asked by no more than this ends a search for a size."""
-LEAST_CHANGE = 1e-3
-"""Multipliers whose logs differ by less are the same."""
+LARGEST_STRIDE = 1.2  # Largest change of the log of the multiplier beyond what is measured
+CLOSE_SIZE = 0.003  # A candidate that is smaller than asked by no more than this ends a search for a size
+LEAST_CHANGE = 1e-3  # Multipliers whose logs differ by less are the same
 
 
 @dataclass(frozen=True)
@@ -118,8 +113,7 @@ class Candidate:
 class Maker(Protocol[Product]):
     """Makes the candidates of a search."""
 
-    close: float
-    """How far below 1 the log of the largest share ends the search."""
+    close: float  # How far below 1 the log of the largest share ends the search
 
     def start(self, target: Target) -> float:
         """Prune, and return a multiplier to begin with."""

@@ -18,10 +18,8 @@ from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.scene.source import Planes
 
-MOST_ROUNDS = 24
-"""Most rounds of pruning."""
-FEW = 16
-"""Of fewer Gaussians none goes in a round."""
+MOST_ROUNDS = 24  # Most rounds of pruning
+FEW = 16  # Of fewer Gaussians none goes in a round
 ALL_LEFT = 0.97
 """A multiplier that keeps this share of what a descent has left asks for more: it chooses from what there was before."""
 

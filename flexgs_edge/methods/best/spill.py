@@ -46,8 +46,7 @@ from flexgs_edge.units import format_size
 
 LOG = logging.getLogger("flexgs_edge")
 
-COST_BYTES = 16
-"""Bytes of a row's costs in a snapshot, without those of SH: removal and weight, in double precision."""
+COST_BYTES = 16  # Bytes of a row's costs in a snapshot, without those of SH: removal and weight, in double precision
 BAND_BYTES = 20
 """Bytes of a row's costs in a snapshot for each SH degree: a cost in double precision, and a mean colour."""
 WORK_PLANES = 11
@@ -59,8 +58,7 @@ DESCENTS = 3
 candidates: docs/results/tuning.md#descents"""
 SPILLED_ROW_BYTES = 24
 """Bytes of memory that each row of a scene in scratch files still takes for a moment: for choosing rows, and lists of rows."""
-SPOOL_ROW_BYTES = 52
-"""Bytes of the scratch file of sums (`ViewSums`) for each row that a view shows."""
+SPOOL_ROW_BYTES = 52  # Bytes of the scratch file of sums (`ViewSums`) for each row that a view shows
 
 USUAL_SHARE = 4
 """Scratch files usually take one byte in so many of the most that they may take: docs/results/tuning.md#let_go"""

@@ -18,8 +18,7 @@ from flexgs_edge.packed.quantize import QuantizedScene, far_contraction, quantiz
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import SceneSource
 
-QUANTIZE_COPIES = 4
-"""Copies of a chunk's planes that quantizing holds at once: as read, gathered, and codes in between."""
+QUANTIZE_COPIES = 4  # Copies of a chunk's planes that quantizing holds at once: as read, gathered, and codes in between
 
 
 @dataclass(frozen=True)

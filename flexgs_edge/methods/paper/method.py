@@ -36,8 +36,7 @@ from flexgs_edge.run.settings import make_settings
 from flexgs_edge.units import format_size
 from flexgs_edge.views.bench import Bench
 
-SENSITIVITY_VIEWS = 8
-"""Most training poses that sensitivity is measured on, evenly spread."""
+SENSITIVITY_VIEWS = 8  # Most training poses that sensitivity is measured on, evenly spread
 
 
 def bits_by_sensitivity(

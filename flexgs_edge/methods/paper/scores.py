@@ -16,10 +16,8 @@ from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.source import SceneSource
 
 SCORES = ("gs", "meson")
-ROWS = 1 << 16
-"""Rows of the scene read at a time."""
-SCORE_ROW_BYTES = 28
-"""Bytes a Gaussian that scoring holds: hits and weights, and what one view adds to them."""
+ROWS = 1 << 16  # Rows of the scene read at a time
+SCORE_ROW_BYTES = 28  # Bytes a Gaussian that scoring holds: hits and weights, and what one view adds to them
 
 
 def score_scene(

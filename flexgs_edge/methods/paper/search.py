@@ -75,12 +75,9 @@ CANDIDATES: tuple[tuple[int, int], ...] = (
     (4, 4), (3, 6), (4, 5), (5, 4), (6, 3), (5, 5), (6, 4), (7, 3), (8, 2), (9, 1),
 )  # fmt: skip
 """The paper's list of (p, s), in tenths, as published. It is not sorted by bytes; the search sorts it."""
-START = (4, 4)
-"""Where the walk along the list begins, in tenths."""
-GRID = 20
-"""Step of the refinement in p and s, in thousandths."""
-REACH = 100
-"""Largest distance of the refinement from the list's answer, in thousandths."""
+START = (4, 4)  # Where the walk along the list begins, in tenths
+GRID = 20  # Step of the refinement in p and s, in thousandths
+REACH = 100  # Largest distance of the refinement from the list's answer, in thousandths
 
 
 class Evaluator(Protocol):

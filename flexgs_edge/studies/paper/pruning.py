@@ -13,12 +13,9 @@ from flexgs_edge.studies.experiment import Beside, Experiment
 from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
 from flexgs_edge.studies.study_scene import FIGURES, Point, Setting, StudyScene
 
-DIAGONAL = tuple(range(50, 501, 50))
-"""Rates p = s of the ADP curve, in thousandths. Nothing was tuned for this split."""
-GRID = 100
-"""Step of the rates in `plane`, in thousandths. The paper's candidates lie on this grid."""
-MAX_ROWS = 980
-"""Largest rate of pruning rows alone, in thousandths."""
+DIAGONAL = tuple(range(50, 501, 50))  # Rates p = s of the ADP curve, in thousandths. Nothing was tuned for this split.
+GRID = 100  # Step of the rates in `plane`, in thousandths. The paper's candidates lie on this grid.
+MAX_ROWS = 980  # Largest rate of pruning rows alone, in thousandths
 RATES = {"prune_rate": "p (removed)", "sh_rate": "s (SH removed)"}
 
 

@@ -23,8 +23,7 @@ from flexgs_edge.studies.written import SceneStudy, write_page, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
 
-Maker = Callable[[StudyScene], Experiment]
-"""Makes an experiment on a scene."""
+Maker = Callable[[StudyScene], Experiment]  # Makes an experiment on a scene
 EXPERIMENTS: tuple[Maker, ...] = (
     quantization.rtn,
     quantization.attributes,

@@ -33,8 +33,7 @@ from flexgs_edge.units import format_size
 
 LOG = logging.getLogger("flexgs_edge")
 
-MAX = "max"
-"""The effort that distils. It gets a curve of its own."""
+MAX = "max"  # The effort that distils. It gets a curve of its own.
 WHOLE, UNPRUNED = "whole", "nothing pruned"
 
 
@@ -62,8 +61,7 @@ class RatePoint:
         return self.quality.flip_original if self.quality.flip_photo is None else self.quality.flip_photo
 
 
-PEERS = (".spz", ".sog", ".compressed.ply")
-"""Formats of other programs that the study compares with."""
+PEERS = (".spz", ".sog", ".compressed.ply")  # Formats of other programs that the study compares with
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from flexgs_edge.studies.study_scene import FIGURES, StudyScene
 LEAST_LOSS = 0.001
 """Points with less loss than this, in dB, are left out. Loss and bytes are interpolated on log scales, because such curves are
 nearly power laws."""
-SLACK = 1e-9
-"""Tolerance, so that the curve's own points lie on it in spite of rounding."""
+SLACK = 1e-9  # Tolerance, so that the curve's own points lie on it in spite of rounding
 
 
 class Curve:

@@ -15,8 +15,7 @@ from flexgs_edge.report.plots import Series
 from flexgs_edge.studies.result_tables import Row
 from flexgs_edge.studies.study_scene import StudyScene
 
-BREAK = 3.0
-"""A method has broken if it loses more than this, in dB: twice the squared error."""
+BREAK = 3.0  # A method has broken if it loses more than this, in dB: twice the squared error
 LOST = f"lost {BREAK:g} dB"
 
 

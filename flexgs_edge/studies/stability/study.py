@@ -17,10 +17,8 @@ from flexgs_edge.studies.stability.unseen_poses import FULL, QUICK, Amounts, pos
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
 from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_study
 
-EFFORT = "fast"
-"""Effort of all searches. The study makes many, and breaks show at every effort."""
-COPIES = 4
-"""Copies of the scene's planes that compressing it again holds at once."""
+EFFORT = "fast"  # Effort of all searches. The study makes many, and breaks show at every effort.
+COPIES = 4  # Copies of the scene's planes that compressing it again holds at once
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from flexgs_edge.studies.study_scene import StudyScene
 from flexgs_edge.views.depths import visible_depths
 
 TILE_SIDE = 64
-TURNS = (15.0, 30.0)
-"""Degrees by which a pose is turned up about the point that it looks at."""
+TURNS = (15.0, 30.0)  # Degrees by which a pose is turned up about the point that it looks at
 ZOOMS = (0.5, 2.0, 4.0)
 SIZES = (0.5, 2.0)
 TRAINING, HELD_OUT, DISTANCE = "training", "held out", "distance"
@@ -51,8 +50,7 @@ class Amounts:
 
 
 FULL = Amounts()
-QUICK = Amounts(width=120, distances=(0.5, 1.0, 2.0), poses=2, even=False)
-"""A quick look at every experiment."""
+QUICK = Amounts(width=120, distances=(0.5, 1.0, 2.0), poses=2, even=False)  # A quick look at every experiment
 
 
 @dataclass(frozen=True)

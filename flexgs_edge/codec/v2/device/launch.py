@@ -9,8 +9,7 @@ import numpy as np
 
 from flexgs_edge.codec.v2.groups import Group
 
-_SPARE = 96
-"""Elements of each plane beyond its rows: vectors may load and store there."""
+_SPARE = 96  # Elements of each plane beyond its rows: vectors may load and store there
 # Fields of a chunk's info record, for input and result; the kernel has the same order.
 INFO = ("rows", "lanes", "words", "status", "found", "found high", "wanted", "at")
 # Places in the record of an alphabet; the kernel has the same.
@@ -28,8 +27,7 @@ PLACES = {
     "tables": 200,
     "counts": 202,
 }
-RECORD = 203
-"""Length of a record in i32."""
+RECORD = 203  # Length of a record in i32
 PLANES = {"cells": (2, "u8"), "weights": (8, "u2"), "bytes": (4, "u1"), "ints": (4, "i4"), "floats": (44, "f4")}
 """Work planes of a chunk: number and type of each."""
 

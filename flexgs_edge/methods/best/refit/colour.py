@@ -22,8 +22,7 @@ from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.sums import Maker, ViewSums
 
-ROUND_VIEWS = 96
-"""Least poses of a round: docs/results/tuning.md#round_views"""
+ROUND_VIEWS = 96  # Least poses of a round: docs/results/tuning.md#round_views
 RELAX_DC = 1.0
 RELAX_SH = 0.25
 """Steps of the constant and of SH, as shares of the SIRT step of the constant alone. All bands move at once. So a pixel seen

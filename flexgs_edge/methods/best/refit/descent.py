@@ -21,8 +21,7 @@ from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_mib
 
-PRICES = 33
-"""Values of the record that the kernel `descend` takes."""
+PRICES = 33  # Values of the record that the kernel `descend` takes
 WIDTH = 0.5
 """Prices rise over about this many grid steps around a centre. Within a step, it makes no difference to the bits."""
 
@@ -86,8 +85,7 @@ a descent of a few hundred views lasts: docs/results/tuning.md#decays"""
 WIDE = 0.055
 """A Gaussian whose largest deviation is above this share of its depth takes steps that are shorter by the same factor. Full
 steps would make haze that no scored pose sees: docs/results/tuning.md#wide"""
-PLANE_SETS = 5
-"""How often all planes of a chunk are held: values and their mean, gradient, two running means of it."""
+PLANE_SETS = 5  # How often all planes of a chunk are held: values and their mean, gradient, two running means of it
 
 
 def widths(sh_degree: int) -> dict[str, int]:
@@ -204,8 +202,7 @@ def fields_of(planes: dict[str, np.ndarray], own: dict[str, int]) -> Iterator[tu
         at += width
 
 
-GRID_VALUES = 14
-"""Step sizes that the kernel `snap` takes."""
+GRID_VALUES = 14  # Step sizes that the kernel `snap` takes
 
 
 def descent_bytes(sh_degree: int) -> int:

@@ -129,8 +129,7 @@ def parts_of(spans: Iterable[tuple[int, int, int]]) -> list[Part]:
 
 CHUNK_ROWS = 1 << 14
 """Most rows of a chunk: 4 MB of values at SH degree 3. Larger ones would hold more rows that a view does not show."""
-RECORD = 16
-"""Values of a splat's record."""
+RECORD = 16  # Values of a splat's record
 
 
 def open_descent(
