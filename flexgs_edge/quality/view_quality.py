@@ -103,6 +103,16 @@ class ViewQuality:
         return max(self.original_ssim - self.ssim_photo, 0.0)
 
 
+class _MeanOf:
+    """The mean over the views of their figure of this name; `None` where no view has it."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, quality: Quality, owner: type) -> float | None:
+        return mean_psnr([getattr(view, self._name) for view in quality.views])
+
+
 @dataclass(frozen=True)
 class Quality:
     """Quality of a scene over its evaluation views: means over the views, and the worst view."""
@@ -112,33 +122,16 @@ class Quality:
     covered_decides: bool = False  # The covered figures decide: there are no photos. Default: the plain figures decide.
     made: Quality | None = None  # quality at made poses, where no given camera stood; `None` if not measured
 
-    def _mean(self, name: str) -> float | None:
-        return mean_psnr([getattr(view, name) for view in self.views])
+    fidelity = _MeanOf()  # against the original's renders, dB; `None` if every view is identical
+    psnr, original_psnr, drop = _MeanOf(), _MeanOf(), _MeanOf()  # against the photos, dB; `None` without photos
+    ssim_original, ssim_photo, original_ssim = _MeanOf(), _MeanOf(), _MeanOf()
+    lpips_original, lpips_photo, original_lpips = _MeanOf(), _MeanOf(), _MeanOf()
+    flip_original, flip_photo, original_flip = _MeanOf(), _MeanOf(), _MeanOf()
 
     @property
     def error(self) -> float:
         """Mean squared error against the original's renders, mean over the views."""
         return math.fsum(view.error for view in self.views) / max(len(self.views), 1)
-
-    @property
-    def fidelity(self) -> float | None:
-        """Mean PSNR against the original's renders, dB; `None` if every view is identical."""
-        return self._mean("fidelity")
-
-    @property
-    def psnr(self) -> float | None:
-        """Mean PSNR against the photos, dB."""
-        return self._mean("psnr")
-
-    @property
-    def original_psnr(self) -> float | None:
-        """Mean PSNR of the original against the photos, dB."""
-        return self._mean("original_psnr")
-
-    @property
-    def drop(self) -> float | None:
-        """Mean drop against the photos, dB; `None` without photos."""
-        return self._mean("drop")
 
     @property
     def modelled_drop(self) -> float:
@@ -225,21 +218,6 @@ class Quality:
         return sum(view.error == 0.0 for view in self.views)
 
     @property
-    def ssim_original(self) -> float | None:
-        """Mean SSIM against the original's renders."""
-        return self._mean("ssim_original")
-
-    @property
-    def ssim_photo(self) -> float | None:
-        """Mean SSIM against the photos."""
-        return self._mean("ssim_photo")
-
-    @property
-    def original_ssim(self) -> float | None:
-        """Mean SSIM of the original against the photos."""
-        return self._mean("original_ssim")
-
-    @property
     def by_loss(self) -> list[int]:
         """Indices of the views, the worst first: by drop if all have photos, else by the error that decides.
 
@@ -254,36 +232,6 @@ class Quality:
             least = LEAST_COVERAGE * self.coverage
             losses = [(view.covered_error or 0.0) if view.coverage >= least else -1.0 for view in self.views]
         return sorted(range(len(losses)), key=lambda index: -losses[index])
-
-    @property
-    def lpips_original(self) -> float | None:
-        """Mean LPIPS against the original's renders."""
-        return self._mean("lpips_original")
-
-    @property
-    def lpips_photo(self) -> float | None:
-        """Mean LPIPS against the photos."""
-        return self._mean("lpips_photo")
-
-    @property
-    def original_lpips(self) -> float | None:
-        """Mean LPIPS of the original against the photos."""
-        return self._mean("original_lpips")
-
-    @property
-    def flip_original(self) -> float | None:
-        """Mean FLIP against the original's renders."""
-        return self._mean("flip_original")
-
-    @property
-    def flip_photo(self) -> float | None:
-        """Mean FLIP against the photos."""
-        return self._mean("flip_photo")
-
-    @property
-    def original_flip(self) -> float | None:
-        """Mean FLIP of the original against the photos."""
-        return self._mean("original_flip")
 
     @property
     def worst_flip(self) -> ViewQuality | None:

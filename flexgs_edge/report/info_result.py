@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from flexgs_edge._version import __version__
+from flexgs_edge.report.run_info import record
 from flexgs_edge.units import format_size
 
 
@@ -62,46 +62,13 @@ class InfoResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        record: dict[str, Any] = {
-            "program": f"flexgs-edge {__version__}",
-            "command": "info",
-            "path": self.path,
-            "format": self.format,
-            **({} if self.version is None else {"version": self.version}),
-            "size": self.size,
-            "count": self.count,
-            "sh_count": self.sh_count,
-            "sh_degree": self.sh_degree,
-            "origin": list(self.origin),
-        }
+        of_other = ("cameras", "images", "antialiased", "format_version", "frame")
+        of_version_2 = ("chroma", "model_bytes", "layers", "preview", "cut_from")
         if self.version is None:
-            return record | {
-                "source_ply_bytes": self.source_ply_bytes,
-                "cameras": self.cameras,
-                "images": self.images,
-                "antialiased": self.antialiased,
-                "format_version": self.format_version,
-                "frame": self.frame,
-                "notes": list(self.notes),
-            }
-        record |= {
-            "bits_per_gaussian": self.bits_per_gaussian,
-            "source_ply_bytes": self.source_ply_bytes,
-            "ratio": self.ratio,
-            "channels": {name: dict(channel) for name, channel in self.channels.items()},
-            "overhead_bytes": self.overhead_bytes,
-            "settings": dict(self.settings),
-            "notes": list(self.notes),
-        }
-        if self.layers is not None:
-            record |= {
-                "chroma": self.chroma,
-                "model_bytes": self.model_bytes,
-                "layers": [dict(layer) for layer in self.layers],
-                "preview": None if self.preview is None else dict(self.preview),
-                "cut_from": None if self.cut_from is None else dict(self.cut_from),
-            }
-        return record
+            return record("info", self, "version", "channels", "settings", *of_version_2)
+        left_out = of_other if self.layers is not None else (*of_other, *of_version_2)
+        derived = {name: getattr(self, name) for name in ("bits_per_gaussian", "ratio", "overhead_bytes")}
+        return record("info", self, *left_out, **derived)
 
     def summary(self) -> str:
         """Return the text that the command prints."""

@@ -7,17 +7,16 @@ and targets.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from flexgs_edge._version import __version__
 from flexgs_edge.goals.promise import KeptPromise
 from flexgs_edge.goals.steps import Scored, SearchResult
 from flexgs_edge.packed.bitspec import Sensitivity
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.as_json import promise_json, quality_json, rounded, step_json
-from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo, record
 from flexgs_edge.report.summary import (
     decibel,
     line,
@@ -93,45 +92,18 @@ class CompressResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "compress",
-            "input": self.scene.to_json(),
-            "views": self.views.to_json() if self.views else None,
-            "output": self.output,
-            "format": self.format,
-            "file_sh_degree": self.file_sh_degree,
-            "size": self.size,
-            "preview_bytes": self.preview_bytes,
-            "ratio": round(self.ratio, 4),
-            "ratio_without_normals": round(self.ratio_without_normals, 4),
-            "ratio_of_input": rounded(self.ratio_of_input),
-            "count": self.count,
-            "sh_count": self.sh_count,
-            "prune_rate": self.prune_rate,
-            "sh_rate": self.sh_rate,
-            "method": self.method,
-            "score": self.score,
-            "select": self.select,
-            "bits": self.bits,
-            "groups": self.groups,
-            "steps": self.steps,
-            "target": self.target,
-            "decided_by": self.decided_by,
-            "reached": self.reached,
-            "promise": promise_json(self.promise),
-            "decision_views": self.decision_views,
-            "search": [step_json(step) for step in self.search.steps] if self.search else [],
-            "sensitivity": [{**asdict(item), "loss": item.loss} for item in self.sensitivity],
-            "quality": quality_json(self.quality) if self.quality else None,
-            "quality_views": self.quality_views,
-            "training_fidelity": rounded(self.training_fidelity),
-            "scored": asdict(self.scored) if self.scored else None,
-            "warnings": list(self.warnings),
-            "score_cache": self.score_cache,
-            "scores_reused": self.scores_reused,
-            "run": self.run.to_json(),
-        }
+        return record(
+            "compress",
+            self,
+            ratio=round(self.ratio, 4),
+            ratio_without_normals=round(self.ratio_without_normals, 4),
+            ratio_of_input=rounded(self.ratio_of_input),
+            promise=promise_json(self.promise),
+            search=[step_json(step) for step in self.search.steps] if self.search else [],
+            sensitivity=[{**asdict(item), "loss": item.loss} for item in self.sensitivity],
+            quality=quality_json(self.quality) if self.quality else None,
+            training_fidelity=rounded(self.training_fidelity),
+        )
 
     def summary(self) -> str:
         """Return the text that the command prints."""
@@ -215,17 +187,7 @@ class EvaluateResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "evaluate",
-            "input": self.scene.to_json(),
-            "reference": self.reference.to_json(),
-            "views": self.views.to_json(),
-            "quality": quality_json(self.quality),
-            "quality_views": self.quality_views,
-            "warnings": list(self.warnings),
-            "run": self.run.to_json(),
-        }
+        return record("evaluate", self, quality=quality_json(self.quality))
 
     def summary(self) -> str:
         """Return the text that the command prints."""
@@ -237,47 +199,31 @@ class EvaluateResult:
 
 
 def _view_table(views: Sequence[ViewQuality]) -> list[str]:
-    rows: list[tuple[str, ...]] = [
-        (
-            "view",
-            "fidelity",
-            "covered",
-            "coverage",
-            "SSIM to ref.",
-            "FLIP to ref.",
-            "drop",
-            "PSNR",
-            "of original",
-            "SSIM",
-            "of original",
-            "FLIP",
-            "of original",
-        )
+    def figure(head: str, name: str) -> tuple[str, Callable[[ViewQuality], str]]:
+        return head, lambda view: similar(getattr(view, name))
+
+    def against_photo(head: str, name: str) -> tuple[str, Callable[[ViewQuality], str]]:
+        return head, lambda view: "-" if view.photo_error is None else decibel(getattr(view, name))
+
+    columns: list[tuple[str, Callable[[ViewQuality], str]]] = [
+        ("view", lambda view: view.name),
+        ("fidelity", lambda view: decibel(view.fidelity)),
+        ("covered", lambda view: decibel(view.covered_fidelity) if view.coverage else "-"),
+        ("coverage", lambda view: f"{100 * view.coverage:.3g} %"),
+        figure("SSIM to ref.", "ssim_original"),
+        figure("FLIP to ref.", "flip_original"),
+        against_photo("drop", "drop"),
+        against_photo("PSNR", "psnr"),
+        against_photo("of original", "original_psnr"),
+        figure("SSIM", "ssim_photo"),
+        figure("of original", "original_ssim"),
+        figure("FLIP", "flip_photo"),
+        figure("of original", "original_flip"),
     ]
-    with_lpips = any(view.lpips_original is not None for view in views)
-    if with_lpips:
-        rows[0] += ("LPIPS to ref.", "LPIPS", "of original")
-    for view in views:
-        photo = view.photo_error is not None
-        rows.append(
-            (
-                view.name,
-                decibel(view.fidelity),
-                decibel(view.covered_fidelity) if view.coverage else "-",
-                f"{100 * view.coverage:.3g} %",
-                similar(view.ssim_original),
-                similar(view.flip_original),
-                decibel(view.drop) if photo else "-",
-                decibel(view.psnr) if photo else "-",
-                decibel(view.original_psnr) if photo else "-",
-                similar(view.ssim_photo),
-                similar(view.original_ssim),
-                similar(view.flip_photo),
-                similar(view.original_flip),
-            )
-        )
-        if with_lpips:
-            rows[-1] += tuple(map(similar, (view.lpips_original, view.lpips_photo, view.original_lpips)))
+    if any(view.lpips_original is not None for view in views):
+        columns += [figure("LPIPS to ref.", "lpips_original"), figure("LPIPS", "lpips_photo")]
+        columns.append(figure("of original", "original_lpips"))
+    rows = [[head for head, _ in columns], *([cell(view) for _, cell in columns] for view in views)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return [
         "  ".join(

@@ -2,10 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
+from flexgs_edge._version import __version__
+
+SIMILARITIES = ("ssim", "flip", "lpips")  # Figures of pairs of pictures
 PLY_HEADER_MOST = 4096  # Most bytes of the header of a PLY in INRIA's layout; most have 1.5 kB
+
+
+def record(command: str, result: object, *left_out: str, **more: Any) -> dict[str, Any]:
+    """The JSON values of a command's result: its fields but for some, and `more`."""
+    return {"program": f"flexgs-edge {__version__}", "command": command, **fields_json(result, *left_out, **more)}
+
+
+def fields_json(result: object, *left_out: str, **more: Any) -> dict[str, Any]:
+    """The fields of a dataclass as JSON values. A `scene` is the `input`."""
+    assert is_dataclass(result)
+    names = [field.name for field in fields(result) if field.name not in (*left_out, *more)]
+    return {"input" if name == "scene" else name: _value(getattr(result, name)) for name in names} | more
+
+
+def _value(value: Any) -> Any:
+    if hasattr(value, "to_json"):
+        return value.to_json()
+    if is_dataclass(value):
+        return fields_json(value)
+    if isinstance(value, Mapping):
+        return {key: _value(one) for key, one in value.items()}
+    return [_value(one) for one in value] if isinstance(value, (tuple, list)) else value
 
 
 @dataclass(frozen=True)
@@ -31,17 +57,15 @@ class RunInfo:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values, with seconds rounded to milliseconds."""
-        return {
-            "seconds": round(self.seconds, 3),
-            "stages": {name: round(seconds, 3) for name, seconds in self.stages.items()},
-            "startup_ms": round(self.startup_seconds * 1000, 1),
-            "compile_ms": round(self.compile_seconds * 1000, 1),
-            "memory_limit": self.memory_limit,
-            "peak_memory": self.peak_memory,
-            "peak_anonymous": self.peak_anonymous,
-            "scratch": self.scratch,
-            "device": self.device,
-        }
+        return fields_json(
+            self,
+            "startup_seconds",
+            "compile_seconds",
+            seconds=round(self.seconds, 3),
+            stages={name: round(seconds, 3) for name, seconds in self.stages.items()},
+            startup_ms=round(self.startup_seconds * 1000, 1),
+            compile_ms=round(self.compile_seconds * 1000, 1),
+        )
 
 
 @dataclass(frozen=True)
@@ -69,10 +93,6 @@ class SceneInfo:
         """Bytes of the input divided by `size`; `None` for a scene from memory."""
         return None if self.bytes is None else self.bytes / size
 
-    def to_json(self) -> dict[str, Any]:
-        """Return all fields as JSON values."""
-        return {**asdict(self), "notes": list(self.notes)}
-
 
 @dataclass(frozen=True)
 class ViewsInfo:
@@ -86,7 +106,3 @@ class ViewsInfo:
     width: int
     height: int
     notes: tuple[str, ...] = ()
-
-    def to_json(self) -> dict[str, Any]:
-        """Return all fields as JSON values."""
-        return {**asdict(self), "notes": list(self.notes)}

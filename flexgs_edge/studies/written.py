@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from flexgs_edge._version import __version__
 from flexgs_edge.files import atomic_folder, check_folder
 from flexgs_edge.report.html import render
 from flexgs_edge.report.plots import picture, require_matplotlib
-from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo, fields_json, record
 from flexgs_edge.report.summary import device_words
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_bench import bench_info
@@ -59,14 +58,7 @@ class SceneStudy:
 
     def to_json(self) -> dict[str, Any]:
         """The record for machines."""
-        return {
-            "name": self.name,
-            "input": self.scene.to_json(),
-            "views": self.views.to_json(),
-            "decided_by": self.decided_by,
-            "experiments": [experiment.to_json() for experiment in self.experiments],
-            "run": self.run.to_json(),
-        }
+        return fields_json(self)
 
     def to_lines(self) -> list[str]:
         """The findings, for people."""
@@ -89,12 +81,7 @@ class WrittenStudy:
 
     def to_json(self) -> dict[str, Any]:
         """The record for machines."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": self.command,
-            "output": self.output,
-            **self.scene.to_json(),
-        }
+        return record(self.command, self, "scene", **self.scene.to_json())
 
     def to_text(self) -> str:
         """The findings, for people."""

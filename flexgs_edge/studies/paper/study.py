@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flexgs_edge._version import __version__
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_folder, check_folder
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.plots import require_matplotlib
+from flexgs_edge.report.run_info import record
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.paper import pruning, quantization, whole
@@ -46,12 +46,7 @@ class PaperStudy:
 
     def to_json(self) -> dict[str, Any]:
         """The record for programs."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "study paper",
-            "output": self.output,
-            "scenes": [scene.to_json() for scene in self.scenes],
-        }
+        return record("study paper", self)
 
     def to_text(self) -> str:
         """The findings, for people."""

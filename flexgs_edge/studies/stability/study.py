@@ -29,10 +29,6 @@ class StabilityStudy(WrittenStudy):
 
     command = "study stability"
 
-    def to_json(self) -> dict[str, Any]:
-        """The record for programs."""
-        return {**super().to_json(), "quick": self.quick}
-
 
 def study_stability(
     scene: str | Path,
