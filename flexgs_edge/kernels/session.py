@@ -104,7 +104,8 @@ class Session:
                 f"{info.name} ({info.platform}) does not open ({error}): it is gone, or its driver is broken; "
                 "`flexgs-edge devices` shows what is there"
             ) from error
-        self.compile_seconds = 0.0
+        self.compile_seconds = 0.0  # spent on building programs so far
+        # Wall seconds by kernel; None (default) if not measured. Measuring makes every launch wait for the queue.
         self.profile: defaultdict[str, float] | None = None
 
     def kernel(self, source: str, name: str, options: tuple[str, ...], signature: str) -> cl.Kernel:
@@ -123,7 +124,7 @@ class Session:
         kernel.set_scalar_arg_dtypes([SCALARS[kind] for kind in signature])
         return kernel
 
-    def launch(
+    def enqueue(
         self, label: str, kernel: cl.Kernel, size: tuple[int, ...], local: tuple[int, ...], args: tuple[Any, ...]
     ) -> None:
         """Enqueue `kernel`; with `profile` set, also wait for it, and add its wall seconds under `label`."""
@@ -212,6 +213,6 @@ class Session:
             pattern = np.full(repeats, value, array.dtype)
             array.changed = cl.enqueue_fill_buffer(self.queue, array.buffer, pattern, 0, size)
 
-    def finish(self) -> None:
-        """Wait for everything that is enqueued."""
+    def close(self) -> None:
+        """Wait for everything that is enqueued; the owners of buffers release them."""
         self.queue.finish()

@@ -180,10 +180,10 @@ def faulty(fault: str) -> None:
         "race": "out[0] = (float)get_global_id(0);",
         "barrier": "if (get_local_id(0) < 2) barrier(CLK_LOCAL_MEM_FENCE); out[get_global_id(0)] = 1.0f;",
     }[fault]
-    kernel = backend.session.kernel(f"__kernel void faulty(__global float *out) {{ {body} }}", "faulty", (), "b")
-    array = backend.session.array((4,), np.float32)
-    backend.session.launch("faulty", kernel, (4,), (4 if fault == "barrier" else 1,), (array,))
-    backend.session.finish()
+    kernel = backend.kernel(f"__kernel void faulty(__global float *out) {{ {body} }}", "faulty", (), "b")
+    array = backend.array((4,), np.float32)
+    backend.enqueue("faulty", kernel, (4,), (4 if fault == "barrier" else 1,), (array,))
+    backend.close()
     print(MARK, 1)
 
 
