@@ -66,7 +66,7 @@ class Series:
 class LineChart:
     """Curves over a common axis.
 
-    `log_x`, `log_y`: use a plain log scale, such as for times. All values must be above zero.
+    `log_x`: use a plain log scale, such as for times. All values must be above zero.
     """
 
     title: str
@@ -80,10 +80,8 @@ class LineChart:
     megabytes: bool = False  # show x in MB, on a log scale
     floating: bool = False  # y need not start at zero, such as for fidelity
     log_x: bool = False
-    log_y: bool = False
     # Pareto front: points that no other point beats, joined by steps under the series.
     front: Sequence[tuple[float, float]] = ()
-    upright: tuple[float, str] | None = None  # mark this x with a line and its text: a point without a y
 
 
 @dataclass(frozen=True)
@@ -229,12 +227,6 @@ def _lines(axes: Axes, chart: LineChart) -> None:
     if chart.front:
         steps: dict[str, Any] = {"color": INK, "linewidth": 1.0, "linestyle": (0, (2, 2)), "zorder": 1}
         axes.step(*_split(sorted(chart.front)), where="post", label="Pareto front", **steps)
-    if chart.upright is not None:
-        at, words = chart.upright
-        axes.axvline(at, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
-        axes.annotate(
-            words, (at, 0.02), (-3, 0), ("data", "axes fraction"), "offset points", ha="right", rotation=90, fontsize=8
-        )
     # Axes of losses start at zero, or below if compression helped, so that small losses do not look large.
     shown = [y for series in chart.series for y in series.y if y is not None]
     low, high = min(shown, default=0.0), max(shown, default=1.0)
@@ -244,12 +236,7 @@ def _lines(axes: Axes, chart: LineChart) -> None:
         axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
         axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)
         axes.yaxis.set_minor_locator(NullLocator())
-    if chart.log_y:
-        axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
-        axes.yaxis.set_minor_locator(NullLocator())
-    elif not chart.floating:
+    if not chart.floating:
         axes.set_ylim(min(low * 1.1, 0.0), max(high, LINEAR_BELOW) * (1.4 if chart.magnitudes else 1.1))
     axes.set_xlabel(chart.x_label)
     axes.set_ylabel(chart.y_label + (", log above 0.1" if chart.magnitudes else ""))

@@ -21,7 +21,7 @@ from flexgs_edge.progress import SILENT
 from flexgs_edge.report.plots import BarChart, LineChart
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.studies.stability import heldout
-from flexgs_edge.studies.stability.breaks import BREAK, LOST
+from flexgs_edge.studies.stability.ours import BREAK, LOST
 from flexgs_edge.studies.stability.study import StabilityStudy, study_stability
 from flexgs_edge.studies.stability.unseen_poses import QUICK
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene

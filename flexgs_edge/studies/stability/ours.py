@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,15 +21,65 @@ from flexgs_edge.methods.best.method import grid_maker, open_rounds
 from flexgs_edge.methods.best.poses import scored_poses
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import search as search_by
+from flexgs_edge.methods.paper.evaluator import SceneEvaluator
 from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.quality.psnr import modelled_drop
+from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.report.plots import Series
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import MemorySource, SceneSource
 from flexgs_edge.studies.paper.pruning import nearest
-from flexgs_edge.studies.stability.breaks import drawn
+from flexgs_edge.studies.result_tables import Row
 from flexgs_edge.studies.study_scene import Setting, StudyScene
 from flexgs_edge.views.bench import Bench
+
+BREAK = 3.0  # A method has broken if it loses more than this, in dB: twice the squared error
+LOST = f"lost {BREAK:g} dB"
+
+
+def view_loss(studied: StudyScene, view: ViewQuality) -> float:
+    """Loss of one view in dB, in the figure that decides: its drop against the photo, or its modelled drop."""
+    if studied.plan.figure == "drop" and view.loss is not None:
+        return view.loss
+    error = view.covered_error or 0.0 if studied.judge.covered_decides else view.error
+    return modelled_drop(error, studied.run.options.base_psnr)
+
+
+def mean_loss(studied: StudyScene, views: Sequence[ViewQuality]) -> float:
+    """Mean loss of some views in the figure that decides, dB."""
+    if studied.plan.figure == "drop":
+        return math.fsum(view_loss(studied, view) for view in views) / len(views)
+    base_psnr = studied.run.options.base_psnr
+    return modelled_drop(Quality(tuple(views), covered_decides=studied.judge.covered_decides).deciding_error, base_psnr)
+
+
+@contextmanager
+def drawn(studied: StudyScene, evaluator: SceneEvaluator, choice: Choice) -> Iterator[DeviceScene]:
+    """The scene of a choice, quantized and loaded."""
+    with evaluator.quantized(choice) as quantized, studied.bench.renderer.load_quantized(quantized) as scene:
+        yield scene
+
+
+def number(row: Row, column: str) -> float:
+    """The number in a cell."""
+    value = row[column]
+    assert isinstance(value, (int, float)), f"{column}: {value!r}"
+    return float(value)
+
+
+def curve(rows: Sequence[Row], label: str, x: str, y: str = "loss", line: bool = True, every: bool = False) -> Series:
+    """Rows as a series of a chart. Its first break is marked, or with `every` all breaks. Points with an error have no y."""
+    shown = [row for row in rows if row[x] is not None]
+    broken = [number(row, x) for row in shown if row["broke"] is not None]
+    return Series(
+        label,
+        [number(row, x) for row in shown],
+        [None if row[y] is None else number(row, y) for row in shown],
+        line=line,
+        broken=broken if every else broken[:1],
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +107,7 @@ def walked(
     margin: bool = False,
 ) -> Iterator[PruneRounds]:
     """Open rounds of pruning over some poses (with `margin`, also generated ones), for any number of searches."""
-    options, bench = replace(studied.run.options, views_margin=margin), bench or studied.bench
+    options, bench = replace(studied.run.options, views_margin=margin), studied.bench
     run = replace(studied.run.of_source(source), options=options)
     poses = scored_poses(cameras, options, bench.renderer, source, studied.judge.covered_decides)
     with open_rounds(run, bench, poses.cameras, known=poses.known) as rounds:

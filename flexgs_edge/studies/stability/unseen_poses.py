@@ -15,8 +15,7 @@ from flexgs_edge.report.plots import BarChart, LineChart
 from flexgs_edge.run.few_poses import evenly
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
-from flexgs_edge.studies.stability.breaks import BREAK, LOST, curve, number
-from flexgs_edge.studies.stability.ours import BEST, WORDS, Contenders
+from flexgs_edge.studies.stability.ours import BEST, BREAK, LOST, WORDS, Contenders, curve, number
 from flexgs_edge.studies.study_scene import StudyScene
 from flexgs_edge.views.depths import visible_depths
 
