@@ -14,7 +14,7 @@ from flexgs_edge.quality.lpips import Lpips
 from flexgs_edge.report.results import EvaluateResult
 from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.decoding import decode_bytes, read_often
-from flexgs_edge.run.foresight import drawing_bytes, foresee
+from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.open_bench import bench_info, open_bench
@@ -54,10 +54,8 @@ def evaluate(
     def needed() -> int:
         return drawing_bytes(run) + decode_bytes(run.source, None) + decode_bytes(scene.source, None)
 
-    foresee(run, search=needed)
     with ExitStack() as stack:
-        bench = stack.enter_context(open_bench(run))
-        foresee(run, opened=True, search=needed)
+        bench = stack.enter_context(open_bench(run, needed=needed))
         run, renderer = check_views(run, bench, trusted=True), bench.renderer
         distance: Lpips | None = None
         if lpips:  # first, because packages or weights may be missing

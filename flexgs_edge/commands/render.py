@@ -18,7 +18,7 @@ from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import RenderResult
 from flexgs_edge.run.decoding import decode_bytes, read_often
-from flexgs_edge.run.foresight import drawing_bytes, foresee
+from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.judge import LIBRARY_BYTES
 from flexgs_edge.run.open_bench import bench_info, open_bench
@@ -58,9 +58,7 @@ def render_views(
     def needed() -> int:
         return writing + drawing_bytes(run) + decode_bytes(run.source, None)
 
-    foresee(run, search=needed, compares=False)
-    with open_bench(run) as bench:
-        foresee(run, opened=True, search=needed, compares=False)
+    with open_bench(run, needed=needed, compares=False) as bench:
         renderer = bench.renderer
         run.budget.take("writing pictures", writing)
         with clock.stage("load"):

@@ -16,7 +16,7 @@ from flexgs_edge.methods.paper.scores import SCORE_ROW_BYTES, SCORES, score_scen
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import ScoreResult
 from flexgs_edge.run.decoding import decode_bytes, read_often
-from flexgs_edge.run.foresight import drawing_bytes, foresee
+from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import ViewOptions
@@ -54,9 +54,7 @@ def score_gaussians(
     def needed() -> int:
         return sums + drawing_bytes(run) + decode_bytes(run.source, None)
 
-    foresee(run, search=needed, compares=False)
-    with open_bench(run) as bench:
-        foresee(run, opened=True, search=needed, compares=False)
+    with open_bench(run, needed=needed, compares=False) as bench:
         renderer = bench.renderer
         run.budget.take("scores", sums)
         with clock.stage("load"):

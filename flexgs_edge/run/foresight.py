@@ -7,6 +7,7 @@ from typing import Any
 
 from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.cameras.order import in_picture
+from flexgs_edge.memory.process import return_freed_memory
 from flexgs_edge.render.fit import DEFAULT, GUESS, ViewSize, compact_bytes, padded, streamed_bytes, view_bytes
 from flexgs_edge.run.counted_backend import BUILD_BYTES, RUNTIME_BYTES
 from flexgs_edge.run.judge import work_bytes
@@ -40,6 +41,8 @@ def foresee(
         return held + compared_bytes + (drawing_bytes(run) if search is None else search())
 
     budget.foreseen = enough
+    if not opened and enough() > budget.free:
+        return_freed_memory()  # before the device takes its first large blocks
 
 
 def drawing_bytes(run: Run[Any]) -> int:

@@ -36,6 +36,7 @@ from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate, Maker, Product, RateResult, search
 from flexgs_edge.methods.best.selection import Measure
 from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, choose_storage, least_spilled, needed_bytes
+from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.view_buffers import view_size
 from flexgs_edge.run.decoding import decoded
@@ -58,13 +59,14 @@ MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
 """Makes the maker of a search from rounds, a measure, and what scores poses beside views that lose too much."""
 
 
-def compress(run: Run[CompressOptions], bench: Bench) -> Made:
+def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
     """Compress a scene into a `.fgs` of version 2.
 
     `run`: planned, with views and a target. `bench`: draws the views. Its renderer gets the storage that the search
     needs. Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene
     does not fit.
     """
+    assert bench is not None  # the plan has refused runs without views
     output = run.output.path
     with Judges(run, bench) as judges:
         poses = choose_poses(run, bench, judges.decide)

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flexgs_edge.cameras.camera import Camera, largest_of
-from flexgs_edge.memory.process import return_freed_memory
 from flexgs_edge.memory.rows import READING_BYTES
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
@@ -62,14 +61,6 @@ SPOOL_ROW_BYTES = 52  # Bytes of the scratch file of sums (`ViewSums`) for each 
 
 USUAL_SHARE = 4
 """Scratch files usually take one byte in so many of the most that they may take: docs/results/tuning.md#let_go"""
-
-
-def prepare_memory(run: Run[CompressOptions]) -> None:
-    """Have freed memory returned if the search will not fit into memory. Call this before the device is opened."""
-    source, options, budget = run.source, run.options, run.budget
-    rows = source.count
-    if options.method == "best" and rows * row_bytes(source.sh_degree, EFFORTS[options.effort].keep) > budget.free:
-        return_freed_memory()
 
 
 def expected_bytes(run: Run[CompressOptions]) -> int:

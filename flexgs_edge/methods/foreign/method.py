@@ -19,6 +19,7 @@ from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.rounds import PruneRounds, take_rows
 from flexgs_edge.methods.best.search import Candidate
 from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Measure, Selection
+from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.methods.foreign.file_maker import FileMaker, WrittenFile, open_files, publish
 from flexgs_edge.run.judges import Judges
 from flexgs_edge.run.made import Made
@@ -146,13 +147,14 @@ def file_maker(options: CompressOptions, files: FileMaker) -> MakerOf[WrittenFil
 LOG = logging.getLogger("flexgs_edge")
 
 
-def compress(run: Run[CompressOptions], bench: Bench) -> Made:
+def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
     """Compress a scene into a file of another program's format, by measured costs.
 
     `run`: planned. `bench`: draws the views.
     """
     options, plan, output, format = run.options, run.plan, run.output.path, run.output.format
-    assert plan is not None and plan.target is not None and format is not None
+    # The plan has refused runs without views.
+    assert bench is not None and plan is not None and plan.target is not None and format is not None
     with Judges(run, bench) as judges:
         judges.prepare()
         if options.antialiased and not format.marks_antialiased:

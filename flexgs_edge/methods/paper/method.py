@@ -24,7 +24,7 @@ from flexgs_edge.packed.bitspec import ALLOWED_DROP, PAPER, BitSpec, Sensitivity
 from flexgs_edge.packed.quantize import QuantizedScene, quantized_bytes
 from flexgs_edge.quality.psnr import error_for_drop
 from flexgs_edge.quality.view_quality import Quality
-from flexgs_edge.run.decoding import decode_bytes
+from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.judges import Judges
@@ -80,6 +80,10 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
 
     `run`: planned. `bench`: draws the views; `None` for runs without views, whose rates are fixed.
     """
+    if bench is not None:
+        with run.clock.stage("open"):  # the search reads the scene for every choice that it measures
+            source = read_often(run.source, run.budget, searching_bytes(run), bench.renderer.backend)
+            run = run.of_source(source)
     run.budget.take("the order of the Gaussians", RANK_ROW_BYTES * run.source.count)
     with nullcontext() if bench is None else Judges(run, bench) as judges:
         ranking = _rank(run, judges, bench)

@@ -33,7 +33,6 @@ from flexgs_edge.scene.source import MemorySource, SceneSource
 from flexgs_edge.studies.paper.pruning import nearest
 from flexgs_edge.studies.result_tables import Row
 from flexgs_edge.studies.study_scene import Setting, StudyScene
-from flexgs_edge.views.bench import Bench
 
 BREAK = 3.0  # A method has broken if it loses more than this, in dB: twice the squared error
 LOST = f"lost {BREAK:g} dB"
@@ -100,11 +99,7 @@ class Whole:
 
 @contextmanager
 def walked(
-    studied: StudyScene,
-    source: SceneSource,
-    cameras: Sequence[Camera],
-    bench: Bench | None = None,
-    margin: bool = False,
+    studied: StudyScene, source: SceneSource, cameras: Sequence[Camera], margin: bool = False
 ) -> Iterator[PruneRounds]:
     """Open rounds of pruning over some poses (with `margin`, also generated ones), for any number of searches."""
     options, bench = replace(studied.run.options, views_margin=margin), studied.bench
