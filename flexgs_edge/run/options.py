@@ -76,40 +76,28 @@ def check_method(method: str, given: Iterable[str]) -> None:
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Where the views come from, and how they are drawn."""
+    """Where the views come from, and how they are drawn.
 
-    # A camera file, a folder with one, `auto`, or `none`. Default: the cameras beside the scene, else `auto`.
+    `flexgs-edge compress --expert` explains every option; `None` stands for its default.
+    """
+
     cameras: str | None = None
-    # Use the poses of cameras with lens distortion, without their photos. Default: undistort the photos.
     ignore_distortion: bool = False
-    # nerfstudio's `dataparser_transforms.json` of the training, for poses of a transforms.json. Default: the one found.
     dataparser: str | None = None
-    images: str | None = None  # Folder of photos, or `none`. Default: `images/` beside the scene.
-    # Fit the photos to the exposure and white balance of the original, where they differ, or not. Default: `fit`.
+    images: str | None = None
     exposure: str = "fit"
-    holdout: int = DEFAULT_HOLDOUT  # hold out every n-th view in order of name; 0 holds out none
-    resolution: int = MAX_VIEW_WIDTH  # Scale wider views down to this many pixels. Fewer pixels are faster.
-    # Near plane, scene units. Default: as a `.fgs` states, else 0.2. Automatic views of small scenes need less, and get
-    # it.
+    holdout: int = DEFAULT_HOLDOUT
+    resolution: int = MAX_VIEW_WIDTH
     near: float | None = None
-    # Red, green, blue in [0, 1]. Default: as a `.fgs` or `cfg_args` states, else black.
     background: tuple[float, float, float] | None = None
-    # How far a Gaussian reaches on the screen: `exact` or `inria`. Default: as a `.fgs` states, else `exact`.
     extent: str | None = None
-    # Reduce opacities to make up for the screen-space dilation. Default: as a `.fgs` or `cfg_args` states, else no.
     antialiased: bool | None = None
-    # Direction of up for automatic views, in the program's frame (that of a decompressed .ply). Default: what the scene
-    # shows, else -y.
     up: tuple[float, float, float] | None = None
-    # Leave out Gaussians with NaN, infinity or zero quaternions. Default: raise `InputError` for them.
     drop_invalid: bool = False
-    # Directions of the axes of the scene's file, such as `RUB`. Default: as the file says, else as its format has it.
     frame: str | None = None
-    lod: int | None = None  # Level of detail of a streamed scene, 0 is the finest. Default: the finest that is there.
-    sh_degree: int | None = None  # Leave out SH above this degree. Default: keep all.
-    memory_limit: int | None = None  # Bytes for the whole process. Default: three quarters of the free memory.
-    # OpenCL device (number, part of its name, `cpu` or `gpu`) or `numpy`. Default: the one that `devices` shows as
-    # chosen.
+    lod: int | None = None
+    sh_degree: int | None = None
+    memory_limit: int | None = None
     device: str | None = None
 
     def __post_init__(self) -> None:
@@ -136,71 +124,44 @@ class ViewOptions:
 
 @dataclass(frozen=True)
 class CompressOptions(ViewOptions):
-    """All options of `compress` besides input and output.
+    """All options of `compress` besides input and output: see `flexgs-edge compress --expert`.
 
-    `max_drop`, `min_fidelity`: quality target: most PSNR lost, or least fidelity, dB. Default: `max_drop=1`.
-    `prune_rate`, `sh_rate`: fixed rates from 0 to 1, instead of a search (`paper`). Give both or none.
+    `max_size` and `preview` are bytes; `unseen` is a word or a share such as "20%"; `distil` counts iterations.
     """
 
-    # `best` (the default) measures the cost of each Gaussian and codes with entropy coding. `paper` is the published
-    # method: faster, larger files.
     method: str = "best"
-    # Views that decide when the search stops: the held-out views (`test`) or the training views. Default: `test`.
     select: str = "test"
-    score: str = "gs"  # Importance score: `gs` or `meson` (`paper`). Default: `gs`.
-    # Keep the scores in this file. Reuse them when scene, views and score are the same (`paper`).
+    score: str = "gs"
     score_cache: str | None = None
     max_drop: float | None = None
     min_fidelity: float | None = None
-    # What holds beside the target: bounds on the worst view, on SSIM and on made poses (`whole`), or nothing (`mean`).
-    # Default: `whole`.
     promise: str = "whole"
-    # Largest drop of any single deciding view, dB. Default: 1.5 times the drop that the target allows in the mean, and
-    # 0.2 dB.
     max_worst_drop: float | str | None = None
-    # Largest loss of SSIM, mean over the deciding views. Default: 0.015 for each dB that the target allows.
     max_ssim_drop: float | str | None = None
-    max_size: int | None = None  # size target: most bytes of the file
-    # Size target: bytes of the scene as a PLY divided by file bytes, whatever format the scene was read from.
+    max_size: int | None = None
     min_ratio: float | None = None
-    # Most Gaussians of the result, whatever the target allows, for programs that draw only so many (`best`).
     max_gaussians: int | None = None
     prune_rate: float | None = None
     sh_rate: float | None = None
-    bits: str = "paper"  # Bits per attribute, `paper`, `auto`, or `rtn4`, `rtn8`, ... (`paper`). Default: `paper`.
-    groups: int | None = None  # Quantization groups per channel (`paper`). Default: one group for about 512 rows.
-    base_psnr: float = DEFAULT_BASE_PSNR  # assumed PSNR of the original against its photos, for the modelled drop, dB
-    trust_views: bool = False  # Go on with cameras and photos that do not fit the scene. Default: raise `InputError`.
-    # More effort makes smaller files and takes longer. `balanced` (from 10 000 Gaussians) and `max` also distil
-    # (`best`, `.fgs`). Default: `balanced`.
+    bits: str = "paper"
+    groups: int | None = None
+    base_psnr: float = DEFAULT_BASE_PSNR
+    trust_views: bool = False
     effort: str = "balanced"
-    best_effort: bool = False  # If the target cannot be met, write the closest result. Default: raise `TargetError`.
-    # What to do with Gaussians that no training view sees (`best`): `keep`, `drop`, or a share such as `20%`, which
-    # keeps the most visible ones. Default: `keep`, without view-dependent colour.
+    best_effort: bool = False
     unseen: str = "keep"
-    # Bound the loss at made poses, where no camera stood, and score some too (`best`). Default: as `promise` says.
     views_margin: bool | None = None
-    # Refit colours after pruning and quantizing (`best`). Default: yes; without it files are larger.
     refit: bool = True
-    # Iterations that fine-tune the file against renders of the original, 0 for none (`best`, `.fgs`). Default: as the
-    # effort says.
     distil: int | None = None
-    spz_version: int = 3  # Version of a `.spz` that is written. Older programs read only 3. Default: 3.
-    layers: int | None = None  # Write the file in 1 to 4 layers, between which `trim` can cut it (`best`). Default: 1.
-    # Most bytes of a preview: the same scene in far fewer Gaussians, which viewers show until the first layer is there
-    # (`best`); 0 for none. Default: 2 % of a file of a megabyte or more, if no target forbids them, and at most 262 144
-    # Gaussians or three fifths of the scene are left; else 0.
+    spz_version: int = 3
+    layers: int | None = None
     preview: int | None = None
-    # Folder for scratch files of scenes that do not fit into memory (`best`). Default: the folder of the output.
     scratch: str | None = None
-    # Keep each round of the search in the scratch folder until the run is done. Continue from the rounds of an
-    # interrupted run (`best`).
     resume: bool = False
-    # Draw views on Dask workers: the address of a scheduler, or `local:N` (`best`). Default: draw them here.
     cluster: str | None = None
-    report: str | None = None  # write a page about the run (index.html) and its record (result.json) to this folder
-    dry_run: bool = False  # do all the work, but write no file
-    force: bool = False  # overwrite existing files
+    report: str | None = None
+    dry_run: bool = False
+    force: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
